@@ -18,10 +18,10 @@ import numpy as np
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.sensors import (
-    FreeFormSensor,
     default_sensor,
     starts_of_one_gaussian,
     starts_with_more_gaussians,
+    with_free_form,
 )
 from probewise.effects import VOCABULARY, Extent
 from probewise.inference import sd_floor
@@ -71,8 +71,8 @@ def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
     one = default_sensor(extent, 1)
     found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law)
     if free_form:
-        wanted = FreeFormSensor.from_one_gaussian(one)
-        starts = wanted.start_from_one_gaussian(found.z)
+        wanted = with_free_form(one)
+        starts = np.pad(found.z, (0, wanted.n_params - one.n_params))[None, :]
     else:
         wanted = default_sensor(extent, 2)
         starts = starts_with_more_gaussians(found.model.sensor, found.z, wanted)

@@ -33,7 +33,7 @@ def sights_of(plan: Plan):
     """The surviving share of backlash and its cosine to an edge that lies elsewhere, by `ProjectedTemplates`."""
     sensor = default_sensor(Extent(10.0, 60.0, plan), 1)
     expected = ExpectedSensor(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
-    seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, TWO), np.arange(len(plan)))
+    seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, expected.effects_on(plan, TWO)), np.arange(len(plan)))
     share, like = seen.detectable_shares_and_cosines()["backlash"]
     return expected, share, like["edge_misplacement"], seen
 
@@ -73,7 +73,7 @@ def test_the_smallest_size_leaves_lambda_eight():
     """A trace of that size, from the chain, has length 8 once the fit has taken its part."""
     plan = thinned(two_way_plan(), 8)
     expected, share, _, seen = sights_of(plan)
-    (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"])
+    (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"]).values()
     theta = expected.null.theta(expected.z[None, :])
     plain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
     with_play = plain.with_effects(VOCABULARY["backlash"]())

@@ -12,7 +12,8 @@ import jsonschema
 import numpy as np
 import pytest
 
-from probewise.diagnosis import Diagnosis, Improvement, diagnose, diagnosis_json, diagnosis_schema
+from probewise.diagnosis import Diagnosis, diagnose, diagnosis_json, diagnosis_schema
+from probewise.diagnosis.held_out import HeldOutGain
 from probewise.effects import EFFECTS, VOCABULARY, Origin
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
@@ -177,10 +178,8 @@ def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_
 
 @pytest.mark.slow
 def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
-    found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
-    plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)
-    answers = [found_out, plain]
-    monkeypatch.setattr("probewise.diagnosis.best_repair.improvement_of", lambda *_, **__: answers.pop(0))
+    worse = HeldOutGain(-4.0, 0.5, 50, (("edge_0", -4.0),))
+    monkeypatch.setattr("probewise.diagnosis.best_repair.held_out_gain", lambda *_, **__: worse)
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()

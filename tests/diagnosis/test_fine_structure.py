@@ -8,7 +8,7 @@ import pytest
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
 from probewise.diagnosis.noise_law import white_noise
-from probewise.diagnosis.sensors import FreeFormSensor, cached_known_scene, default_sensor, fine_structure_slopes
+from probewise.diagnosis.sensors import cached_known_scene, default_sensor, fine_structure_slopes, with_free_form
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.sensor import Chain, FixedLevels, FreeMixture
@@ -24,8 +24,8 @@ def fitted(recording: Recording, *, free: bool = True) -> Fit:
     one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.with_least_sigma(NOISE_SD))
     if not free:
         return one
-    form = FreeFormSensor.from_one_gaussian(sensor)
-    start = form.start_from_one_gaussian(one.z)[0]
+    form = with_free_form(sensor)
+    start = np.pad(one.z, (0, form.n_params - sensor.n_params))
     return fit(Model(form, (), recording.plan), recording, start, law.with_least_sigma(NOISE_SD))
 
 

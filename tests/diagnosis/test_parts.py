@@ -21,12 +21,12 @@ from probewise.diagnosis.evidence import (
     block_log_bayes_factors,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
-from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_new_scan
+from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
 from probewise.diagnosis.noise_law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prepared import join, join_plans
-from probewise.diagnosis.sensors import FreeFormSensor, default_sensor, sensor_from_posterior, theta_to_natural
+from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.effects import VOCABULARY, Extent
@@ -148,14 +148,14 @@ def test_an_earlier_sensor_becomes_the_prior_of_the_same_spread_in_any_unit(unit
 
 
 def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
-    free = FreeFormSensor.from_one_gaussian(default_sensor(EXTENT, 1))
+    free = with_free_form(default_sensor(EXTENT, 1))
     rng = np.random.default_rng(0)
     z = 0.02 * rng.normal(size=(4000, free.n_params))
     theta = free.theta(z)
     np.testing.assert_allclose(free.z(theta), z, atol=1e-8)
     names = (*mixture_parameter_names(free.n_gaussians), "I_min", "I_max")
     prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
-    assert isinstance(prior, FreeFormSensor)
+    assert prior.is_free_form
     drawn = prior.theta(rng.normal(size=(4000, free.n_params)))
     spread = theta.std(axis=0)
     np.testing.assert_allclose(drawn.std(axis=0)[spread > 1e-9], spread[spread > 1e-9], rtol=0.08)
@@ -174,7 +174,7 @@ def test_the_prior_of_an_earlier_sensor_does_not_depend_on_the_unit(unit):
 
 
 def test_the_prior_of_an_earlier_free_form_does_not_depend_on_the_unit():
-    free = FreeFormSensor.from_one_gaussian(default_sensor(EXTENT, 1))
+    free = with_free_form(default_sensor(EXTENT, 1))
     theta = free.theta(0.02 * np.random.default_rng(0).normal(size=(4000, free.n_params)))
     theta[:, -2:] *= 1e-12
     names = (*mixture_parameter_names(free.n_gaussians), "I_min", "I_max")
@@ -505,7 +505,7 @@ def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tm
     assert ("s0 (2)", "s1 (2)") in groups
     assert candidate_scan_groups(back.plan) == groups
     assert candidate_scan_groups(replace(joined.plan, sessions=())) != groups
-    more = rows_as_new_scan(joined.plan, np.arange(24, 36), 100.0, 1.0, "more")
+    more = rows_as_next_scan(joined.plan, np.arange(24, 36), "more")
     assert more.sessions == ()
     assert join_plans([joined.plan, more]).sessions == (0, 0, 1, 1, 2)
     assert join_plans([more, more]).sessions == ()

@@ -16,7 +16,7 @@ from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.samples import ModelSamples, sample_model, weights_beside_other_effects
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.sensors import FreeFormSensor, GaussianMixtureSensor, default_sensor
+from probewise.diagnosis.sensors import CalibratedSensor, default_sensor, with_free_form
 from probewise.effects import EFFECTS, Extent
 from probewise.effects.noise import DriftingNoise
 from probewise.recordings import Recording, Uniform, two_way_plan
@@ -27,7 +27,7 @@ PLAN = two_way_plan()
 
 @pytest.mark.slow
 def test_a_sensor_of_free_form_is_written_read_and_driven_by():
-    free = FreeFormSensor.from_one_gaussian(default_sensor(Extent(10.0, 60.0, PLAN), 1))
+    free = with_free_form(default_sensor(Extent(10.0, 60.0, PLAN), 1))
     rng = np.random.default_rng(5)
     z = 0.3 * rng.standard_normal(free.n_params) + 0.02 * rng.standard_normal((500, free.n_params))
     chain = free.chain(PLAN, (), n_nodes=16)
@@ -87,7 +87,7 @@ def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
     """An earlier sensor whose white level is twenty of its sds off: the fit rests at six of them."""
     rng = np.random.default_rng(0)
     center = default_sensor(Extent(10.0, 60.0, PLAN), 1).center
-    tight = GaussianMixtureSensor(
+    tight = CalibratedSensor(
         1, center, np.diag([0.05, 0.05, 0.01, 0.01, 0.02, 0.05, 0.05]), has_exchangeable_gaussians=False
     )
     truth = tight.theta(np.zeros((1, 7)))

@@ -45,7 +45,7 @@ TABLE = runs()
 
 
 def offered(controls=("power_w",), table=TABLE):
-    return {c.table.scan_names[0]: c for c in possible_run_commands(table, "temp_c", controls, "s")}
+    return {c.plan.scan_names[0]: c for c in possible_run_commands(table, "temp_c", controls, "s")}
 
 
 def test_without_controls_recorded_runs_are_taken_again():
@@ -54,7 +54,7 @@ def test_without_controls_recorded_runs_are_taken_again():
 
 def test_a_control_is_swept_held_and_switched_between_its_ends():
     found = offered()
-    power = {name: command.table.columns["power_w"] for name, command in found.items()}
+    power = {name: command.plan.columns["power_w"] for name, command in found.items()}
     np.testing.assert_allclose(power["1 power_w up"][[0, -1]], [2.0, 4.0])
     np.testing.assert_allclose(power["1 power_w down"][[0, -1]], [4.0, 2.0])
     assert set(power["1 power_w steps"].tolist()) == {2.0, 4.0}
@@ -63,23 +63,23 @@ def test_a_control_is_swept_held_and_switched_between_its_ends():
 
 def test_a_control_is_swept_in_values_that_can_be_set():
     """In thousandths of its range, from 2 to 4 W: two decimals would be too few, sixteen cannot be set."""
-    swept = offered()["1 power_w up"].table.columns["power_w"]
+    swept = offered()["1 power_w up"].plan.columns["power_w"]
     np.testing.assert_array_equal(swept, np.round(swept, 3))
     np.testing.assert_allclose(swept, np.linspace(2.0, 4.0, len(swept)), atol=0.0005)
     assert len(np.unique(swept)) == len(swept)
 
 
 def test_a_slow_run_takes_twice_the_time():
-    time = offered()["1 slow"].table.time_s
+    time = offered()["1 slow"].plan.time_s
     np.testing.assert_allclose(np.ptp(time), 2 * np.ptp(TABLE.time_s[:12]))
 
 
 def test_what_is_yet_to_be_read_is_empty():
-    assert all(np.isnan(command.table.columns["temp_c"]).all() for command in offered().values())
+    assert all(np.isnan(command.plan.columns["temp_c"]).all() for command in offered().values())
 
 
 def test_time_that_begins_anew_in_each_run_does_so_in_the_next():
-    assert offered()["2 again"].table.time_s[0] == 0.0
+    assert offered()["2 again"].plan.time_s[0] == 0.0
 
 
 def test_time_that_goes_on_is_later_than_all_that_was_recorded():
@@ -99,7 +99,7 @@ def test_commands_set_behind_each_other_are_runs_of_their_own():
 
 def test_no_command_has_more_than_102_readings():
     long = runs((20.0,), n=1000)
-    assert max(len(command.table) for command in offered(table=long).values()) <= 102
+    assert max(len(command.plan) for command in offered(table=long).values()) <= 102
 
 
 def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
@@ -146,10 +146,10 @@ def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
 
 def test_when_time_begins_anew_does_not_depend_on_the_order_of_rows():
     interleaved = TABLE.take(np.lexsort((TABLE.scan, TABLE.time_s)))
-    assert offered((), interleaved)["2 again"].table.time_s[0] == 0.0
+    assert offered((), interleaved)["2 again"].plan.time_s[0] == 0.0
     goes_on = TABLE.with_columns({"t_s": np.arange(float(len(TABLE)))})
     last_first = goes_on.take(np.argsort(-goes_on.scan, kind="stable"))
-    assert offered((), last_first)["2 again"].table.time_s[0] > len(TABLE) - 1
+    assert offered((), last_first)["2 again"].plan.time_s[0] > len(TABLE) - 1
 
 
 _N = 60

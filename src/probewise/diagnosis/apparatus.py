@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -30,24 +30,18 @@ NOTHING_NATS = 0.5
 """Expected log Bayes factor below which readings do not tell two hypotheses apart at all: they are aliases."""
 
 
-class Command(Protocol):
-    """A possible next measurement, to be proposed to the user: kind, description, rows and duration."""
+@dataclass(frozen=True, eq=False)
+class Command:
+    """A possible next measurement: kind in a word or two, an instruction, its rows, and minutes with the break before.
 
-    @property
-    def kind(self) -> str:
-        """Kind of measurement, in a word or two."""
+    Kinds of a scan: "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet,
+    "lay".
+    """
 
-    @property
-    def description(self) -> str:
-        """The measurement in words, as an instruction."""
-
-    @property
-    def plan(self) -> Plan:
-        """Rows of the measurement."""
-
-    @property
-    def minutes(self) -> float:
-        """Duration in minutes, including the break before it."""
+    kind: str
+    description: str
+    plan: Plan
+    minutes: float
 
 
 def rows_by_command(commands: Sequence[Command]) -> list[IntArray]:
@@ -136,7 +130,7 @@ class Apparatus(ABC):
         return 0.0
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
-        """Return whether at least this share of the budget of costly predictions is spent."""
+        """Return whether at least this share of the budget is spent; if so, record that the search was cut short."""
         return False
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
@@ -147,15 +141,16 @@ class Apparatus(ABC):
     def covariates_and_predicted_slope(
         self, found: Fit, recording: Recording
     ) -> tuple[Sequence[Covariate], FloatArray]:
-        """Return the covariates of the usable readings, and the slope of the prediction there, (n_usable,).
+        """Return the covariates of the usable readings that vary, and the slope of the prediction there, (n_usable,).
 
-        The slope is along the motion, per mm, or, of a table, the change since the previous row.
+        The slope is along the motion, per mm, or, of a table, the change since the previous row. A table's covariates
+        are time or row, predicted level, its change since the row before, columns, states, and the run.
         """
 
     def multiplied_covariates(self, covariates: Sequence[Covariate]) -> Sequence[Covariate]:
-        """Choose the covariates of which a product of two may be an unknown effect; none by default.
+        """Choose the covariates of which a product of two may be an unknown effect: time and columns of a table.
 
-        What an arm logs beside the readings is not known to act by products.
+        None by default: what an arm logs beside the readings is not known to act by products.
         """
         return ()
 
@@ -203,9 +198,9 @@ class Apparatus(ABC):
         """
 
     @abstractmethod
-    def plan_of_alternatives(self, commands: Sequence[Any], after: Plan) -> Plan:
+    def plan_of_alternatives(self, commands: Sequence[Command], after: Plan) -> Plan:
         """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
 
     @abstractmethod
-    def plan_of_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
+    def plan_of_sequence(self, commands: Sequence[Command], after: Plan) -> Plan:
         """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""

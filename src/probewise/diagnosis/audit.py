@@ -21,13 +21,12 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.aliases import LAMBDA, LEAST_SHARE
-from probewise.diagnosis.apparatus import Words
+from probewise.diagnosis.apparatus import Command, Words
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
 from probewise.diagnosis.light_sensor import (
     LightSensorApparatus,
-    Scan,
     candidate_scans,
     scan_started_after,
     target_swaps,
@@ -35,13 +34,12 @@ from probewise.diagnosis.light_sensor import (
 from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,
-    CalibratedSensor,
-    FreeFormSensor,
     SensorPrior,
     default_sensor,
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
+    with_free_form,
 )
 from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
 from probewise.diagnosis.templates import templates_of_effect
@@ -71,6 +69,12 @@ class ExpectedSensor:
     levels: tuple[float, float]
     sd: float
 
+    def effects_on(self, plan: Plan, kinds: Mapping[str, EffectKind]) -> dict[str, NamedEffect[Any]]:
+        """Scale effects to a plan, by name, without those that cannot act there."""
+        extent = Extent(*self.levels, plan)
+        maybe = {name: kind.for_extent(extent) for name, kind in kinds.items()}
+        return {name: effect for name, effect in maybe.items() if effect is not None}
+
 
 @dataclass(frozen=True, eq=False)
 class PlanTemplates:
@@ -91,35 +95,17 @@ class PlanTemplates:
 
     @classmethod
     def of(
-        cls,
-        expected: ExpectedSensor,
-        plan: Plan,
-        effects: Mapping[str, EffectKind],
-        *,
-        most: int | None = None,
+        cls, expected: ExpectedSensor, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
     ) -> Self:
-        """Scale the effects to a plan and build their templates, without effects on the noise or that cannot act there.
+        """Build the templates of effects that are scaled to a plan, without those on the noise.
 
         Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
         """
-        extent = Extent(*expected.levels, plan)
-        maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
-        return cls.of_scaled_effects(
-            expected, plan, {name: effect for name, effect in maybe.items() if effect is not None}, most=most
-        )
-
-    @classmethod
-    def of_scaled_effects(
-        cls, expected: ExpectedSensor, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
-    ) -> Self:
-        """Build the templates of effects that are already scaled to the plan, as `of` does."""
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
         model = Model(expected.null, (), plan)
         predicted, slopes = model.predict_and_differentiate(expected.z)
         found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, sd=expected.sd, objective=0.0)
-        columns = [np.zeros((len(plan), 0))]
-        settings: list[FloatArray] = []
-        owner: list[int] = []
+        columns, settings, owner = [np.zeros((len(plan), 0))], list[FloatArray](), list[int]()
         for at, effect in enumerate(built.values()):
             if effect.stage is Stage.NOISE:
                 continue
@@ -133,9 +119,9 @@ class PlanTemplates:
             np.concatenate(columns, axis=1) / expected.sd,
             entry,
             np.array(owner, dtype=np.int64),
-            names=tuple(built),
-            built=built,
-            settings=tuple(settings),
+            tuple(built),
+            built,
+            tuple(settings),
         )
 
     def norms_of_entries(self, columns: FloatArray) -> FloatArray:
@@ -166,14 +152,11 @@ class ProjectedTemplates:
         own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
         left = -own @ (own[:n_points].T @ columns)
         left[:n_points] += columns
-        return cls(
-            laid,
-            left,
-            _orthonormalise_entries(left, laid.entry),
-            laid.norms_of_entries(columns),
-            laid.norms_of_entries(left),
-            n_points,
-        )
+        basis, widths = np.zeros_like(left), np.bincount(laid.entry)
+        for width in np.unique(widths):  # all entries of one width at a time; without directions below a thousandth
+            mine = np.flatnonzero(widths[laid.entry] == width)
+            basis[:, mine], _ = orthonormalise_groups(left[:, mine], int(width), least=1e-18, share=1e-6)
+        return cls(laid, left, basis, laid.norms_of_entries(columns), laid.norms_of_entries(left), n_points)
 
     def detectable_shares_and_cosines(
         self, asked: Sequence[str] | None = None
@@ -184,14 +167,18 @@ class ProjectedTemplates:
         Only effects in `asked` have cosines, by default all, and only between shares of 0.05 or more.
         """
         laid = self.laid
-        present = {name: self._active_entry_indices(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
+        present = {}  # the entries of each effect that act on these rows
+        for k in np.unique(laid.owner).tolist():
+            mine = np.flatnonzero(laid.owner == k)
+            acting = self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)
+            present[laid.names[k]] = mine[acting]
         shares = {
             name: float(np.median(self.kept[mine] / self.raw[mine])) if mine.size else 0.0
             for name, mine in present.items()
         }
         visible = [name for name, share in shares.items() if share >= LEAST_SHARE]
         wanted = [name for name in (visible if asked is None else asked) if name in visible]
-        out: dict[str, tuple[float, dict[str, float]]] = {name: (share, {}) for name, share in shares.items()}
+        out = {name: (share, dict[str, float]()) for name, share in shares.items()}
         if not wanted:
             return out
         mine = np.concatenate([present[name] for name in wanted])
@@ -200,10 +187,8 @@ class ProjectedTemplates:
         onto = np.add.reduceat(onto, _run_start_indices(laid.entry), axis=0)
         onto = np.add.reduceat(onto, _run_start_indices(laid.entry[columns]), axis=1)
         mine = np.unique(laid.entry[columns])
-        best = np.maximum.reduceat(onto, _run_start_indices(laid.owner), axis=0) / np.maximum(
-            self.kept[mine] ** 2, 1e-300
-        )
-        cosines = np.sqrt(np.minimum(best, 1.0))
+        best = np.maximum.reduceat(onto, _run_start_indices(laid.owner), axis=0)
+        cosines = np.sqrt(np.minimum(best / np.maximum(self.kept[mine] ** 2, 1e-300), 1.0))
         owners = [laid.names[k] for k in laid.owner[_run_start_indices(laid.owner)]]
         for name in wanted:
             typical = np.median(cosines[:, laid.owner[mine] == laid.names.index(name)], axis=1)
@@ -211,37 +196,22 @@ class ProjectedTemplates:
             out[name] = (shares[name], {other: like[other] for other in visible if other != name})
         return out
 
-    def _active_entry_indices(self, effect: int) -> IntArray:
-        """Return the indices of the entries of an effect, given by its index, that act on these rows."""
-        mine = np.flatnonzero(self.laid.owner == effect)
-        return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
-
-    def smallest_detectable_amplitudes(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
+    def smallest_detectable_amplitudes(self, effect: NamedEffect[Any]) -> dict[int, float | None]:
         """Return each amplitude's value at which an effect has lambda 8, median over settings; None if it has none."""
         at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
         columns = np.flatnonzero(np.isin(self.laid.entry, at))
         settings = np.concatenate([self.laid.settings[k] for k in at])
         lengths = np.linalg.norm(self.left[:, columns], axis=0)
-        out: list[float | None] = []
+        out: dict[int, float | None] = {}
         for k in effect.amplitudes:
             significant = (settings[:, k] != 0) & (lengths > 1e-3)
             sizes = np.abs(settings[significant, k]) * LAMBDA / lengths[significant]
-            out.append(float(np.median(sizes)) if sizes.size else None)
-        return tuple(out)
+            out[k] = float(np.median(sizes)) if sizes.size else None
+        return out
 
 
 def _run_start_indices(codes: IntArray) -> IntArray:
     return np.flatnonzero(np.diff(codes, prepend=-1))
-
-
-def _orthonormalise_entries(columns: FloatArray, entry: IntArray) -> FloatArray:
-    """Orthonormalise each entry's columns; directions below a thousandth of the longest become zero."""
-    out = np.zeros_like(columns)
-    widths = np.bincount(entry)
-    for width in np.unique(widths):  # all entries of one width at a time
-        mine = np.flatnonzero(widths[entry] == width)
-        out[:, mine], _ = orthonormalise_groups(columns[:, mine], int(width), least=1e-18, share=1e-6)
-    return out
 
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
@@ -273,27 +243,17 @@ class DetectableSize:
 
 @dataclass(frozen=True)
 class EffectAudit:
-    """Detectability of one effect under a plan: fine, aliased or invisible.
+    """Detectability of one effect under a plan.
 
     Fine: the readings detect the effect and tell it from every other. Aliased: another effect imitates it with a cosine
     of 0.95 or more (at lambda 8 less than 3 nats apart). Invisible: it cannot act here, or the sensor's own parameters
     absorb over 95 % of its change of the readings. An effect on the noise is fine from 24 readings on, else invisible.
 
-    Attributes
-    ----------
-    name, detectability
-        The effect, and whether it is invisible, aliased or fine.
-    share
-        Share of its change of the readings that the model's parameters do not absorb, median over its settings; 0 if it
-        cannot act here. Of a noise effect: 1 if fine, 0 if invisible.
-    alike
-        Effects that imitate a typical setting of this one, with cosines, largest first.
-    smallest
-        The value of each amplitude at which it has lambda 8 (norm in noise sds, after a refit).
-    reason
-        Why it is invisible, or "".
-    rows
-        Number of rows like these that detect it if it changes readings by one noise sd rms; None if not computed.
+    `share`: share of its change of the readings that the model's parameters do not absorb, median over its settings; 0
+    if it cannot act here; of a noise effect 1 if fine, else 0. `alike`: effects that imitate a typical setting of it,
+    with cosines, largest first. `smallest`: the value of each amplitude at which it has lambda 8 (norm in noise sds,
+    after a refit). `reason`: why it is invisible, or "". `rows`: number of rows like these that detect it if it changes
+    readings by one noise sd rms; None if not computed.
     """
 
     name: str
@@ -323,23 +283,10 @@ class Cure:
 class PlanAudit(ShowsItself):
     """Audit of a plan: which effects its readings detect and tell apart, and scans to add for the others.
 
-    Attributes
-    ----------
-    plan
-        The plan.
-    assumed
-        The assumed sensor, in words.
-    effects, after
-        Every effect, under the plan and under the plan with all cures.
-    cosines
-        Cosine of each effect (row) with its best imitation by each other (column), (n_effects, n_effects), in the order
-        of `effects`; on the diagonal, the detectable share.
-    cures
-        Scans to add, in the order chosen.
-    words
-        Words for the apparatus.
-    classes
-        Groups of effects aliased with one another; None if not requested.
+    `assumed`: the assumed sensor, in words; `effects`, `after`: every effect, under the plan and under the plan with
+    all `cures`, which are in the order chosen; `cosines`: of each effect (row) with its best imitation by each other
+    (column), (n_effects, n_effects), in the order of `effects`; on the diagonal, the detectable share; `classes`:
+    groups of effects aliased with one another; None if not requested.
     """
 
     plan: Plan
@@ -357,24 +304,14 @@ class PlanAudit(ShowsItself):
     def effects_with_detectability(
         self, detectability: Detectability, *, after: bool = False
     ) -> tuple[EffectAudit, ...]:
-        """Return the effects that are "fine", "aliased" or "invisible" under the plan, or `after` all cures.
-
-        Raises
-        ------
-        ParameterError
-            If `detectability` is none of the three.
-        """
+        """Return the effects that are "fine", "aliased" or "invisible" under the plan, or `after` all cures."""
         require_one_of("detectability", detectability, get_args(Detectability))
-        return tuple(
-            effect for effect in (self.after if after else self.effects) if effect.detectability == detectability
-        )
+        return tuple(e for e in (self.after if after else self.effects) if e.detectability == detectability)
 
     @property
     def cure_plan(self) -> Plan | None:
         """All cures as one plan; None if there are none."""
-        if not self.cures:
-            return None
-        return join_plans([cure.plan for cure in self.cures])
+        return join_plans([cure.plan for cure in self.cures]) if self.cures else None
 
     @property
     def extra_readings(self) -> int:
@@ -396,12 +333,8 @@ class PlanAudit(ShowsItself):
         lines += _wrapped_lines("invisible", [e.name for e in self.effects_with_detectability("invisible")])
         lines += _READING_GUIDE
         if not self.cures:
-            cured = (
-                "not needed"
-                if len(self.effects_with_detectability("fine")) == len(self.effects)
-                else self.words.no_cure
-            )
-            return "\n".join([*lines, f"cure       {cured}"])
+            all_fine = len(self.effects_with_detectability("fine")) == len(self.effects)
+            return "\n".join([*lines, f"cure       {'not needed' if all_fine else self.words.no_cure}"])
         minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
         lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
         for k, cure in enumerate(self.cures, start=1):
@@ -474,14 +407,18 @@ def audit_plan(
     expected, said = _expected_sensor_and_description(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     progress("judging the plan")
-    before, cosines = audits_and_cosines(PlanTemplates.of(expected, plan, effects), effects, unit)
+
+    def templates_on(plan: Plan) -> PlanTemplates:
+        return PlanTemplates.of(expected, plan, expected.effects_on(plan, effects))
+
+    before, cosines = audits_and_cosines(templates_on(plan), list(effects), unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
     chosen = choose_cure_scans(plan, expected, effects, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
         current = join_plans([current, command.plan])
-        steps.append(audits_and_cosines(PlanTemplates.of(expected, current, effects), effects, unit)[0])
+        steps.append(audits_and_cosines(templates_on(current), list(effects), unit)[0])
     cured = _curing_step_by_effect(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
@@ -513,40 +450,28 @@ def audit_plan_of_diagnosis(
 ) -> PlanAudit:
     """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
 
-    Parameters
-    ----------
-    diagnosis
-        Diagnosis of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...).
-    sensor
-        The earlier sensor that was the prior of the diagnosis, if any.
-    effects
-        The vocabulary, by name.
+    `diagnosis` is of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...)
+    is used. `sensor` is the earlier sensor that was the prior of the diagnosis, if any.
     """
     known, usable = diagnosis.null, np.flatnonzero(diagnosis.recording.usable)
     plan = diagnosis.recording.plan.take(usable[:: -(-len(usable) // _MOST_READINGS)])
-    names, mean = list(known.chain.names), known.theta.mean(axis=0)
-    low, high = (float(mean[names.index(name)]) for name in ("I_min", "I_max"))
-    low, high = _in_order(low, high)
-    extent = Extent.of(diagnosis.recording)
+    mean, extent = known.theta.mean(axis=0), Extent.of(diagnosis.recording)
     own = mean[None, : 6 * known.n_gaussians + 2]
-    null: CalibratedSensor
     if sensor is not None:
         null = sensor_from_samples(sensor)
     elif is_free_form(own[:, :-2]):
-        null = FreeFormSensor.from_one_gaussian(default_sensor(extent, 1))
+        null = with_free_form(default_sensor(extent, 1))
     else:
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
-    expected = ExpectedSensor(null, z, (low, high), float(known.noise_sd.mean()))
-    effects_seen, cosines = audits_and_cosines(
-        PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
-    )
+    expected = ExpectedSensor(null, z, _levels(known.chain.names, mean), float(known.noise_sd.mean()))
+    laid = PlanTemplates.of(expected, plan, expected.effects_on(plan, effects), most=_SETTINGS)
+    effects_seen, cosines = audits_and_cosines(laid, list(effects), plan.instrumentation.unit)
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
 
 
-def _in_order(low: float, high: float) -> tuple[float, float]:
-    """Return two levels in rising order, apart by a little at least if they are equal."""
-    low, high = min(low, high), max(low, high)
+def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
+    low, high = sorted(float(theta[list(names).index(name)]) for name in ("I_min", "I_max"))
     return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
 
 
@@ -555,12 +480,9 @@ def _expected_sensor_and_description(
 ) -> tuple[ExpectedSensor, str]:
     """Return the expected sensor, and its description in words with its noise sd."""
     if sensor is not None:
-        mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
-        null = sensor_from_samples(sensor)
+        null, said = sensor_from_samples(sensor), "the sensor as calibrated"
+        low, high = _levels(sensor.names, np.asarray(sensor.samples, dtype=np.float64).mean(axis=0))
         z = np.zeros(null.n_params)
-        low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
-        low, high = _in_order(low, high)
-        said = "the sensor as calibrated"
     else:
         inst = plan.instrumentation
         bottom, top = (0.0 if inst.min is None else inst.min), (100.0 if inst.max is None else inst.max)
@@ -572,20 +494,17 @@ def _expected_sensor_and_description(
     sd = _NOISE * (high - low) if noise_sd is None else noise_sd
     if not sd > 0:
         raise ParameterError("noise_sd", sd, "greater than 0")
-    return ExpectedSensor(
-        null, z, (low, high), sd
-    ), f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
+    said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
+    return ExpectedSensor(null, z, (low, high), sd), said
 
 
 def audits_and_cosines(
-    laid: PlanTemplates, effects: Mapping[str, EffectKind], unit: str
+    laid: PlanTemplates, names: Sequence[str], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column; shares on the diagonal)."""
     seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
     detectability = seen.detectable_shares_and_cosines()
-    names = list(effects)
-    cosines = np.zeros((len(names), len(names)))
-    out = []
+    cosines, out = np.zeros((len(names), len(names))), list[EffectAudit]()
     for own, name in enumerate(names):
         effect = laid.built.get(name)
         if effect is None:
@@ -598,23 +517,18 @@ def audits_and_cosines(
             share, like = detectability[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
-            out.append(_audit_of_effect(effect, share, like, seen.smallest_detectable_amplitudes(effect), unit))
+            if share < LEAST_SHARE:
+                reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
+                out.append(EffectAudit(name, "invisible", share, reason=reason))
+            else:
+                alike = sorted(((other, c) for other, c in like.items() if c >= ALIAS), key=lambda pair: -pair[1])
+                smallest = tuple(
+                    DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
+                    for k, amount in seen.smallest_detectable_amplitudes(effect).items()
+                )
+                out.append(EffectAudit(name, "aliased" if alike else "fine", share, tuple(alike), smallest))
         cosines[own, own] = out[-1].share
     return tuple(out), cosines
-
-
-def _audit_of_effect(
-    effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...], unit: str
-) -> EffectAudit:
-    if share < LEAST_SHARE:
-        reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
-        return EffectAudit(effect.name, "invisible", share, reason=reason)
-    alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
-    smallest = tuple(
-        DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
-        for k, amount in zip(effect.amplitudes, amounts, strict=True)
-    )
-    return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)
 
 
 _MOST_SCANS = 5
@@ -629,14 +543,14 @@ def choose_cure_scans(
     effects: Mapping[str, EffectKind],
     ailing: Sequence[str],
     progress: Progress = silent,
-) -> list[Scan]:
+) -> list[Command]:
     """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
 
     They are timed one after another, in the order chosen. The deficit of an effect is 0 if it is detected and told from
     others, up to 1 if aliased, 1 to 2 if invisible.
     """
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
-    chosen: list[Scan] = []
+    chosen: list[Command] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)
@@ -646,7 +560,7 @@ def choose_cure_scans(
         if not options:
             break
         together = join_plans([current, *(option.plan for option in options)])
-        laid = PlanTemplates.of(expected, together, effects, most=_SETTINGS)
+        laid = PlanTemplates.of(expected, together, expected.effects_on(together, effects), most=_SETTINGS)
         now = np.arange(len(current))
         trouble = _total_detectability_deficit(laid, now, ailing)
         worth = []
@@ -782,11 +696,14 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
     expected = ExpectedSensor(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
-    laid = PlanTemplates.of_scaled_effects(expected, cast(Plan, own), built, most=_SETTINGS_OF_TABLE)
-    rows = _evenly_spread_rows(len(own), _MOST_ROWS)
+    laid = PlanTemplates.of(expected, cast(Plan, own), built, most=_SETTINGS_OF_TABLE)
+    rows = np.arange(len(own))
+    if len(own) > _MOST_ROWS:  # one in each of as many stretches; by the golden ratio, so that no column keeps step
+        stretch = np.arange(_MOST_ROWS)
+        rows = np.asarray((stretch + stretch * _GOLDEN % 1.0) * len(own) / _MOST_ROWS, dtype=np.int64)
     each = math.sqrt(len(own) / len(rows))  # every row taken stands for several, with as much information as they have
     laid = replace(laid, slopes=each * laid.slopes[rows], columns=each * laid.columns[rows])
-    found, cosines = audits_and_cosines(laid, cast(Any, names), simulator.unit)
+    found, cosines = audits_and_cosines(laid, list(names), simulator.unit)
     effects = tuple(
         replace(e, reason=e.reason if e.share > 0 else reasons.get(e.name, e.reason))
         if e.detectability == "invisible"
@@ -795,27 +712,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     )
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words
-    return PlanAudit(
-        cast(Plan, own),
-        assumed,
-        effects=effects,
-        cosines=cosines,
-        cures=(),
-        after=effects,
-        words=words,
-        classes=_alias_classes(effects),
-    )
-
-
-def _evenly_spread_rows(n_points: int, most: int) -> IntArray:
-    """Return all row numbers of a table or, of a longer one, `most` of them: one in each of as many equal stretches.
-
-    Its place there differs from stretch to stretch, by the golden ratio, so that no column of the table keeps step.
-    """
-    if n_points <= most:
-        return np.arange(n_points)
-    stretch = np.arange(most)
-    return np.asarray((stretch + stretch * _GOLDEN % 1.0) * n_points / most, dtype=np.int64)
+    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _alias_classes(effects))
 
 
 def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
@@ -828,12 +725,8 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
         if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-12 * max(float(np.abs(predicted).max()), 1e-300):
-            at = (
-                "the middle of the prior"
-                if k == 0
-                else "another point of the prior (at its middle, readings are constant or not finite)"
-            )
-            return z, predicted, at
+            other = "another point of the prior (at its middle, readings are constant or not finite)"
+            return z, predicted, other if k else "the middle of the prior"
         never &= ~np.isfinite(predicted)
         is_constant |= bool(np.isfinite(predicted).all())
     if never.any():

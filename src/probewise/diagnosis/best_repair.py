@@ -21,7 +21,7 @@ from probewise.diagnosis.held_out import (
     held_out_gain,
     mean_gain_over_parts,
     partition_into_blocks,
-    sequential_log_densities,
+    predictive_log_densities,
 )
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise_law import NoiseLaw
@@ -79,33 +79,10 @@ class Improvement:
     p_value_after: float
 
 
-def improvement_of(
-    searched: Searched,
-    test: GlobalTest,
-    best: WeighedFit,
-    noise: Names,
-    after: Linearised,
-    *,
-    shown: tuple[Fit, Fit],
-    rng: np.random.Generator,
-) -> Improvement:
-    """Measure the gain of the best fit over the null: in evidence and, under one noise, on held-out parts, in rms."""
-    null = test.null
-    law = best.evidence[noise].likeliest_law
-    rms = [searched.prepared.recording.rms(residuals_beside_walk(found.residuals, law)) for found in shown]
-    log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
-    if best is null:
-        return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value_after=test.p_value)
-    prepared = searched.prepared
-    parts = prepared.apparatus.held_out_parts(prepared.recording)
-    # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
-    own = null.evidence[null.possible_noise(noise)].likeliest_law
-    own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
-    held = held_out_gain(*shown, prepared.recording, law, parts, law_of_null=own)
-    p_after = bayes_factor_p_value(
-        after, searched.template_banks_for_global_test(best.found), after.draw_null_residuals(N_DRAWS, rng=rng)
-    )
-    return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_value_after=p_after)
+def p_value_after(searched: Searched, fit: WeighedFit, after: Linearised, *, rng: np.random.Generator) -> float:
+    """Return the p-value of the global test of a repaired model, linearised as `after`."""
+    draws = after.draw_null_residuals(N_DRAWS, rng=rng)
+    return bayes_factor_p_value(after, searched.template_banks_for_global_test(fit.found), draws)
 
 
 _RUIN = -1.0  # nats per held-out reading below which named effects are withdrawn
@@ -138,13 +115,23 @@ class BestRepair:
         out_of_vocabulary: Names = (),
         rng: np.random.Generator,
     ) -> BestRepair:
-        """Build from a fit and its noise effects, and measure the fit's gain over the null."""
+        """Measure the gain of a fit over the null: in evidence and, under one noise, on held-out parts, in rms."""
         noise = fit.possible_noise(noise)
         law, recording = fit.evidence[noise].likeliest_law, searched.prepared.recording
         repaired = fit_under_noise(fit, law, recording)
         calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
         after = Linearised.of(repaired, law)
-        gain = improvement_of(searched, test, fit, noise, after, shown=(calibrated, repaired), rng=rng)
+        rms = [recording.rms(residuals_beside_walk(found.residuals, law)) for found in (calibrated, repaired)]
+        held, p_after = HeldOutGain(0.0, 0.0, 0, ()), test.p_value
+        if fit is not test.null:
+            parts = searched.prepared.apparatus.held_out_parts(recording)
+            # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
+            own = test.null.evidence[test.null.possible_noise(noise)].likeliest_law
+            own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
+            held = held_out_gain(calibrated, repaired, recording, law, parts, law_of_null=own)
+            p_after = p_value_after(searched, fit, after, rng=rng)
+        log_evidence = fit.evidence[noise].log_z - test.null.evidence[searched.certain].log_z
+        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
         return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 
@@ -187,9 +174,7 @@ def judged_and_best_repair(
         noise = searched.posterior.likeliest_noise(stated)
     on_mean = tuple(name for name in judged.repaired_by if name not in on_noise)
     best = BestRepair.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
-    if judged.verdict == "named" and predicts_far_worse(
-        best.improvement
-    ):  # a fit that fails on held-out readings is no repair
+    if judged.verdict == "named" and predicts_far_worse(best.improvement):  # it is no repair
         return judged.with_verdict_withdrawn(), BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best
 
@@ -237,14 +222,12 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
     columns = bases[min(map(int, rivals), key=lambda i: (int(bases.widths[i]), -float(scores[i])))]
     norms = np.sqrt(np.mean(columns**2, axis=0))
     columns = columns[:, norms > 0] / norms[norms > 0]
-    plain = np.zeros((len(columns), 0))
     amount, _ = _amounts_and_covariance(found, problem, columns, np.ones(len(columns), dtype=np.bool_))
     change = np.concatenate([found.slopes, columns], axis=1) @ amount
 
     def gain_per_reading(out: BoolArray) -> FloatArray:
-        return _held_out_log_densities(found, problem, columns, out) - _held_out_log_densities(
-            found, problem, plain, out
-        )
+        with_basis, plain = (_held_out_log_densities(found, problem, c, out) for c in (columns, columns[:, :0]))
+        return with_basis - plain
 
     return Correction(change, columns, mean_gain_over_parts(part, gain_per_reading))
 
@@ -298,11 +281,7 @@ def improvement_and_correction(
             heldout_sd=math.hypot(gain.heldout_sd, held.sd),
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
             rms_after=searched.prepared.recording.rms(residuals_beside_walk(found.residuals, problem.law)),
-            p_value_after=bayes_factor_p_value(
-                problem,
-                searched.template_banks_for_global_test(best.fit.found),
-                problem.draw_null_residuals(N_DRAWS, rng=rng),
-            ),
+            p_value_after=p_value_after(searched, best.fit, problem, rng=rng),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
             break
@@ -337,13 +316,7 @@ def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray
     law = problem.law.without_tail_or_rounding()
     amount, covariance = _amounts_and_covariance(found, problem, columns, ~out)
     design = np.concatenate([found.slopes, columns], axis=1)
-    rest, own = law.take_readings(~out), law.take_readings(out)
+    rest = law.take_readings(~out)
     kept_miss = rest((found.residuals - design @ amount)[~out])
     sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
-    if law.has_memory:
-        return sequential_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)
-    miss = (found.residuals - design @ amount)[out]
-    total = sigma_2 * own.sd**2 + np.einsum("ij,jk,ik->i", design[out], covariance, design[out])
-    # At an end of the range a likelihood is relative to its peak, as for fits (`held_out_gain`).
-    peak = np.where(own.is_censored, 0.0, -0.5 * np.log(2 * math.pi * total))
-    return np.asarray((peak - 0.5 * miss**2 / total) * own.kept)
+    return predictive_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)

@@ -242,7 +242,6 @@ def prepare_system(
 
 
 def _progress_with_call_count(progress: Progress, system: System) -> Progress:
-    """Return a progress that also shows the number of calls of `simulate`, if the system has this function."""
     return progress if system.caller is None else ProgressWithCallCount(progress, system.caller)
 
 
@@ -382,7 +381,6 @@ def _combinations_with_a_chance(searched: Searched) -> list[Names]:
 
 
 def _refitted(searched: Searched, held: WeighedFit, system: System) -> WeighedFit:
-    """Refit a combination over another system of the same parameters, from where it was."""
     model = Model(system, held.found.model.effects, held.found.model.plan)
     again = searched.refits.fit_and_weigh(model, held.found.z[None, :], held.law)
     return again.with_variant_factor_and_weights(held.log_share, held.weights)

@@ -159,7 +159,6 @@ class Diagnosis(ShowsItself):
 
 
 def _with_code(hypothesis: Hypothesis) -> str:
-    """Return a hypothesis in words, followed by its label in diagnosis.json."""
     words, label = hypothesis_in_words(hypothesis.effects), hypothesis.label
     return words if words == label else f"{words} ({label})"
 
@@ -262,7 +261,6 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _public_names(effects: Iterable[str]) -> list[str]:
-    """Return the public names of effects, sorted; an effect that occurs twice is listed twice."""
     return sorted(map(name_without_copy_suffix, effects))
 
 

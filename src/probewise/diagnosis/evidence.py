@@ -181,7 +181,6 @@ def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
 
 
 def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
-    """Return the log evidence without the misfit, (n_laws,), for modes z (n_laws, n_params) and their curvatures."""
     widths = -0.5 * np.linalg.slogdet(curvature)[1]
     return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
 
@@ -466,7 +465,6 @@ def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) ->
 
 
 def _height(evidence: NoiseEvidence) -> float:
-    """Return the log evidence at the likeliest node, without the prior weights of nodes."""
     return float((evidence.log_z_nodes - evidence.nodes.log_weights).max(initial=-math.inf))
 
 

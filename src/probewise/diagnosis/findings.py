@@ -245,7 +245,6 @@ def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) ->
 
 
 def _scan_numbers_found(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
-    """Return one parameter `scans`, of the numbers, from 0, of the scans to which an effect is bound, if any."""
     numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
     return (_parameter_found("scans", "scan", numbers),) if numbers.size else ()
 
@@ -372,7 +371,6 @@ def formula_of(searched: Searched, judged: Judged, best: BestRepair, samples: Mo
 def _formula_from_samples(
     effect: NamedEffect[Any], values: FloatArray, unit: str, log_evidence: float, per_reading: float
 ) -> Formula:
-    """Describe an effect with an `expression` by samples of its parameters, (n_samples, n_params), and its gain."""
     _, side, target, _ = effect.name.split(":", 3)
     expression = str(getattr(effect, "expression", ""))
     return Formula(expression, side, target, parameters_found(effect, values, unit), log_evidence, per_reading)

@@ -54,8 +54,8 @@ class Predictor(Protocol):
 class Null(Protocol):
     """A model to be diagnosed, in coordinates in which its prior is a standard normal.
 
-    The sensor of the paper (`GaussianMixtureSensor`), one with a free-form SSF (`FreeFormSensor`), a sensor over an
-    unknown shape (`SensorAndShape`), or a simulator of a table (`systems.System`).
+    A sensor over known patterns (`CalibratedSensor`) or over an unknown shape (`SensorAndShape`), or a simulator of a
+    table (`systems.System`).
     """
 
     @property
@@ -166,7 +166,6 @@ def difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Convert predictions at these points, (n_params + 1, n_points), to that at z and slopes (n_points, n_params)."""
     with np.errstate(invalid="ignore", over="ignore"):  # at a start from which the model diverges, which is not taken
         return batch[0], (batch[1:] - batch[0]).T / steps
 
@@ -423,7 +422,6 @@ def _fit_coroutine(
 
 
 def _points_after_steps(z: FloatArray, steps: FloatArray) -> FloatArray:
-    """Return the points after steps from z, each coordinate by 2 at most and within the bounds, (n_steps, n_params)."""
     return np.clip(z + np.clip(steps, -2.0, 2.0), -FARTHEST, FARTHEST)
 
 

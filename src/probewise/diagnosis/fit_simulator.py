@@ -270,7 +270,6 @@ def fit_simulator(
 
 
 def _noise_model(recording: Recording, sd: float) -> NoiseModel:
-    """Return white noise of unknown sd, with the rounding step that was declared, if it shows."""
     step = recording.plan.instrumentation.step or 0.0
     least = _ROUNDING * float(np.abs(recording.readings[recording.usable]).max())
     return NoiseModel((), recording, {}, step if sd < HIDDEN * step else 0.0, least)

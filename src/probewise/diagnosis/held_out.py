@@ -132,22 +132,42 @@ def _refit_log_densities(
     covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
     # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
     hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
-    if (of_its_own | hardly_told).any() or law.has_memory:
-        return sequential_log_densities(law, out, miss, slopes, without.z - about, covariance, sigma_2)
-    miss, slopes, own = miss[out], slopes[out], law.take_readings(out)
-    spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
+    sequential = bool((of_its_own | hardly_told).any())
+    return predictive_log_densities(
+        law, out, miss, slopes, without.z - about, covariance, sigma_2, sequential=sequential
+    )
 
-    def log_density(miss: FloatArray) -> FloatArray:
+
+def predictive_log_densities(
+    law: NoiseLaw,
+    out: BoolArray,
+    miss: FloatArray,
+    slopes: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
+    sigma_2: float,
+    *,
+    sequential: bool = False,
+) -> FloatArray:
+    """Return the log density of each held-out reading from a linear model of the others, (n_out,); 0 for lost ones.
+
+    Arguments as of `sequential_log_densities`, which is used if asked for, or if the noise has memory.
+    """
+    if sequential or law.has_memory:
+        return sequential_log_densities(law, out, miss, slopes, mean, covariance, sigma_2)
+    own, left = law.take_readings(out), (miss - slopes @ mean)[out]
+    spread = np.einsum("ij,jk,ik->i", slopes[out], covariance, slopes[out])
+
+    def log_density(left: FloatArray) -> FloatArray:
         narrow, wide = (
-            _log_normal_density(miss, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
+            _log_normal_density(left, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
             for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
         )
         return np.asarray(np.logaddexp(narrow, wide))
 
-    density = log_density(miss)
-    if own.is_censored.any():
-        density -= np.where(own.is_censored, log_density(np.zeros(len(miss))), 0.0)
-    return np.asarray(density * own.kept)
+    # At an end of the range it is a likelihood, relative to its peak.
+    at_end = np.where(own.is_censored, log_density(np.zeros(len(left))), 0.0)
+    return np.asarray((log_density(left) - at_end) * own.kept)
 
 
 def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Model
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.sensors import GaussianMixtureSensor
+from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.recordings.plan import Recording
 
 _HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
@@ -96,7 +96,6 @@ class HypothesisProblem:
 
     @cached_property
     def _kept_node_indices(self) -> list[int]:
-        """Indices of the fewest noise nodes that hold 99.9 % of the evidence."""
         order = np.argsort(-self.noise.weights)
         n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
         kept: list[int] = order[:n_kept].tolist()
@@ -129,7 +128,7 @@ class FoldedNormal(StandardNormal):
     the point, (n_params,).
     """
 
-    sensor: GaussianMixtureSensor
+    sensor: CalibratedSensor
     near: FloatArray
 
     def __post_init__(self) -> None:
@@ -137,7 +136,6 @@ class FoldedNormal(StandardNormal):
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
-        """Maps z @ turn + shift to every other order: turn (n_others, n_own, n_own), shift (n_others, 1, n_own)."""
         n_own = self.sensor.n_params
         orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
         shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])
@@ -186,6 +184,6 @@ def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProb
     exchangeable Gaussians.
     """
     sensor = problem.model.sensor
-    if not (isinstance(sensor, GaussianMixtureSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):
+    if not (isinstance(sensor, CalibratedSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):
         return problem
     return FoldedProblem(problem, FoldedNormal(problem.model.n_params, sensor, near))

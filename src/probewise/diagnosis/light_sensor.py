@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Words
+from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Command, Words
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
@@ -33,69 +33,50 @@ BREAK_S = 30.0  # seconds to turn the sensor, or to exchange the sheet
 LAY_S = 60.0  # additional seconds to lay a new sheet
 
 
-@dataclass(frozen=True, eq=False)
-class Scan:
-    """One scan that the arm could take: kind, description as an instruction, and plan.
-
-    `kind`: "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet, "lay".
-    """
-
-    kind: str
-    description: str
-    plan: Plan
-
-    @property
-    def minutes(self) -> float:
-        """Duration in minutes, including the break before it."""
-        scanning = (float(np.ptp(self.plan.time_s)) + BREAK_S) / 60.0 if len(self.plan) else 0.0
-        return scanning + self.sheet_laying_s / 60.0
-
-    @property
-    def sheet_laying_s(self) -> float:
-        """Additional break before it for laying a sheet, in seconds."""
-        return LAY_S if self.kind == "lay" else 0.0
+def scan_command(kind: str, description: str, plan: Plan) -> Command:
+    """Return a scan that the arm could take."""
+    scanning = (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
+    return Command(kind, description, plan, scanning + _sheet_laying_s(kind) / 60.0)
 
 
-def earliest_start_s(plan: Plan) -> float:
-    """Return the earliest start of a scan after a plan, in s."""
+def _sheet_laying_s(kind: str) -> float:
+    return LAY_S if kind == "lay" else 0.0
+
+
+def _earliest_start_s(plan: Plan) -> float:
     return float(plan.time_s.max(initial=0.0)) + BREAK_S
 
 
-def plan_of_alternatives(commands: Sequence[Scan], after: Plan) -> Plan:
+def plan_of_alternatives(commands: Sequence[Command], after: Plan) -> Plan:
     """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
 
-    Covariates that the scans lack, such as battery voltage, keep their last value of that plan.
+    Covariates that cannot be commanded, such as battery voltage, keep their last known value of that plan.
     """
-    return _with_last_known_covariates(commands, after)
-
-
-def plan_of_sequence(commands: Sequence[Scan], after: Plan) -> Plan:
-    """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
-
-    Covariates that the scans lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
-    """
-    out: list[Scan] = []
-    for scan in commands:
-        out.append(_scan_started_at(scan, earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])))
-    return _with_last_known_covariates(out, after)
-
-
-def _with_last_known_covariates(scans: Sequence[Scan], after: Plan) -> Plan:
-    """Concatenate scans; covariates that cannot be commanded have their last known values of the preceding plan."""
-    plan = join_plans([scan.plan for scan in scans])
+    plan = join_plans([command.plan for command in commands])
     read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates})
 
 
-def scan_started_after(scan: Scan, plan: Plan) -> Scan:
+def plan_of_sequence(commands: Sequence[Command], after: Plan) -> Plan:
+    """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
+
+    Covariates that the scans lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
+    """
+    out: list[Command] = []
+    for scan in commands:
+        start_s = _earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])
+        out.append(_scan_started_at(scan, start_s))
+    return plan_of_alternatives(out, after)
+
+
+def scan_started_after(scan: Command, plan: Plan) -> Command:
     """Move a scan to after a plan, with time to lay its sheet."""
-    return _scan_started_at(scan, earliest_start_s(plan))
+    return _scan_started_at(scan, _earliest_start_s(plan))
 
 
-def _scan_started_at(scan: Scan, start_s: float) -> Scan:
-    """Start a scan at a time, plus the time to lay its sheet."""
-    delay_s = start_s + scan.sheet_laying_s - float(scan.plan.time_s[0])
+def _scan_started_at(scan: Command, start_s: float) -> Command:
+    delay_s = start_s + _sheet_laying_s(scan.kind) - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))
 
 
@@ -140,91 +121,69 @@ def excerpts_of_scan(
         change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(level)))])
         first = int(np.argmax(change[_NEAR - 1 :] - change[: 1 - _NEAR]))
         if change[first + _NEAR - 1] > change[first]:
-            rows = scan[first : first + _NEAR]
-            out.append(Excerpt("_near", " (where it changes most)", rows))
+            out.append(Excerpt("_near", " (where it changes most)", scan[first : first + _NEAR]))
     return out
 
 
-def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
+def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
     """List the scans that could follow a plan, each timed to start after it.
 
     `level`: expected readings, (n_points,): adds the part of each scan where they change most.
     """
-    controls = plan.instrumentation.controls
-    height_mm = plan.instrumentation.height_mm
-    gap_s, start_s = median_gap_s(plan), earliest_start_s(plan)
-    out: list[Scan] = []
+    controls, height_mm = plan.instrumentation.controls, plan.instrumentation.height_mm
+    out: list[Command] = []
     for scan in rows_of_distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
-        degrees = math.degrees(float(plan.orientation_rad[scan[0]]))
+        degrees = math.degrees(float(plan.orientation_rad[scan[0]])) + _TURN_DEG
         for part in excerpts_of_scan(scan, strides=strides, level=None if level is None else level[scan]):
-            rows, every, label = part.rows, part.words, f"{name}{part.suffix}"
-            once = rows_as_new_scan(plan, rows, start_s, gap_s, label)
-            both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
-            out += [
-                Scan("repeat", f"take scan {name} again{every}", _with_scan_name_suffix(once, "again")),
-                Scan(
+            rows, every, twice = part.rows, part.words, 2 * part.stride
+            once = rows_as_next_scan(plan, rows, name)
+            half = rows[: MOST_READINGS // 2 * 2 : 2]
+            both = rows_as_next_scan(plan, np.concatenate([half, half[::-1]]), name)
+            # Of every second reading, with unchanged time per reading.
+            faster = f"at {twice} times the speed (every {twice}th reading)"
+            faster = f"at double speed{every}" if part.stride == 1 else faster
+            taken = [
+                ("repeat", f"take scan {name} again{every}", once, "again"),
+                (
                     "reverse",
                     f"take scan {name} backwards{every}",
-                    rows_as_new_scan(plan, rows[::-1], start_s, gap_s, f"{label}_reversed"),
+                    rows_as_next_scan(plan, rows[::-1], name),
+                    "reversed",
                 ),
-                Scan(
-                    "respeed",
-                    f"scan {name} forth and back {_faster_scan_words(part)}",
-                    rows_as_new_scan(plan, both, start_s, gap_s, f"{label}_both"),
-                ),
+                ("respeed", f"scan {name} forth and back {faster}", both, "both"),
             ]
             if "orientation_deg" in controls:
                 turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
-                words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
-                out.append(Scan("rotate", words, _with_scan_name_suffix(turned, "turned")))
+                words = f"take scan {name} with the sensor turned to {degrees:.0f} degrees{every}"
+                taken.append(("rotate", words, turned, "turned"))
             if "led" in controls:
                 dark = replace(once, covariates={**once.covariates, "led": np.zeros(len(once))})
-                out.append(
-                    Scan("relight", f"take scan {name} with the LED off{every}", _with_scan_name_suffix(dark, "dark"))
-                )
+                taken.append(("relight", f"take scan {name} with the LED off{every}", dark, "dark"))
             if "height_mm" in controls and height_mm is not None:
                 commanded_mm = once.covariates.get("height_mm", np.full(len(once), np.nan))
                 high_mm = _RAISE * np.where(np.isfinite(commanded_mm), commanded_mm, height_mm)
                 where = f"{high_mm[0]:.4g} mm" if np.ptp(high_mm) == 0.0 else f"{_RAISE:g} times its height"
                 raised = replace(once, covariates={**once.covariates, "height_mm": high_mm})
-                words = f"take scan {name} with the sensor at {where}{every}"
-                out.append(Scan("raise", words, _with_scan_name_suffix(raised, "raised")))
+                taken.append(("raise", f"take scan {name} with the sensor at {where}{every}", raised, "raised"))
+            out += [
+                scan_command(kind, words, replace(own, scan_names=(f"{name}{part.suffix}_{how}",)))
+                for kind, words, own, how in taken
+            ]
     return out
 
 
-def rows_repeatable_without_hands(plan: Plan) -> IntArray:
-    """Return the rows over the last reading's pattern and, unless the arm turns the sensor, in its orientation."""
-    last = int(np.argmax(plan.time_s))
-    same_sheet = plan.pattern == plan.pattern[last]
-    turned_rad = np.abs(np.angle(np.exp(1j * (plan.orientation_rad - plan.orientation_rad[last]))))
-    as_mounted = turned_rad < math.radians(_TURN_DEG) / 2
-    return np.flatnonzero(same_sheet & (as_mounted | ("orientation_deg" in plan.instrumentation.controls)))
-
-
-def rows_as_new_scan(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
-    """Return rows of a plan, in order, as one new scan from `start_s` on, one every `gap_s`; commanded values stay."""
-    taken = plan.take(rows)
-    controls = plan.instrumentation.controls
+def rows_as_next_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
+    """Return rows of a plan, in order, as one new scan after it, at its pace; commanded values stay."""
+    taken, controls = plan.take(rows), plan.instrumentation.controls
     return replace(
         taken,
-        time_s=np.asarray(start_s + gap_s * np.arange(len(rows)), dtype=np.float64),
+        time_s=np.asarray(_earliest_start_s(plan) + median_gap_s(plan) * np.arange(len(rows)), dtype=np.float64),
         scan=np.zeros(len(rows), dtype=np.int64),
         scan_names=(name,),
         covariates={k: v for k, v in taken.covariates.items() if k in COMMANDED or k in controls},
         sessions=(),
     )
-
-
-def _faster_scan_words(part: Excerpt) -> str:
-    """Describe the speed of a scan of every second reading of an excerpt, with unchanged time per reading."""
-    if part.stride == 1:
-        return f"at double speed{part.words}"
-    return f"at {2 * part.stride} times the speed (every {2 * part.stride}th reading)"
-
-
-def _with_scan_name_suffix(plan: Plan, how: str) -> Plan:
-    return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
 
 
 def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
@@ -248,7 +207,7 @@ _STRIPES = (5, 10)  # numbers of stripes per scan
 _STRIDE = 4
 
 
-def target_swaps(plan: Plan) -> list[Scan]:
+def target_swaps(plan: Plan) -> list[Command]:
     """List scans over a white and a black sheet, along the other axis, and over moved or turned edges and stripes.
 
     Sheets and the other axis take the places of the plan's first moving scan; edges and stripes those of its first scan
@@ -257,67 +216,56 @@ def target_swaps(plan: Plan) -> list[Scan]:
     scans = rows_of_distinct_scans(plan)
     if not scans:
         return []
-    first = scans[0]
-    out = []
+    first, out = scans[0], []
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
-        flat = _rows_as_next_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
-        out.append(
-            Scan("lay", f"scan a plain {colour} surface", _with_pattern(flat, f"plain_{colour}", Uniform(albedo)))
-        )
+        flat = rows_as_next_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
+        flat = _with_pattern(flat, f"plain_{colour}", Uniform(albedo))
+        out.append(scan_command("lay", f"scan a plain {colour} surface", flat))
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts_of_scan(first, strides=(_STRIDE // 2, _STRIDE)):
-        across = _rotated_scan(_rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
-        out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
+        across = _rotated_scan(rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
+        words = f"scan at right angles to scan {name}, through its middle{part.words}"
+        out.append(scan_command("across", words, across))
     edges = ((scan, plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])) for scan in scans)
     laid = (_scans_over_moved_targets(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
     return [*out, *next(filter(None, laid), [])]
 
 
-def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
+def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command]:
     """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
-    beyond = _distance_inside_edge_mm(plan, scan, edge)
+    beyond = _distance_inside_edge_mm(plan, edge)[scan]
     length = float(np.ptp(beyond))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
         return []
-    once = _rows_as_next_scan(plan, scan, name)
+    once = rows_as_next_scan(plan, scan, name)
     half_round = replace(edge, normal_rad=edge.normal_rad + math.pi, offset_mm=-edge.offset_mm)
     laid = [
         (f"{name}_half_round", f"turn pattern {name} by 180 degrees about its edge and scan it", once, half_round),
         (f"{name}_quarter", f"turn pattern {name} and its scan by 90 degrees", *_rotated_scan_and_edge(once, edge)),
     ]
-    middle_mm = float(beyond.mean())
     for end in (-1.0, 1.0):
-        exactly_mm = middle_mm + end * _ASIDE * length
+        exactly_mm = float(beyond.mean()) + end * _ASIDE * length
         aside_mm = float(np.round(exactly_mm)) or exactly_mm
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
-        laid.append(
-            (
-                f"{name}_by_{aside_mm:g}_mm",
-                f"move pattern {name} by {aside_mm:g} mm along its normal and scan it",
-                once,
-                moved,
-            )
-        )
-    out = []
+        words = f"move pattern {name} by {aside_mm:g} mm along its normal and scan it"
+        laid.append((f"{name}_by_{aside_mm:g}_mm", words, once, moved))
+    parts: list[tuple[str, str, Plan, Excerpt, Pattern]] = []
     for label, words, whole, pattern in laid:
-        rows = np.arange(len(whole))
-        seen = ndtr(_distance_inside_edge_mm(whole, rows, pattern) / (_FOOTPRINT * length))
-        for part in excerpts_of_scan(rows, strides=(_STRIDE,), level=seen):
-            taken = _with_pattern(_rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
-            out.append(Scan("lay", f"{words}{part.words}", taken))
+        seen = ndtr(_distance_inside_edge_mm(whole, pattern) / (_FOOTPRINT * length))
+        excerpts = excerpts_of_scan(np.arange(len(whole)), strides=(_STRIDE,), level=seen)
+        parts += [(label, words, whole, part, pattern) for part in excerpts]
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
-        for part in excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE)):
-            taken = _with_pattern(_rows_as_next_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
-            out.append(Scan("lay", f"{words}{part.words}", taken))
+        excerpts = excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE))
+        parts += [(label, words, plan, part, stripes) for part in excerpts]
+    out = []
+    for label, words, whole, part, pattern in parts:
+        taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+        out.append(scan_command("lay", f"{words}{part.words}", taken))
     return out
-
-
-def _rows_as_next_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
-    return rows_as_new_scan(plan, rows, earliest_start_s(plan), median_gap_s(plan), name)
 
 
 def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
@@ -330,7 +278,6 @@ def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
 
 
 def _rotated_scan(scan: Plan) -> Plan:
-    """Rotate a scan's places by 90 degrees about their middle, anticlockwise."""
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
     return replace(scan, x_mm=x_mm - (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
 
@@ -346,9 +293,8 @@ def _rotated_scan_and_edge(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane
     return _rotated_scan(scan), replace(edge, normal_rad=normal_rad, offset_mm=float(edge.offset_mm + moved_mm))
 
 
-def _distance_inside_edge_mm(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
-    """Return the signed distance of rows from an edge, along its normal, in mm."""
-    return plan.x_mm[rows] * math.cos(edge.normal_rad) + plan.y_mm[rows] * math.sin(edge.normal_rad) - edge.offset_mm
+def _distance_inside_edge_mm(plan: Plan, edge: HalfPlane) -> FloatArray:
+    return plan.x_mm * math.cos(edge.normal_rad) + plan.y_mm * math.sin(edge.normal_rad) - edge.offset_mm
 
 
 def held_out_parts(recording: Recording) -> Parts:
@@ -375,15 +321,8 @@ _MOST_SCANS_ALONE = 24  # number of scans above which residuals are not located 
 
 def slope_along_motion(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
     """Differentiate predictions of a plan along each row's direction of motion, in readings per mm, (n_points,)."""
-    step = 0.25
-    ahead, behind = (
-        replace(
-            plan,
-            x_mm=plan.x_mm + s * plan.direction_of_motion[:, 0],
-            y_mm=plan.y_mm + s * plan.direction_of_motion[:, 1],
-        )
-        for s in (step, -step)
-    )
+    step, (along_x, along_y) = 0.25, plan.direction_of_motion.T
+    ahead, behind = (replace(plan, x_mm=plan.x_mm + s * along_x, y_mm=plan.y_mm + s * along_y) for s in (step, -step))
     # All rows are shifted together, so that directions, and hence backlash, do not change.
     return np.asarray((predict(ahead) - predict(behind)) / (2 * step))
 
@@ -399,10 +338,15 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
     moving = np.flatnonzero(sign != 0)
     scan = plan.scan[usable]
     degrees = orientation_deg(plan)[usable]
+    edge_mm = np.full(len(plan), np.inf)  # from the nearest edge of the row's pattern, if one is described
+    for name, rows in plan.rows_by_pattern():
+        if name in plan.patterns:
+            region = region_of(plan.patterns[name])
+            edge_mm[rows] = edge_distance(region, plan.x_mm[None, rows], plan.y_mm[None, rows])[0]
     pooled: Mapping[str, FloatArray] = {
         "time": plan.time_s[usable],
         "level": level,
-        "edge_distance": _edge_distance_mm(plan)[usable],
+        "edge_distance": edge_mm[usable],
         **{f"column {k}" if k in _NOT_COLUMNS else k: values[usable] for k, values in plan.covariates.items()},
     }
     out: list[Covariate] = []
@@ -456,29 +400,15 @@ def covariate_of_effect(
         return None
     if name == "level":
         return replace(pooled[name], values=without[pooled[name].rows])
-    return (_place_covariate_of_larger_change(change, plan) if name == "place" else None) or pooled[name]
-
-
-def _place_covariate_of_larger_change(change: FloatArray, plan: Plan) -> Covariate | None:
-    """Return the places along X or Y, for readings approached along it, whichever has the larger change."""
-    along_x, along_y = (np.flatnonzero(plan.direction_of_motion[:, k] != 0) for k in (0, 1))
-    strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
-    rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
-    return Covariate("place", values[rows], rows) if rows.size else None
-
-
-def _edge_distance_mm(plan: Plan) -> FloatArray:
-    """Return the distance of each row from the nearest edge of its pattern, mm; infinite without a described edge."""
-    out = np.full(len(plan), np.inf)
-    for name, rows in plan.rows_by_pattern():
-        if name in plan.patterns:
-            region = region_of(plan.patterns[name])
-            out[rows] = edge_distance(region, plan.x_mm[None, rows], plan.y_mm[None, rows])[0]
-    return out
+    if name == "place":  # along X or Y, of the readings approached along it, whichever has the larger change
+        along_x, along_y = (np.flatnonzero(plan.direction_of_motion[:, k] != 0) for k in (0, 1))
+        strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
+        rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
+        return Covariate("place", values[rows], rows) if rows.size else pooled[name]
+    return pooled[name]
 
 
 def _varies(values: FloatArray, size: float = 0.0) -> bool:
-    """Return whether values differ by more than 1e-9 of the largest, or of `size` if that is larger."""
     return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(size, float(np.abs(values).max()))
 
 
@@ -506,27 +436,21 @@ class LightSensorApparatus(Apparatus):
     )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Scale effects to a recording, by name: the vocabulary, effects out of it with a formula, and drifting noise.
-
-        Left out are effects that cannot act there or on the given null. Without a given null the SSF is free and
-        absorbs effects on the SSF, so these are left out.
-        """
         extent, plan = Extent.of(recording), recording.plan
         kinds = {**self.vocabulary, **RARE_EFFECTS, **NUISANCES}
-        if null is None:
-            absorbed = {
-                n for n, kind in kinds.items() if isinstance(kind, LightEffect) and kind.is_absorbed_by_ssf(plan)
+        if null is None:  # the SSF is free, and absorbs effects on the SSF
+            kinds = {
+                name: kind
+                for name, kind in kinds.items()
+                if not (isinstance(kind, LightEffect) and kind.is_absorbed_by_ssf(plan))
             }
-            kinds = {name: kind for name, kind in kinds.items() if name not in absorbed}
         able = {name: effect for name, kind in kinds.items() if (effect := kind.for_extent(extent)) is not None}
         return {name: effect for name, effect in able.items() if null is None or null.admits(effect)}
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        """Return the covariates that vary, and the predicted slope along the motion, per mm, (n_usable,)."""
         usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
         slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
@@ -537,15 +461,17 @@ class LightSensorApparatus(Apparatus):
     plan_of_sequence = staticmethod(plan_of_sequence)
 
     def settings_of(self, plan: Plan) -> FloatArray:
-        """Return place, orientation and a number for the pattern of each row, (n_points, 4)."""
         number = np.array([zlib.crc32(name.encode()) for name in plan.pattern_names])[plan.pattern]
         return np.stack([plan.x_mm, plan.y_mm, orientation_deg(plan), number], axis=1)
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-    ) -> list[Scan]:
-        """List the scans that the arm can take, and with `hands` those over an exchanged or turned target."""
+    ) -> list[Command]:
         if self.hands:
             return [*candidate_scans(plan, strides=strides, level=level), *target_swaps(plan)]
-        rows = rows_repeatable_without_hands(plan)
+        # Over the last reading's pattern and, unless the arm turns the sensor, in its orientation.
+        last = int(np.argmax(plan.time_s))
+        turned_rad = np.abs(np.angle(np.exp(1j * (plan.orientation_rad - plan.orientation_rad[last]))))
+        able = (turned_rad < math.radians(_TURN_DEG) / 2) | ("orientation_deg" in plan.instrumentation.controls)
+        rows = np.flatnonzero((plan.pattern == plan.pattern[last]) & able)
         return candidate_scans(plan.take(rows), strides=strides, level=None if level is None else level[rows])

@@ -145,7 +145,6 @@ def two_sided_amplitude_groups(found: Fit) -> Iterator[AmplitudeGroup]:
 
 
 def _two_sided_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:
-    """Return the heavy-tailed priors of the amplitudes that may have either sign, by the number of the parameter."""
     marginals = list(getattr(effect.prior, "marginals", {}).values())
     own = {k: marginals[k] for k in effect.amplitudes if k < len(marginals)}
     return {k: prior for k, prior in own.items() if isinstance(prior, HeavyTailedPrior) and not prior.positive}
@@ -195,7 +194,6 @@ class LinearView:
         return self.model.sensor.n_params
 
     def _theta_by_coordinates(self, z: FloatArray) -> FloatArray:
-        """Return the derivative of each of the null's parameters by its coordinate, (n_samples, n_own)."""
         theta = self.model.sensor.theta
         return np.asarray((theta(z[:, : self._n_own] + _STEP) - theta(z[:, : self._n_own] - _STEP)) / (2 * _STEP))
 
@@ -327,12 +325,10 @@ class ConditionallyLinearDensity:
 
     @cached_property
     def _own(self) -> int:
-        """Number of the amplitude among the coordinates without that of the grid."""
         return _number_without(self.at, self.amplitude.at[0])
 
     @cached_property
     def _probable_mask(self) -> BoolArray:
-        """Mask of the nodes that are not improbable, (n_nodes,)."""
         of_nodes = logsumexp(self.log_shares, axis=1)
         return np.asarray(of_nodes > of_nodes.max() - _IMPROBABLE)
 
@@ -344,7 +340,6 @@ class ConditionallyLinearDensity:
 
     @property
     def _probable_range(self) -> tuple[float, float]:
-        """The range of the nodes that are not improbable, with one more on either side."""
         first, last = np.flatnonzero(self._probable_mask)[[0, -1]]
         return float(self.nodes[max(first - 1, 0)]), float(self.nodes[min(last + 1, len(self.nodes) - 1)])
 
@@ -380,7 +375,6 @@ class ConditionallyLinearDensity:
         return np.where(np.isfinite(out), out, 0.0)
 
     def _interpolated_means(self, value: FloatArray) -> FloatArray:
-        """Return the means of all components at values of the grid's coordinate, (n, n_components, n_params - 1)."""
         position = (value - self.nodes[0]) / (self.nodes[1] - self.nodes[0])
         below = np.clip(np.floor(position), 0, len(self.nodes) - 2).astype(np.int64)
         share = (position - below)[:, None, None]
@@ -415,12 +409,10 @@ def _quadratic_log_likelihood(
 
 
 def _number_without(at: int, other: int) -> int:
-    """Return the number of a coordinate among those without the one at `at`."""
     return other - (other > at)
 
 
 def _inserted(x: FloatArray, at: int, amplitude: AmplitudeGroup) -> FloatArray:
-    """Return coordinates, (n, n_params), of all but one in which an amplitude is a value, (n, n_params - 1)."""
     out, own = x.copy(), _number_without(at, amplitude.at[0])
     out[:, [own]] = amplitude.coordinates(x[:, [own]])
     return np.insert(out, at, 0.0, axis=1)

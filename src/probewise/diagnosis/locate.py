@@ -103,7 +103,6 @@ class Place:
 
     @property
     def _within(self) -> BoolArray:
-        """Mask of the usable readings whose covariate lies in the window."""
         values = np.zeros(0) if self.values is None else self.values
         if self.start is None or self.end is None:
             return np.isfinite(values)

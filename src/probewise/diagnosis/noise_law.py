@@ -60,7 +60,6 @@ class RoundedNormal:
 
     @cached_property
     def _half_by_reading(self) -> FloatArray:
-        """Half width of each reading's flat top, in sds of its normal part, (n_points, k) or as `half`."""
         return np.asarray(self.half / self.sd)
 
     @cached_property
@@ -102,13 +101,11 @@ class RoundedNormal:
 
 
 def _log_density(x: FloatArray, half: FloatArray) -> FloatArray:
-    """Return the log density of a standard normal plus a uniform part of this half width; arrays broadcast."""
     away = np.abs(x)
     return np.asarray(log_gaussian_mass_between(-half - away, half - away) - np.log(2 * half))
 
 
 def _score(x: FloatArray, half: FloatArray) -> FloatArray:
-    """Return minus the derivative of that log density."""
     log_mass = _log_density(x, half) + np.log(2 * half) + _LOG_ROOT_2_PI
     return np.asarray(np.exp(-0.5 * (x - half) ** 2 - log_mass) - np.exp(-0.5 * (x + half) ** 2 - log_mass))
 
@@ -121,7 +118,6 @@ def _fisher_information_of_rounded(half: float) -> float:
 
 
 def _log_fisher_information(half: float | FloatArray) -> FloatArray:
-    """Return the log of the information at many half widths, of any shape; wide flat tops inform by their edges."""
     log_half = np.log(half)
     beyond = np.maximum(log_half - _LOG_HALVES[-1], 0.0)
     return np.asarray(np.interp(log_half, _LOG_HALVES, _tabulated_log_information()) - beyond)
@@ -215,7 +211,6 @@ class NoiseLaw:
 
     @property
     def _counted(self) -> BoolArray:
-        """Mask of the readings that are neither lost nor censored, (n_points,)."""
         return ~(self.lost | self.is_censored)
 
     @property
@@ -355,7 +350,6 @@ class NoiseLaw:
 
     @cached_property
     def _whitening_sd(self) -> FloatArray:
-        """Relative sd by which each reading is divided, (n_points,); rounding tells less the smaller the own sd."""
         density = self.whitened_density
         if isinstance(density, RoundedNormal) and np.ndim(density.sd):
             return np.asarray(density.whitening_sd)[:, 0]
@@ -513,12 +507,10 @@ class Tail:
         return np.asarray(expit(self._log_odds_of_wide(squares)))
 
     def _log_odds_of_wide(self, squares: FloatArray) -> FloatArray:
-        """Return the log odds that a residual is from the wide component, from its square over sigma^2."""
         share, times = np.asarray(self.share), np.asarray(self.times)
         return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
 
     def _relative_precisions(self, squares: FloatArray) -> FloatArray:
-        """Return the expected precision of each residual relative to the narrow component."""
         return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide_probability(squares))
 
 

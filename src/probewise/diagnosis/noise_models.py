@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_banded, solveh_banded
+from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
@@ -29,34 +29,6 @@ from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
 
-@dataclass(frozen=True, eq=False)
-class _Chain:
-    """The chain of a noise distribution, in units of sigma; arrays (n_points,) in the chain's order.
-
-    `order` numbers the readings; x_k is `kept_share` times that of the reading before it plus noise of variance
-    `gained`; the reading shows `scale` times x_k plus independent noise of variance `beside`.
-    """
-
-    order: IntArray
-    kept_share: FloatArray
-    gained: FloatArray
-    beside: FloatArray
-    scale: FloatArray
-
-    @classmethod
-    def of(cls, law: NoiseLaw) -> _Chain:
-        n = len(law.sd)
-        if law.walk.size:
-            return cls(np.arange(n), np.ones(n), law.walk, law.sd**2, np.ones(n))
-        root = np.arange(n)
-        if law.before.size:  # rows of runs may alternate: those of one run together
-            for k in np.flatnonzero(law.carry).tolist():
-                root[k] = root[law.before[k]]
-        order = np.argsort(root, kind="stable")
-        carry = law.carry[order]
-        return cls(order, carry, 1 - carry**2, np.zeros(n), law.sd[order])
-
-
 def innovations_given_rest(law: NoiseLaw, columns: FloatArray, asked: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Whiten the noise of some readings given that of all others: what the others and earlier ones do not tell of each.
 
@@ -65,70 +37,13 @@ def innovations_given_rest(law: NoiseLaw, columns: FloatArray, asked: BoolArray)
     readings asked for, (n_asked, n_columns), of sd sigma each and independent, 0 where lost; and the sd of each reading
     in units of sigma, given the other readings and those asked for before it, (n_asked,), 1 where lost.
     """
-    chain = _Chain.of(law)
-    seen, own = ~law.lost[chain.order], asked[chain.order]
-    given = seen & ~own
-    y = np.where(seen[:, None], columns[chain.order] / chain.scale[:, None], 0.0)
-    precision, later = _told_by_later(chain, given, y)
-    mean, variance = _told_by_earlier(chain, seen, y)
-    total = 1 + variance * precision
-    expected = (mean + variance[:, None] * later) / total[:, None]
-    sd = np.sqrt(variance / total + chain.beside)
-    sd = np.where(seen, sd, 1.0)
-    out, sd_out = np.zeros(y.shape), np.ones(len(y))
-    out[chain.order] = np.where(seen[:, None], (y - expected) / sd[:, None], 0.0)
-    sd_out[chain.order] = np.where(seen, sd * chain.scale, 1.0)
-    return out[asked], sd_out[asked]
-
-
-def _told_by_earlier(chain: _Chain, seen: BoolArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the means, (n_points, n_columns), and variances, (n_points,), of x_k given the readings before k."""
-    n = len(y)
-    variance, share, stays = np.empty(n), np.zeros(n), np.ones(n)
-    rows = zip(chain.kept_share.tolist(), chain.gained.tolist(), chain.beside.tolist(), seen.tolist(), strict=True)
-    after = 0.0  # variance of x_(k-1) given the readings up to it
-    for k, (kept, gained, beside, is_seen) in enumerate(rows):
-        now = kept * kept * after + gained
-        variance[k] = now
-        if is_seen:
-            share[k] = now / (now + beside)
-            stays[k] = beside / (now + beside)
-        after = now * stays[k]
-    # mean_(k+1) = a_(k+1) (stays_k mean_k + share_k y_k)
-    entering = np.zeros(y.shape)
-    entering[1:] = (chain.kept_share[1:] * share[:-1])[:, None] * y[:-1]
-    bands = np.ones((2, n))
-    bands[1, :-1] = -chain.kept_share[1:] * stays[:-1]
-    return np.asarray(solve_banded((1, 0), bands, entering, check_finite=False)), variance
-
-
-def _told_by_later(chain: _Chain, given: BoolArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return what the given readings after k tell of x_k: precision, (n_points,), and its product with the mean.
-
-    The products have the shape of `y`, (n_points, n_columns).
-    """
-    n = len(y)
-    precision, stays, share = np.zeros(n), np.zeros(n), np.zeros(n)
-    rows = list(
-        zip(chain.kept_share.tolist(), chain.gained.tolist(), chain.beside.tolist(), given.tolist(), strict=True)
-    )
-    for k in range(n - 1, 0, -1):
-        kept, gained, beside, is_given = rows[k]
-        known = precision[k]
-        if is_given:
-            across = (1 + beside * known) * gained + beside
-            precision[k - 1] = kept * kept * (1 + beside * known) / across
-            share[k], stays[k] = kept / across, kept * beside / across
-        else:
-            across = 1 + gained * known
-            precision[k - 1] = kept * kept * known / across
-            stays[k] = kept / across
-    # later_(k-1) = share_k y_k + stays_k later_k
-    entering = np.zeros(y.shape)
-    entering[:-1] = share[1:, None] * y[1:]
-    bands = np.ones((2, n))
-    bands[0, 1:] = -stays[1:]
-    return precision, np.asarray(solve_banded((0, 1), bands, entering, check_finite=False))
+    law, there = replace(law, flat=0.0), ~law.lost[asked]
+    # A whitening w of all readings has w^T w for their precision; a part of it is that of some given all others.
+    own = law(np.eye(len(columns))[:, asked & ~law.lost])
+    root = np.linalg.cholesky((own.T @ own)[::-1, ::-1])[::-1, ::-1]  # upper: root root^T is the precision
+    innovations, sd = np.zeros((len(there), columns.shape[1])), np.ones(len(there))
+    innovations[there], sd[there] = np.linalg.solve(root, own.T @ law(columns)), 1 / np.diag(root)
+    return innovations, sd
 
 
 def walk_given_readings(law: NoiseLaw, residuals: FloatArray) -> FloatArray:
@@ -209,7 +124,6 @@ def _smoothed_and_variance(
 
 
 def _log_density(apart: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return the normal log density, without its constant."""
     return np.asarray(-0.5 * np.log(variance) - 0.5 * apart**2 / variance)
 
 
@@ -276,9 +190,8 @@ class NoiseModel:
         banks = [self.likely.get(e.name) or e.weighed_nodes(whitened, rows) for e in self.effects]
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for bank, log_each in banks:
-            settings = np.concatenate(
-                [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
-            )
+            every = [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))]
+            settings = np.concatenate(every, axis=1)
             log_weights = (log_weights[:, None] + log_each).ravel()
         laws = self.laws_at(settings, predicted)
         if self.rounding:
@@ -297,8 +210,11 @@ class NoiseModel:
         `predicted` are predictions of the usable rows, (n_usable,).
         """
         residuals, sd = self._residuals_and_rough_sd(predicted)
-        span = float(np.ptp(predicted)) or 1.0
-        noise = self._noise_parameters_at_nodes(settings, np.clip((predicted - predicted.min()) / span, 0.0, 1.0))
+        plan, span, seen = self.recording.plan, float(np.ptp(predicted)) or 1.0, np.zeros((1, len(self.recording)))
+        seen[0, self.recording.usable] = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
+        noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=seen)
+        for effect, own in effects_with_columns(self.effects):
+            noise = effect.apply(noise, settings[:, own], plan)
         far = np.abs(residuals) > _FAR * sd
         laws = (self._law_at_node(noise, k, far) for k in range(len(settings)))
         left = self._usable_readings - predicted
@@ -312,55 +228,32 @@ class NoiseModel:
         sd = max(float(np.median(np.abs(free))) / MAD_OF_NORMAL, self._rounding_step / math.sqrt(12))
         return residuals, sd or 1.0
 
-    def _noise_parameters_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
-        """Return the relative sds, correlations, ... of the noise at all nodes, with every noise effect applied.
-
-        `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) predictions from 0 to 1.
-        """
-        plan, usable = self.recording.plan, self.recording.usable
-        everywhere = np.zeros((1, len(plan)))
-        everywhere[0, usable] = seen
-        noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
-        for effect, own in effects_with_columns(self.effects):
-            noise = effect.apply(noise, settings[:, own], plan)
-        return noise
-
     def _law_at_node(self, noise: NoiseParameters, node: int, far: BoolArray) -> NoiseLaw:
         def value_at_node(values: FloatArray) -> float:
             return float(values[min(node, len(values) - 1), 0])
 
         sd = noise.sd[min(node, len(noise.sd) - 1)]
         sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
-        lost_share = value_at_node(noise.lost_share)
-        value = value_at_node(noise.lost_value)
-        lost = np.zeros_like(far)
+        lost_share, value, lost = value_at_node(noise.lost_share), value_at_node(noise.lost_value), np.zeros_like(far)
         if lost_share > 0:
             lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * self._span + 1e-14 * abs(value))
-        carry = np.where(
-            self._n_rows_since_previous_in_scan > 0,
-            value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),
-            0.0,
-        )
+        n_rows, above = self._n_rows_since_previous_in_scan, self._previous_in_scan
+        carry = np.where(n_rows > 0, value_at_node(noise.rho) ** np.maximum(n_rows, 1), 0.0)
         # The noise of a censored reading is not known: none is correlated with it.
         unknown = lost | self._censored
-        carry[unknown] = 0.0
-        above = self._previous_in_scan
-        carry[(above >= 0) & unknown[above]] = 0.0
+        carry[unknown | (above >= 0) & unknown[above]] = 0.0
         walk = np.zeros(0)
         if np.any(noise.walk):  # from the row of the previous usable reading, even of another run
-            n_rows = np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
-            walk = value_at_node(noise.walk) ** 2 * n_rows
+            walk = value_at_node(noise.walk) ** 2 * np.diff(np.flatnonzero(self.recording.usable), prepend=-1.0)
         log_extra = 0.0
         if lost_share > 0:
-            n_lost, cells = (
-                int(lost.sum()),
-                max(self._span / self._lost_value_resolution, 1.0),
-            )
+            n_lost, cells = int(lost.sum()), max(self._span / self._lost_value_resolution, 1.0)
             # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
             log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
             log_extra += int((lost & self._censored).sum()) * math.log(self._lost_value_resolution)
             log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
+        interleaved = np.any((above >= 0) & (above != np.arange(len(above)) - 1)) and np.any(carry)
         return NoiseLaw(
             sd,
             carry,
@@ -370,15 +263,12 @@ class NoiseModel:
             log_extra,
             least=self.least_sd,
             walk=walk,
-            before=np.maximum(above, 0)
-            if np.any((above >= 0) & (above != np.arange(len(above)) - 1)) and np.any(carry)
-            else np.zeros(0, dtype=np.int64),
+            before=np.maximum(above, 0) if interleaved else np.zeros(0, dtype=np.int64),
             censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
         )
 
     @cached_property
     def _censored(self) -> BoolArray:
-        """Mask of the usable readings at an end of the instrument's range, (n_usable,)."""
         return self.recording.censored[self.recording.usable]
 
     @cached_property
@@ -391,7 +281,6 @@ class NoiseModel:
 
     @cached_property
     def _span(self) -> float:
-        """Range of the usable readings."""
         return float(np.ptp(self._usable_readings))
 
     @cached_property
@@ -400,12 +289,10 @@ class NoiseModel:
 
     @cached_property
     def _lost_value_resolution(self) -> float:
-        """Width of a cell, in reading units: lost readings have one value to within it."""
         return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
     def _rounding_step(self) -> float:
-        """Rounding step of all readings, 0 if there is none."""
         return lattice_step(self._usable_readings)
 
 

@@ -202,7 +202,6 @@ def _least_trimmed_fit(
 
 
 def _farthest(residual: FloatArray, n: int, law: NoiseLaw) -> BoolArray:
-    """Return the mask of the n largest residuals, (n_points,), none of them at an end of the range."""
     size = np.where(law.is_censored, 0.0, np.abs(residual))
     return np.isin(np.arange(len(size)), np.argsort(-size, kind="stable")[:n])
 

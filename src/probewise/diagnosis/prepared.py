@@ -21,10 +21,11 @@ from probewise.diagnosis.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,
     SensorPrior,
-    SsfForms,
+    default_sensor,
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
+    starts_of_one_gaussian,
 )
 from probewise.effects import Extent, NamedEffect, NoiseEffect
 from probewise.effects.noise import LARGEST_SIZE
@@ -121,7 +122,6 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
 
 
 def _unused_scan_names(names: Sequence[str], taken: Sequence[str]) -> list[str]:
-    """Return a plan's scan names, those that are taken renamed; names that differ stay different."""
     new: dict[str, str] = {}
     for name in dict.fromkeys(names):
         new[name] = unused_name(name, {*taken, *new.values(), *({*names} - {name})})
@@ -186,7 +186,6 @@ def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str
 
 
 def _is_same_pattern(one: Pattern, other: Pattern) -> bool:
-    """Return whether two patterns have the same kind and values; of an image, the name of its file too."""
     return have_same_albedo(one, other) and getattr(one, "file", None) == getattr(other, "file", None)
 
 
@@ -374,7 +373,8 @@ def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus
     wild = np.flatnonzero(recording.usable & (np.abs(readings - middle) > _WILD * (high - low)))
     if null is None:
         kept = replace(recording, left_out=(*recording.left_out, *wild.tolist()))
-        null, starts = SsfForms(Extent.of(kept)).one_gaussian_and_starts()
+        null = default_sensor(Extent.of(kept), 1)
+        starts = starts_of_one_gaussian(null)
     else:
         starts = null.starts
     model = Model(null, (), recording.plan)

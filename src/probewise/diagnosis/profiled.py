@@ -131,17 +131,12 @@ class ProfiledDensity:
 
     @cached_property
     def _cell_probabilities(self) -> FloatArray:
-        """Probability of each of the equal cells between the first and the last node, (n_cells,)."""
         middle = 0.5 * (self._cell_edges[1:] + self._cell_edges[:-1])
         log_density = np.interp(middle, self.nodes, self.log_evidence)
         shares = np.exp(log_density - log_density.max())
         return np.asarray(shares / shares.sum())
 
     def _means_and_nearest_slices(self, value: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Interpolate the other coordinates' modes at values of the sliced one, and find the nearest slices.
-
-        Returns (n_samples, n_params - 1), and indices of slices, (n_samples,).
-        """
         middle = np.stack([np.interp(value, self.nodes, column) for column in self.modes.T], axis=1)
         return middle, np.argmin(np.abs(value[:, None] - self.nodes), axis=1)
 
@@ -216,10 +211,5 @@ def _nonlinear_coordinates(found: Fit) -> list[int]:
 
 
 def _normal_equations(joined: FloatArray, rest: FloatArray, sd: float) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton matrix and the gradient of each slice's log posterior by its coordinates `rest`.
-
-    `rest` is (n_nodes, n_rest); `joined` (n_nodes, n_rest + 1, n_points) holds the derivatives of whitened residuals,
-    then the residuals.
-    """
     gram = joined @ joined.transpose(0, 2, 1) / sd**2
     return gram[:, :-1, :-1] + np.eye(rest.shape[1]), -gram[:, :-1, -1] - rest

@@ -172,6 +172,5 @@ def _named_sentence(judged: Judged, grounds: Grounds) -> str:
 
 
 def _joined_effect_sentences(names: Sequence[str], grounds: Grounds, *more: str) -> str:
-    """Join the sentences of effects, and `more`, without a full stop; "" if there are none."""
     said = "; ".join([*(grounds.sentences[name] for name in names if name in grounds.sentences), *more])
     return grounds.words.as_sentence(said)

@@ -270,7 +270,6 @@ def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[Name
 
 
 def _change_readings_alike(one: NamedEffect[Any], other: NamedEffect[Any]) -> bool:
-    """Return whether effects are equal, or variants of one form with the same action: these differ in priors alone."""
     act = getattr(one, "act", None)
     return one == other or (act is not None and act is getattr(other, "act", None))
 

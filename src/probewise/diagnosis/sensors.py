@@ -13,20 +13,19 @@ each with a normal prior, so that the evidence penalises only those used.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise._kinds import require_like
 from probewise.calibration import FittedSensor, mixture_moments
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
+from probewise.diagnosis.fit import FARTHEST, Model, Null
 from probewise.effects import Extent, NamedEffect
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
@@ -46,8 +45,13 @@ LEAST_READINGS = 24
 """Fewest usable readings for a verdict on a sensor."""
 
 
-class CalibratedSensor(ABC):
+@dataclass(frozen=True, eq=False)
+class CalibratedSensor:
     """A sensor over known patterns as a `Null`, with a normal prior of the natural coordinates of SSF and levels.
+
+    Its SSF is a mixture, of 6 n_gaussians + 1 coordinates: one less than the paper's parameters, since only ratios of
+    amplitudes matter. Or it has a free form (`is_free_form`): coordinates of one Gaussian and the two levels, then
+    N_BENDS weights.
 
     `center` (n_params,) is the prior's mean, `factor` a square root of its covariance. `calibrated_height_mm` is the
     height of an earlier calibration; None: the height that a plan declares.
@@ -56,64 +60,51 @@ class CalibratedSensor(ABC):
     n_gaussians: int
     center: FloatArray
     factor: FloatArray
-    calibrated_height_mm: float | None
-    predicts_in_bulk = predicts_cheaply_nearby = may_be_far_off = has_exchangeable_gaussians = False
-    nuisance_names: tuple[str, ...] = ()
-    least_readings = LEAST_READINGS
-
-    def coordinates(self, theta: FloatArray) -> None:
-        """Return None: what it simulates is no array of readings."""
-        return None
+    has_exchangeable_gaussians: bool = True
+    is_free_form: bool = False
+    calibrated_height_mm: float | None = None
+    predicts_in_bulk = predicts_cheaply_nearby = may_be_far_off = False
+    nuisance_names: ClassVar[tuple[str, ...]] = ()
+    least_readings: ClassVar[int] = LEAST_READINGS
 
     def __post_init__(self) -> None:
-        n = self.n_params
         object.__setattr__(self, "center", read_only_floats(self.center))
         object.__setattr__(self, "factor", read_only_floats(self.factor))
-        if self.center.shape != (n,) or self.factor.shape != (n, n):
-            raise ShapeError(
-                f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n},) and "
-                f"({n}, {n}) for {self.n_gaussians} Gaussians"
-            )
 
     @property
-    @abstractmethod
     def n_params(self) -> int:
-        """Number of coordinates."""
+        return len(self.center)
 
     @property
-    @abstractmethod
     def effective_n_gaussians(self) -> int:
-        """Number of Gaussians that its SSF counts as, the measure of its complexity."""
+        return 2 if self.is_free_form else self.n_gaussians  # the free form counts as one Gaussian more than one
 
     @property
-    @abstractmethod
     def ssf_in_words(self) -> str:
-        """Description of its SSF, in words."""
-
-    @abstractmethod
-    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
-
-    @abstractmethod
-    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
-        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
+        if self.is_free_form:
+            return "an SSF of free form"
+        return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
 
     @property
     def starts(self) -> FloatArray:
-        """One starting point: 0 in the coordinates z, the centre of the prior, (1, n_params)."""
         return np.zeros((1, self.n_params))
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return True: every effect can act on a sensor."""
         return True
+
+    def coordinates(self, theta: FloatArray) -> None:
+        return None
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates z, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
-        return self.theta_from_natural(self._natural_from_z(z))
+        natural = self._natural_from_z(z)
+        return free_form_to_theta(natural) if self.is_free_form else natural_to_theta(natural, self.n_gaussians)
 
     def z(self, theta: FloatArray) -> FloatArray:
-        """Map a_1 .. C_N, I_min, I_max to coordinates z: the inverse of `theta`."""
-        return self._z_from_natural(self.natural_from_theta(theta))
+        """Invert `theta`."""
+        return self._z_from_natural(
+            theta_to_free_form(theta) if self.is_free_form else theta_to_natural(theta, self.n_gaussians)
+        )
 
     def _natural_from_z(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
@@ -122,59 +113,15 @@ class CalibratedSensor(ABC):
         return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
-        """Build the chain (sensor, effects, scene) over the plan's patterns; `n_nodes` for curved edges."""
         return self.chain_over(cached_known_scene(plan), effects, n_nodes=n_nodes)
 
     def chain_over(self, scene: Scene, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
         """Build the chain (sensor, effects, scene) over any scene; `n_nodes` for curved edges."""
-        return Chain(
-            FreeMixture(self.n_gaussians),
-            FreeLevels(),
-            scene,
-            tuple(effects),
-            n_nodes=n_nodes,
-            calibrated_height_mm=self.calibrated_height_mm,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianMixtureSensor(CalibratedSensor):
-    """A sensor whose SSF is a mixture: 6 n_gaussians + 1 coordinates, one less than the paper's parameters.
-
-    Only ratios of amplitudes matter. The evidence counts the permutations of exchangeable Gaussians.
-    """
-
-    n_gaussians: int
-    center: FloatArray
-    factor: FloatArray
-    has_exchangeable_gaussians: bool = True
-    calibrated_height_mm: float | None = field(default=None, kw_only=True)
-
-    @property
-    def n_params(self) -> int:
-        """Number of coordinates."""
-        return 6 * self.n_gaussians + 1
-
-    @property
-    def effective_n_gaussians(self) -> int:
-        """Number of Gaussians."""
-        return self.n_gaussians
-
-    @property
-    def ssf_in_words(self) -> str:
-        """Number of Gaussians of the SSF, in words."""
-        return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
-
-    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, n_params + 1)."""
-        return natural_to_theta(natural, self.n_gaussians)
-
-    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
-        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
-        return theta_to_natural(theta, self.n_gaussians)
+        ssf, effects, height_mm = FreeMixture(self.n_gaussians), tuple(effects), self.calibrated_height_mm
+        return Chain(ssf, FreeLevels(), scene, effects, n_nodes=n_nodes, calibrated_height_mm=height_mm)
 
     def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
-        """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians in another order."""
+        """Return the coordinates, (n_samples, n_params), of the same mixture with its Gaussians in another order."""
         n, natural = self.n_gaussians, self._natural_from_z(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
@@ -219,72 +166,38 @@ def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
     return np.concatenate([logits, parts.reshape(len(theta), 5 * n_gaussians), theta[:, -2:]], axis=1)
 
 
-def default_sensor(extent: Extent, n_gaussians: int) -> GaussianMixtureSensor:
+def free_form_to_theta(natural: FloatArray) -> FloatArray:
+    """Map a free form's natural coordinates, (n_samples, 7 + N_BENDS), to theta, (n_samples, 6 N_FREE_FORM + 2)."""
+    one = natural_to_theta(natural[:, :-N_BENDS], 1)
+    return np.concatenate([free_form_theta(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
+
+
+def theta_to_free_form(theta: FloatArray) -> FloatArray:
+    """Invert `free_form_to_theta`."""
+    # The amplitude of the first does not enter its natural coordinates.
+    one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
+    return np.concatenate([theta_to_natural(one, 1), bend_coefficients(theta[:, :-2])], axis=1)
+
+
+def default_sensor(extent: Extent, n_gaussians: int) -> CalibratedSensor:
     """Return `n_gaussians` with the default prior: sds a fourteenth of the longest scan, to a factor of two."""
     length = extent.length_mm
     one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
     one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
     center = np.array([0.0] * (n_gaussians - 1) + one_center * n_gaussians + [extent.low, extent.high])
     sd = np.array([1.5] * (n_gaussians - 1) + one_sd * n_gaussians + [extent.span / 2] * 2)
-    return GaussianMixtureSensor(n_gaussians, center, np.diag(sd))
+    return CalibratedSensor(n_gaussians, center, np.diag(sd))
 
 
 _SHARE = 0.1  # prior sd of each weight, as a share of the mass
 
 
-@dataclass(frozen=True, eq=False)
-class FreeFormSensor(CalibratedSensor):
-    """A sensor with a free-form SSF.
-
-    Its natural coordinates are those of one Gaussian and the two levels, then N_BENDS weights of the free form.
-    """
-
-    center: FloatArray
-    factor: FloatArray
-    n_gaussians: int = field(default=N_FREE_FORM, init=False)
-    calibrated_height_mm: float | None = field(default=None, kw_only=True)
-
-    @classmethod
-    def from_one_gaussian(cls, one: GaussianMixtureSensor) -> Self:
-        """Build the prior from that of one Gaussian's place and size, with weights of sd 0.1 of the mass about 0."""
-        factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
-        factor[: one.n_params, : one.n_params] = one.factor
-        return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
-
-    def start_from_one_gaussian(self, one: FloatArray) -> FloatArray:
-        """Return one start of a fit, (1, n_params): coordinates of one Gaussian, (7,), with weights of 0."""
-        return np.pad(one, (0, N_BENDS))[None, :]
-
-    @property
-    def n_params(self) -> int:
-        """Number of coordinates."""
-        return 7 + N_BENDS
-
-    @property
-    def effective_n_gaussians(self) -> int:
-        """2: the free form counts as one Gaussian more than one."""
-        return 2
-
-    @property
-    def ssf_in_words(self) -> str:
-        """Description of its SSF: "an SSF of free form"."""
-        return "an SSF of free form"
-
-    def theta_from_natural(self, natural: FloatArray) -> FloatArray:
-        """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
-        one = natural_to_theta(natural[:, :-N_BENDS], 1)
-        return np.concatenate([free_form_theta(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
-
-    def natural_from_theta(self, theta: FloatArray) -> FloatArray:
-        """Map a_1 .. C_N, I_min, I_max to natural coordinates: the inverse of `theta_from_natural`."""
-        return theta_to_free_form_natural(theta)
-
-
-def theta_to_free_form_natural(theta: FloatArray) -> FloatArray:
-    """Map theta, (n_samples, 6 N + 2), to a free form's natural coordinates, (n_samples, 7 + N_BENDS)."""
-    # The amplitude of the first does not enter its natural coordinates.
-    one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
-    return np.concatenate([theta_to_natural(one, 1), bend_coefficients(theta[:, :-2])], axis=1)
+def with_free_form(one: CalibratedSensor) -> CalibratedSensor:
+    """Return a sensor of free form: the place and size of one Gaussian, and weights of sd 0.1 of the mass about 0."""
+    factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
+    factor[: one.n_params, : one.n_params] = one.factor
+    center = np.concatenate([one.center, np.zeros(N_BENDS)])
+    return CalibratedSensor(N_FREE_FORM, center, factor, has_exchangeable_gaussians=False, is_free_form=True)
 
 
 _RIDGE = 1e-8  # of each variance, by which a covariance of samples is sure to be positive
@@ -310,7 +223,7 @@ def sensor_from_posterior(
     mean = np.asarray(mean, dtype=np.float64)[at]
     cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
     free = is_free_form(mean[None, :-2])
-    natural_from_theta = theta_to_free_form_natural if free else partial(theta_to_natural, n_gaussians=n_gaussians)
+    natural_from_theta = theta_to_free_form if free else partial(theta_to_natural, n_gaussians=n_gaussians)
     center = natural_from_theta(mean[None, :])[0]
     steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
     up = natural_from_theta(mean + np.diag(steps))
@@ -322,12 +235,13 @@ def sensor_from_posterior(
     size[levels] = np.abs(center[levels]).max() or 1.0
     floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
-    return (
-        FreeFormSensor(center, factor, calibrated_height_mm=height_mm)
-        if free
-        else GaussianMixtureSensor(
-            n_gaussians, center, factor, has_exchangeable_gaussians=False, calibrated_height_mm=height_mm
-        )
+    return CalibratedSensor(
+        n_gaussians,
+        center,
+        factor,
+        has_exchangeable_gaussians=False,
+        is_free_form=free,
+        calibrated_height_mm=height_mm,
     )
 
 
@@ -372,42 +286,14 @@ def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
     return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T), height_mm=height_mm)
 
 
-Start = tuple[Null, FloatArray]
-"""A null and coordinates to fit it from, (n_starts, n_params)."""
-
-
-@dataclass(frozen=True, eq=False)
-class SsfForms:
-    """Forms of a sensor's SSF with priors scaled to a recording, each as a null with coordinates to fit it from."""
-
-    extent: Extent
-
-    def one_gaussian_and_starts(self) -> Start:
-        """Return a sensor of one Gaussian, and three starts: typical, narrow and wide."""
-        one = default_sensor(self.extent, 1)
-        return one, starts_of_one_gaussian(one)
-
-    def free_form_and_starts(self, found: Fit) -> Start:
-        """Return a sensor of free form, and one start: the fit of one Gaussian."""
-        one = found.model.sensor
-        assert isinstance(one, GaussianMixtureSensor)
-        free = FreeFormSensor.from_one_gaussian(one)
-        return free, free.start_from_one_gaussian(found.z)
-
-    def more_gaussians_and_starts(self, found: Fit, order: int) -> Start:
-        """Return a sensor of `order` Gaussians, one more than the fit has, and starts: splits of the fit's heaviest."""
-        wanted = default_sensor(self.extent, order)
-        return wanted, starts_with_more_gaussians(found.model.sensor, found.z, wanted)
-
-
-def starts_of_one_gaussian(sensor: GaussianMixtureSensor) -> FloatArray:
+def starts_of_one_gaussian(sensor: CalibratedSensor) -> FloatArray:
     """Return coordinates to start from for one Gaussian: typical, narrow and wide, (3, n_params)."""
     out = np.zeros((3, sensor.n_params))
     out[:, 2:4] = [[0.0], [-1.5], [1.5]]
     return out
 
 
-def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: GaussianMixtureSensor) -> FloatArray:
+def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: CalibratedSensor) -> FloatArray:
     """Split the heaviest Gaussian of a fit in three ways, as starts: coordinates of `wanted`, (3, wanted.n_params)."""
     theta = found.theta(z[None, : found.n_params])[0]
     n = found.n_gaussians
@@ -439,6 +325,9 @@ _REACH = 2.4
 _APART = 0.6
 _WIDTH = 0.35
 _FINE_SHARE = 0.03  # prior sd of each weight, as a share of the mass
+_CELLS = np.stack(np.meshgrid(np.arange(-8, 9), np.arange(-8, 9)), axis=-1).reshape(-1, 2)  # of a hexagonal grid
+_PLACES = _APART * np.stack([_CELLS[:, 0] + _CELLS[:, 1] / 2, _CELLS[:, 1] * np.sqrt(3) / 2], axis=-1)
+_PLACES = _PLACES[np.hypot(*_PLACES.T) <= _REACH]
 
 
 def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
@@ -465,14 +354,3 @@ def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> Floa
     chain = replace(sensor.chain(model.plan, (), n_nodes=FAST_NODES), ssf=FreeMixture(1))
     whole = model.predict(z[None, :])[0]  # normalised, so that the total weight is unchanged
     return np.asarray(_FINE_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
-
-
-def _hexagonal_grid() -> FloatArray:
-    """Return places on a hexagonal grid over a disc, (n, 2)."""
-    steps = np.arange(-8, 9)
-    i, j = (a.ravel() for a in np.meshgrid(steps, steps))
-    places = _APART * np.stack([i + j / 2, j * np.sqrt(3) / 2], axis=-1)
-    return np.asarray(places[np.hypot(*places.T) <= _REACH])
-
-
-_PLACES = _hexagonal_grid()

@@ -201,7 +201,6 @@ class _Descent:
         return np.concatenate(out).reshape(*x.shape[:-1], -1)
 
     def _height(self, residuals: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return minus the log density up to a constant, and the variance of a reading, (k,) both."""
         with np.errstate(all="ignore"):
             variance = np.maximum(np.sum(residuals**2, axis=-1) / self.law.n_kept, LEAST_SCALE**2)
             height = 0.5 * self.law.n_kept * np.log(variance) + 0.5 * np.sum(np.where(self.flat, 0.0, x) ** 2, axis=-1)

@@ -281,6 +281,5 @@ class _Ridge:
         return np.concatenate(out)
 
     def _heights(self, residuals: FloatArray, z: FloatArray) -> FloatArray:
-        """Return the log density up to a constant, (k,), with the likeliest noise sd."""
         squares = np.maximum(np.sum(residuals**2, axis=1), LEAST_SCALE)
         return np.asarray(-0.5 * self.law.n_kept * np.log(squares) - 0.5 * np.sum(z**2, axis=1))

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Words
+from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Command, Words
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
@@ -55,22 +55,7 @@ _BREAK = 0.5  # minutes, before a run
 _RUN = "run"
 
 
-@dataclass(frozen=True, eq=False)
-class RunCommand:
-    """One run that could be recorded: kind, description, rows without readings (`table`), and duration in minutes."""
-
-    kind: str
-    description: str
-    table: RunTable
-    minutes: float
-
-    @property
-    def plan(self) -> Plan:
-        """The rows, as a plan."""
-        return cast(Plan, self.table)
-
-
-def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
+def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[Command]:
     """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
 
     At most four recorded runs are taken, those that differ in their controls.
@@ -78,7 +63,7 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
     `reading`: the predicted column, which is empty in rows yet to be taken; `controls`: columns that can be set;
     without any, runs can only be repeated.
     """
-    out: list[RunCommand] = []
+    out: list[Command] = []
     settable = [name for name in controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     for rows in _rows_of_distinct_runs(table, settable):
@@ -88,7 +73,7 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
         for kind, words, columns, slower in _variations_of_run(table, kept, ends, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
             made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
-            out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
+            out.append(Command(kind, words, cast(Plan, made), _minutes_of_runs(made, time_unit)))
     return out
 
 
@@ -137,7 +122,6 @@ def _variations_of_run(
 
 
 def _rounded_to_range(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Round values to a thousandth of a range or finer, so that they can be set; those at its ends stay."""
     if not low < high:
         return values
     decimals = int(np.ceil(3 - np.log10(high - low)))
@@ -157,7 +141,6 @@ def _planned_run(
 
     The run takes `slower` times as long as the rows did; parameters per run are taken as in the run `like`.
     """
-    taken = table.take(rows)
     changed: dict[str, Any] = {**columns}
     if reading in table.columns:
         changed[reading] = np.full(len(rows), np.nan)
@@ -167,13 +150,8 @@ def _planned_run(
         changed[table.time] = begin + slower * (time - time[0])
     run = table.run or unused_name(_RUN, table.columns)
     changed[run] = np.full(len(rows), name)
-    return replace(
-        taken,
-        columns={**taken.columns, **changed},
-        run=run,
-        like={name: table.like.get(like, like)},
-        first_row=len(table),
-    )
+    taken, as_run = table.take(rows), {name: table.like.get(like, like)}
+    return replace(taken, columns={**taken.columns, **changed}, run=run, like=as_run, first_row=len(table))
 
 
 def _next_start_time(table: RunTable) -> float:
@@ -186,18 +164,18 @@ def _next_start_time(table: RunTable) -> float:
     return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
 
 
-def plan_of_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def plan_of_alternatives(commands: Sequence[Command], after: Plan) -> Plan:
     """Concatenate alternative runs, each timed as if it came next, to predict all of them at once."""
-    first, *more = (command.table for command in commands)
+    first, *more = (cast(RunTable, command.plan) for command in commands)
     return cast(Plan, append_tables(first, more))
 
 
-def plan_of_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def plan_of_sequence(commands: Sequence[Command], after: Plan) -> Plan:
     """Concatenate runs to be recorded in sequence: each begins after the one before, unless time restarts with each."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []
     for command in commands:
-        table = command.table
+        table = cast(RunTable, command.plan)
         if table.time is not None and not recorded.time_begins_anew and out:
             later = float(out[-1].time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
             table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
@@ -218,13 +196,10 @@ def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[Int
 
 def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
     minutes = _minutes_of_time_unit(table, time_unit)
-    if minutes is None:
-        return _BREAK + len(table) * _A_READING
-    return _BREAK + float(np.ptp(table.time_s)) * minutes
+    return _BREAK + (len(table) * _A_READING if minutes is None else float(np.ptp(table.time_s)) * minutes)
 
 
 def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
-    """Return how many minutes a unit of a table's time has; None without a time, or in an unknown unit."""
     return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
 
@@ -276,13 +251,15 @@ class SimulatorApparatus(Apparatus):
 
     @property
     def rows_are_in_order(self) -> bool:
-        """Whether the order of the table's rows may be that of recording."""
         return self.about.rows_are_in_order
 
     @property
     def words(self) -> Words:
-        """Words for sentences about the simulator."""
-        own = self.system.simulator
+        own, caller = self.system.simulator, self.system.caller
+        facts = [("simulator", own.source or "given in Python")]
+        if caller is not None:
+            how = "for all samples at once" if caller.broadcasts else "for one sample after the other"
+            facts.append(("calls of simulate", f"{caller.n_calls:,}, {how}"))
         return Words(
             null="the simulator",
             find_signal="record where the reading changes",
@@ -301,24 +278,15 @@ class SimulatorApparatus(Apparatus):
             units={"time": own.time_unit, "level": "{reading}", "previous": "{reading}"},
             nothing_held_out="Nothing could be held out: that takes two runs of eight readings or more, or a single "
             "run with about 40.",
-            facts=self._facts(),
+            facts=tuple(facts),
             tells_duration=_minutes_of_time_unit(self.about.table, own.time_unit) is not None,
         )
 
-    def _facts(self) -> tuple[tuple[str, str], ...]:
-        source = ("simulator", self.system.simulator.source or "given in Python")
-        if (caller := self.system.caller) is None:
-            return (source,)
-        how = "for all samples at once" if caller.broadcasts else "for one sample after the other"
-        return source, ("calls of simulate", f"{caller.n_calls:,}, {how}")
-
     @property
     def controls(self) -> tuple[str, ...]:
-        """The columns that the simulator's file declares as controls."""
         return self.system.simulator.controls
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
@@ -329,11 +297,9 @@ class SimulatorApparatus(Apparatus):
         return forms | {effect.name: effect for effect in on_noise} | known
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
-        """Return formulas for effects out of vocabulary, by name: short expressions of columns and states."""
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Return the names of the effects that the user's simulator file adds."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     @property
@@ -342,7 +308,6 @@ class SimulatorApparatus(Apparatus):
         return max(_EVALUATIONS_PER_ROW * len(self.about.table), _LEAST_EVALUATIONS)
 
     def refit_budget_share_spent(self) -> float:
-        """Return the spent share of the budget of calls or evaluations of a law; 0 if `simulate` takes arrays."""
         caller = self.system.caller
         if caller is None:
             return self.system.tally.n_evaluations / self.evaluations_of_a_search
@@ -351,14 +316,12 @@ class SimulatorApparatus(Apparatus):
         return 0.0 if caller.broadcasts else caller.n_calls / (n_each * CALLS_OF_A_SEARCH)
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
-        """Return whether at least this share of the budget is spent; if so, record that the search was cut short."""
         over = self.refit_budget_share_spent() >= share
         tally = self.system.caller or self.system.tally
         tally.cut_short |= over
         return over
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
         curves = {f"curve:{name.removeprefix('input_gain:')}" for name in effects if name.startswith("input_gain:")}
         return replace(
             PriorOdds.for_effects(effects),
@@ -369,10 +332,6 @@ class SimulatorApparatus(Apparatus):
         )
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
-
-        Covariates are time or row, predicted level, its change since the row before, columns, states, and the run.
-        """
         table = cast(RunTable, recording.plan)
         usable = np.flatnonzero(recording.usable)
         by_row = self.covariate_values_by_name(found.model.predict(found.z[None, :])[0])
@@ -390,10 +349,7 @@ class SimulatorApparatus(Apparatus):
         return out, pooled["previous"]
 
     def multiplied_covariates(self, covariates: Sequence[Covariate]) -> list[Covariate]:
-        """Return time and the table's columns: of more than ten, those with the most distinct values.
-
-        Columns with few values are settings or numbers of groups, whose product with another is the rarer mistake.
-        """
+        # Columns with few values are settings or numbers of groups, whose product with another is the rarer mistake.
         columns = {covariate_of_column(name) for name in self.about.table.covariates}
         varied = [c for c in covariates if c.name == "time" or c.name in columns]
         chosen = sorted(varied, key=lambda c: -len(np.unique(c.values)))[:_MOST_MULTIPLIED]
@@ -407,12 +363,13 @@ class SimulatorApparatus(Apparatus):
         columns = {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
         out |= {covariate_of_column(name): v for name, v in columns.items()}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
-        out["previous"] = _differences_within_runs(predicted, table)
+        out["previous"] = np.zeros(len(table))
+        for rows in table.rows_by_scan():
+            out["previous"][rows[1:]] = np.diff(predicted[rows])
         out["run"] = table.scan.astype(np.float64)
         return out
 
     def held_out_parts(self, recording: Recording) -> Parts:
-        """Return the part of each usable reading, (n_usable,), and names: runs or, of one run, five blocks."""
         table, usable = cast(RunTable, recording.plan), recording.usable
         run = table.scan[usable]
         if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:
@@ -422,7 +379,6 @@ class SimulatorApparatus(Apparatus):
         return part, tuple(f"part {k + 1} of {N_BLOCKS}" for k in range(N_BLOCKS))
 
     def coordinates_of_new_run(self, model: Model) -> IntArray:
-        """Return the indices of the parameters per run, and of the effects' values per run, (n_coordinates,)."""
         names, of_run = list(self.system.marginals), {*self.system.nuisance_names}
         parameters = [k for k, name in enumerate(names) if name in of_run]
         values = [np.arange(model.n_params)[model.coordinate_slice(n)] for n in model.names if has_value_per_run(n)]
@@ -430,36 +386,23 @@ class SimulatorApparatus(Apparatus):
 
     @property
     def takes_one_measurement_at_a_time(self) -> bool:
-        """Whether FILE.py names no column of runs.
-
-        It reads every table as one run: a second run in next.csv would begin where the first ended, not from `states`
-        as it is planned, and a lag or a backlash would reach from one into the other.
-        """
+        # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
+        # from `states` as it is planned, and a lag or a backlash would reach from one into the other.
         return self.system.simulator.run is None
 
     def settings_of(self, plan: Plan) -> FloatArray:
-        """Return the columns besides the reading, and the time since the start of the run, (n_points, n_settings)."""
         table, own = cast(RunTable, plan), self.system.simulator
         columns = [v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)]
         return np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1))
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-    ) -> list[RunCommand]:
-        """List the runs that could be recorded after the table `plan`; the other arguments are not used."""
+    ) -> list[Command]:
         own = self.system.simulator
         return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_of_sequence = staticmethod(plan_of_sequence)
-
-
-def _differences_within_runs(values: FloatArray, table: RunTable) -> FloatArray:
-    """Return the change since the previous row of the run, 0 at its first row, (n_points,) -> (n_points,)."""
-    out = np.zeros(len(table))
-    for rows in table.rows_by_scan():
-        out[rows[1:]] = np.diff(values[rows])
-    return out
 
 
 def _varies(values: FloatArray) -> bool:

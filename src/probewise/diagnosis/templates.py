@@ -109,7 +109,6 @@ class TemplateBank:
         return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
 
     def _template_and_column_indices(self, width: int) -> tuple[IntArray, IntArray]:
-        """Return the indices of the templates of one width, (n,), and of their columns, (n, width)."""
         members = np.flatnonzero(self.widths == width)
         return members, self._first_columns[members, None] + np.arange(width)
 
@@ -353,7 +352,6 @@ def log_bayes_factors_of_pairs(
 
 
 def _joined_templates(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Join two templates of unit rms into one of unit rms."""
     widths = first.shape[1], second.shape[1]
     scaled = [t * math.sqrt(w / sum(widths)) for t, w in zip((first, second), widths, strict=True)]
     return np.concatenate(scaled, axis=1)

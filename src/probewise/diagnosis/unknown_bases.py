@@ -122,7 +122,6 @@ def _orthonormal_blocks(bank: TemplateBank, problem: Linearised) -> OrthonormalB
 
 
 def _are_held(columns: FloatArray, blocks: OrthonormalBlocks) -> BoolArray:
-    """Return which orthonormal columns, (n_rows, n_columns), have a cosine of 0.9 or more with the span of a block."""
     cosines = np.sqrt(np.add.reduceat((blocks.u.T @ columns) ** 2, blocks.starts, axis=0))
     return np.asarray(cosines.max(axis=0) >= _LIKE)
 
@@ -150,7 +149,6 @@ def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> 
 
 
 def _basis_family_name(covariate: Covariate, template: FloatArray) -> str:
-    """Name a template's family, such as "time" or, for windows and steps, "time, locally"."""
     name = covariate.published_name
     where = name if covariate.scan is None else f"{name} within scans"
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
@@ -208,7 +206,6 @@ def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[Floa
 
 
 def _product_bases(covariates: Sequence[Covariate], n_points: int) -> Iterator[FloatArray]:
-    """Yield the product of each two covariates, both centred and scaled: 0 where either is missing."""
     scaled = [
         _on_all_rows(((c.values - c.values.mean()) / (c.values.std() or 1.0))[:, None], c, n_points) for c in covariates
     ]

@@ -213,7 +213,6 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
-        """Return the combinations with the same noise effects, and effects on the mean aliased with these."""
         noise = prepared.noise_effect_names & {*combination}
         others = searched.combinations_aliased_with(tuple(name for name in combination if name not in noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
@@ -332,7 +331,6 @@ def with_shared_effects(
 def _leader_on_mean(
     probability: Mapping[Names, float], noise_names: frozenset[str], aliases: tuple[Alias, ...]
 ) -> Names:
-    """Return the most probable combination with an effect on the mean, of the most probable class of aliases."""
     physics = {k: p for k, p in probability.items() if k != ("unknown",) and not {*k} <= noise_names}
     classes = [_combination_and_alias_swaps(names, aliases) & physics.keys() for names in physics]
     likeliest = max(classes, key=lambda members: sum(physics[names] for names in members), default=set())
@@ -452,6 +450,5 @@ def verdict_from_probabilities(
 
 
 def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
-    """Return the combination and all that differ from it by one effect swapped for its alias."""
     both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
     return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

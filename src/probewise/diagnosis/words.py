@@ -110,7 +110,6 @@ def effects_in_words(names: Sequence[str]) -> list[str]:
 
 
 def _two(said: str) -> str:
-    """Write "a wave in the readings", which is there twice, as "two waves in the readings"."""
     plural, n = re.subn(r"^an? ((?:periodic )?)(\w+)", r"two \1\2s", said)
     return plural if n else f"{said} (twice)"
 

@@ -489,10 +489,6 @@ class Refits:
         )
 
     def _hopeless_above(self, model: Model) -> float:
-        """Return the objective above which a fit is too far behind the best refit to matter; infinite without a law.
-
-        A law is integrated at every step of a fit. Elsewhere a fit costs too little to be worth giving up.
-        """
         if not model.sensor.predicts_cheaply_nearby:
             return math.inf
         return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + _HOPELESS

@@ -215,7 +215,6 @@ def search(
     spent = prepared.apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
-        """Return whether this share is spent of the budget of refits that an earlier search left."""
         return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
     state = SearchState(

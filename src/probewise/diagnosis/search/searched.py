@@ -147,7 +147,6 @@ class Evidences:
         )
 
     def _largest_log_z(self, names: Names) -> float:
-        """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no fit."""
         return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
     def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:

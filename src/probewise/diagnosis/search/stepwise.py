@@ -27,7 +27,12 @@ from probewise.diagnosis.search.refits import (
     effects_out_of_vocabulary,
     is_significantly_better,
 )
-from probewise.diagnosis.sensors import SsfForms, Start
+from probewise.diagnosis.sensors import (
+    default_sensor,
+    starts_of_one_gaussian,
+    starts_with_more_gaussians,
+    with_free_form,
+)
 from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes_factors_of_pairs, log_mean_exp
 from probewise.effects import AGAIN, Extent, NamedEffect, name_of_first_copy
 from probewise.effects.noise import lattice_step
@@ -319,26 +324,28 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
 
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 
-    def fit_and_keep(form: Start, law: NoiseLaw) -> WeighedFit:
+    def fit_and_keep(sensor: Null, starts: FloatArray, law: NoiseLaw) -> WeighedFit:
         state.progress("fitting the sensor alone", len(state.sensors), n_forms)
-        sensor, starts = form
         state.sensors[sensor.n_gaussians] = sensor
         return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), plan), starts, law))
 
     if null is not None:
-        fit_and_keep((null, null.starts), law)
+        fit_and_keep(null, null.starts, law)
     else:
-        forms = SsfForms(Extent.of(recording))
-        last = fit_and_keep(forms.one_gaussian_and_starts(), law)
+        extent = Extent.of(recording)
+        one = default_sensor(extent, 1)
+        last = fit_and_keep(one, starts_of_one_gaussian(one), law)
         if max_order > 1:
-            best = max(
-                fit_and_keep(forms.free_form_and_starts(last.found), refits.likeliest_law(last)).log_z, last.log_z
-            )
+            free, z = with_free_form(one), last.found.z
+            start = np.pad(z, (0, free.n_params - len(z)))[None, :]  # the weights begin at 0
+            best = max(fit_and_keep(free, start, refits.likeliest_law(last)).log_z, last.log_z)
             for n in range(2, max_order + 2):
                 # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
                 if n > 2 and last.log_z < best - ALIASED_NATS:
                     break
-                last = fit_and_keep(forms.more_gaussians_and_starts(last.found, n), refits.likeliest_law(last))
+                wanted = default_sensor(extent, n)
+                starts = starts_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
+                last = fit_and_keep(wanted, starts, refits.likeliest_law(last))
                 best = max(best, last.log_z)
     if noises.add_significant_pairs(state.null.found, state.null.evidence):
         state.progress("weighing pairs of noises")
@@ -605,7 +612,6 @@ def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Propo
 
 
 def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
-    """Return the largest log evidence of each combination by screening about a null, over the noise models."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
         best[names] = max(value, best.get(names, value))

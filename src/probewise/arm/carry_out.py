@@ -62,6 +62,9 @@ def carry_out(
     turned it before, the person is asked too, unless the plan neither turns the sensor nor has a pattern that looks
     different to a turned one.
 
+    Raises ReachError if a row is out of the arm's reach; nothing moves; ParameterError if the plan needs the LED off,
+    or a height at which this arm does not read.
+
     Parameters
     ----------
     arm
@@ -79,13 +82,6 @@ def carry_out(
     ------
     A reading for each row, in the plan's frame, at the place and orientation that the arm measured; at the planned ones
     if the arm does not measure them.
-
-    Raises
-    ------
-    ReachError
-        If a row is out of the arm's reach; nothing moves.
-    ParameterError
-        If the plan needs the LED off, or a height at which this arm does not read.
     """
     arm = as_instrument(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)

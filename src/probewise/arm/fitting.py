@@ -73,14 +73,8 @@ def write_marks(marks: Sequence[TouchedMark], path: Path) -> None:
 def spread_mark_places(geometry: Geometry) -> FloatArray:
     """Choose places spread over the arm's reach on the field, in whole steps of 10 mm.
 
-    Returns
-    -------
-    Five to eight places, shape (n_marks, 2), in mm, in the order of use.
-
-    Raises
-    ------
-    ReachError
-        If fewer than five are within reach.
+    Returns five to eight places, shape (n_marks, 2), in mm, in the order of use. Raises ReachError if fewer than five
+    are within reach.
     """
     width, height = geometry.field_mm
     # Every second place of a grid, as on a chessboard, so that no two rows have the same base angles.
@@ -140,6 +134,10 @@ def fit_geometry(
 ) -> FittedGeometry:
     """Fit home angles, links and base to marks; return the fitted geometry with its errors.
 
+    Raises ShapeError if there is not one row of three numbers per mark; ParameterError if there are fewer than five
+    marks, they do not determine the geometry, or `touch_mm` is not above 0; MarksDisagreeError if the best fit has a
+    p-value below 0.001.
+
     Parameters
     ----------
     geometry
@@ -150,15 +148,6 @@ def fit_geometry(
         Place of the sensor's face at each mark, (n_marks, 3): x, y (lab frame) and height; NaN: height not measured.
     touch_mm
         Sd of a mark's place and height, from positioning by eye and from the motors.
-
-    Raises
-    ------
-    ShapeError
-        If there is not one row of three numbers per mark.
-    ParameterError
-        If there are fewer than five marks, they do not determine the geometry, or `touch_mm` is not above 0.
-    MarksDisagreeError
-        If the best fit has a p-value below 0.001.
     """
     turned, marks = floats(turned_rad, "turned_rad"), floats(marks_mm, "marks_mm")
     if turned.ndim != 2 or turned.shape[1] != 3 or marks.shape != turned.shape:

@@ -77,10 +77,7 @@ class Joint:
     def stop_counts(self) -> int:
         """Motor count with the joint at its stop.
 
-        Raises
-        ------
-        ParameterError
-            If the joint has no stop.
+        Raises ParameterError if the joint has no stop.
         """
         if self.stop_rad is None or self.stop_side is None:
             raise ParameterError("stop_deg", None, "an angle: without one the joint has no stop to be found")
@@ -279,16 +276,8 @@ class Geometry:
     def angles_rad(self, places_mm: FloatArray, height_mm: float) -> FloatArray:
         """Solve the inverse kinematics, elbow up.
 
-        Parameters
-        ----------
-        places_mm
-            Places, shape (n, 2), lab frame.
-        height_mm
-            Height of the sensor's face above the surface.
-
-        Returns
-        -------
-        Joint angles, shape (n, 3); NaN for places too far, too near, or beyond a joint's limits.
+        `places_mm`: places, shape (n, 2), lab frame; `height_mm`: height of the sensor's face above the surface.
+        Returns joint angles, shape (n, 3); NaN for places too far, too near, or beyond a joint's limits.
         """
         places = _checked_rows(places_mm, 2)
         dx, dy = places[:, 0] - self.axis_mm[0], places[:, 1] - self.axis_mm[1]
@@ -419,16 +408,8 @@ def places_at_parameters(geometry: Geometry, values: FloatArray, turned_rad: Flo
 def place_jacobian(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
     """Return the derivatives of the sensor's place and height by each parameter `FITTED`, joint angles from home fixed.
 
-    Parameters
-    ----------
-    geometry
-        The nominal geometry.
-    places_mm
-        Places of the sensor by the nominal geometry, (n, 2), at the reading height.
-
-    Returns
-    -------
-    Shape (n, 3, 9): x, y and height by the parameters of `FITTED`; NaN at a place out of reach.
+    `geometry`: the nominal geometry; `places_mm`: places of the sensor by the nominal geometry, (n, 2), at the reading
+    height. Returns shape (n, 3, 9): x, y and height by the parameters of `FITTED`; NaN at a place out of reach.
     """
     values = fitted_parameter_values(geometry)
     turned = geometry.angles_rad(places_mm, geometry.read_height_mm) - values[:3]

@@ -60,18 +60,9 @@ class HeightCheck:
 def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading]) -> HeightCheck:
     """Compare heights measured by the light with those by the motors' counters.
 
-    Parameters
-    ----------
-    curve
-        Readings at the first place, three heights or more.
-    others
-        Readings elsewhere over the same white, one for each place.
-
-    Raises
-    ------
-    ParameterError
-        If there are fewer than three heights, no other place, a standard error that is not above 0, or readings at the
-        first place that do not fall with the height by five sds or more.
+    `curve`: readings at the first place, three heights or more; `others`: readings elsewhere over the same white, one
+    for each place. Raises ParameterError if there are fewer than three heights, no other place, a standard error that
+    is not above 0, or readings at the first place that do not fall with the height by five sds or more.
     """
     n_heights = len({look.height_mm for look in curve})
     if n_heights < LEAST_HEIGHTS:

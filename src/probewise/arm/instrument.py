@@ -99,12 +99,7 @@ class Instrument(Protocol):
     def measure(self, pose: Pose) -> Reading:
         """Move to a pose, lower the sensor, read it and raise it; return the reading.
 
-        Raises
-        ------
-        ReachError
-            If the arm cannot reach the pose.
-        LinkError
-            If the instrument does not answer.
+        Raises ReachError if the arm cannot reach the pose; LinkError if the instrument does not answer.
         """
         ...
 
@@ -194,6 +189,9 @@ class Reach:
     geometry ships with the package: all but 2 % of the field, at the corners farthest from the axis and nearest to the
     axis, where the arm cannot fold.
 
+    Raises ParameterError if a length is negative or not finite, or `nearest_mm` is not below `farthest_mm`; ReachError
+    if no place on the field is within reach.
+
     Parameters
     ----------
     field_mm
@@ -202,13 +200,6 @@ class Reach:
         Distance of the axis from the field.
     nearest_mm, farthest_mm
         Smallest and largest distance of the sensor from the axis.
-
-    Raises
-    ------
-    ParameterError
-        If a length is negative or not finite, or `nearest_mm` is not below `farthest_mm`.
-    ReachError
-        If no place on the field is within reach.
     """
 
     field_mm: tuple[float, float] = FIELD_MM

@@ -145,19 +145,12 @@ class LegoArm:
         A KeyboardInterrupt while the sensor rises releases the motors at once, but the reading is returned: the next
         `measure`, or the end of `with`, raises it.
 
-        Returns
-        -------
-        The reading, with the actual pose by the motors' counters, and the covariates `height_mm` and `battery_mv`. In
-        the files of recordings, `height_mm` is the commanded height, the geometry's `read_height_mm`; the height by the
-        counters, `position_mm[2]`, differs from it by some tenths of a millimetre.
-
-        Raises
-        ------
-        ReachError
-            If the arm cannot reach the place, or has another orientation or height there (nothing moves); or if the
-            sensor cannot rise from where it is.
-        LinkError
-            If the brick does not answer, or a motor does not move, before the reading is taken.
+        Returns the reading, with the actual pose by the motors' counters, and the covariates `height_mm` and
+        `battery_mv`. In the files of recordings, `height_mm` is the commanded height, the geometry's `read_height_mm`;
+        the height by the counters, `position_mm[2]`, differs from it by some tenths of a millimetre. Raises ReachError
+        if the arm cannot reach the place, or has another orientation or height there (nothing moves); or if the sensor
+        cannot rise from where it is; LinkError if the brick does not answer, or a motor does not move, before the
+        reading is taken.
         """
         self._raise_held_stop()
         place = np.array([[pose.x_mm, pose.y_mm]])
@@ -205,10 +198,7 @@ class LegoArm:
     def go_over(self, x_mm: float, y_mm: float) -> None:
         """Move the sensor over a place, at about travel height.
 
-        Raises
-        ------
-        ReachError
-            If the place is out of reach.
+        Raises ReachError if the place is out of reach.
         """
         goals = self._goals_at_place(x_mm, y_mm, self.geometry.travel_height_mm)
         self.raise_sensor()
@@ -221,10 +211,7 @@ class LegoArm:
 
         If `first_down` is set, the first lowering is in steps, and `first_down` is called after each.
 
-        Raises
-        ------
-        ReachError
-            If the place is out of reach at that height.
+        Raises ReachError if the place is out of reach at that height.
         """
         travel_mm = self.geometry.travel_height_mm
         end_mm = self.geometry.read_height_mm if height_mm is None else height_mm
@@ -247,10 +234,7 @@ class LegoArm:
     def raise_sensor(self) -> None:
         """Raise the sensor to about travel height, if it is lower, by the link that needs the smaller turn.
 
-        Raises
-        ------
-        ReachError
-            If neither link alone can raise it.
+        Raises ReachError if neither link alone can raise it.
         """
         for _ in range(N_RISES):
             if self.position_mm[2] >= self.geometry.travel_height_mm - NEAR_TRAVEL_MM:
@@ -268,12 +252,8 @@ class LegoArm:
 
         The links find their stops before the base, so that the sensor is up when the base turns.
 
-        Raises
-        ------
-        LinkError
-            If a joint meets no stop, or the brick does not answer.
-        ReachError
-            If the sensor cannot rise from where the links are.
+        Raises LinkError if a joint meets no stop, or the brick does not answer; ReachError if the sensor cannot rise
+        from where the links are.
         """
         stopped = []
         for joint in (ELBOW, SHOULDER, BASE):

@@ -20,10 +20,7 @@ N_CHECKED = 33  # points checked along a move
 class SoftLimits:
     """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts.
 
-    Parameters
-    ----------
-    geometry
-        Limits of the joints, and the lowest height of the sensor.
+    `geometry`: limits of the joints, and the lowest height of the sensor.
     """
 
     def __init__(self, geometry: Geometry) -> None:
@@ -65,10 +62,7 @@ class SoftLimits:
         `here` and `to` are the counts of the joint's motor at start and end. A joint beyond its limits may move back,
         and a sensor below the lowest height may rise.
 
-        Raises
-        ------
-        ReachError
-            If the move is refused.
+        Raises ReachError if the move is refused.
         """
         geometry, mechanics = self._geometry, self._geometry.joints[joint]
         angle, start = mechanics.angle_at(to), mechanics.angle_at(here)
@@ -136,12 +130,7 @@ class Machine(Protocol):
 class DryRun:
     """A dry run: prints every commanded move, and reads nothing.
 
-    Parameters
-    ----------
-    geometry
-        Geometry of the arm.
-    say
-        Function called with one line per command.
+    `geometry`: geometry of the arm; `say`: function called with one line per command.
     """
 
     def __init__(self, geometry: Geometry, say: Callable[[str], None]) -> None:

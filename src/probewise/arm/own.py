@@ -76,10 +76,7 @@ class OwnInstrument:
     def from_file(cls, path: str | Path, *, start_s: float = 0.0, clock: Clock = time) -> Self:
         """Load a user's file; its function `connect()`, which returns the instrument, is called on entering.
 
-        Raises
-        ------
-        FileError
-            If the file cannot be read or run, or has no function `connect`.
+        Raises FileError if the file cannot be read or run, or has no function `connect`.
         """
         names = run_python_file(path, "a Python file with a function connect() that returns the instrument")
         connect = names.get("connect")
@@ -190,12 +187,8 @@ class OwnInstrument:
 
         Where the dict does not say otherwise, its time is the clock's and its pose the commanded one.
 
-        Raises
-        ------
-        ParameterError
-            If the result is not a valid reading; the object's own errors pass through.
-        LinkError
-            Instead of any of these errors, for an instrument with a `source`.
+        Raises ParameterError if the result is not a valid reading; the object's own errors pass through; LinkError
+        instead of any of these errors, for an instrument with a `source`.
         """
         with self._errors_located("measure"):
             return self._as_reading(self._own.measure(pose), pose)
@@ -247,6 +240,8 @@ def as_instrument(
 ) -> OwnInstrument | LegoArm | SimulatedArm:
     """Adapt any object with `measure(pose)` to an Instrument; instruments of this package are returned unchanged.
 
+    Raises ParameterError if `own` has no method `measure`.
+
     Parameters
     ----------
     own
@@ -264,11 +259,6 @@ def as_instrument(
         Time at the start, for resuming an earlier run; without effect on instruments of this package.
     name
         Name for messages.
-
-    Raises
-    ------
-    ParameterError
-        If `own` has no method `measure`.
     """
     if isinstance(own, OwnInstrument | LegoArm | SimulatedArm):
         return own

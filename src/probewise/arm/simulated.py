@@ -120,10 +120,7 @@ class SimulatedArm:
     def measure(self, pose: Pose) -> Reading:
         """Simulate moving to a pose, lowering, reading and raising; the reading's time is that of its completion.
 
-        Raises
-        ------
-        ReachError
-            If the arm cannot reach the place, or the height is not above 0; the arm does not move.
+        Raises ReachError if the arm cannot reach the place, or the height is not above 0; the arm does not move.
         """
         require_pose(pose)
         place = np.array([[pose.x_mm, pose.y_mm]])

@@ -56,10 +56,7 @@ def shipped_geometry_path() -> Path:
 def read_geometry(path: Path) -> Geometry:
     """Read an arm's dimensions from a TOML file of format "arm/1".
 
-    Raises
-    ------
-    FileError
-        If the file is missing or not TOML, or an entry is missing or not allowed.
+    Raises FileError if the file is missing or not TOML, or an entry is missing or not allowed.
     """
     text = read_text(path, "an arm's file of format arm/1")
     try:
@@ -168,10 +165,7 @@ class Joint:
 class EmulatedArm:
     """The arm: three joints and the sensor at its end.
 
-    Parameters
-    ----------
-    geometry
-        Dimensions of the arm; every joint starts at home.
+    `geometry`: dimensions of the arm; every joint starts at home.
 
     Attributes
     ----------

@@ -262,6 +262,8 @@ class Battery:
 class Brick:
     """An NXT brick, switched on at construction.
 
+    Raises ParameterError if the name or `sleep_min` is invalid.
+
     Parameters
     ----------
     clock
@@ -276,11 +278,6 @@ class Brick:
         Files in flash, by name; None: echo.rxe, empty. Each file runs as a program that echoes messages.
     watch
         Function called every 10 ms while a motor turns.
-
-    Raises
-    ------
-    ParameterError
-        If the name or `sleep_min` is invalid.
     """
 
     def __init__(

@@ -96,21 +96,9 @@ def plain_cells(
 
     Where all numbers of a column can be read with either decimal mark, it has that of the other columns.
 
-    Parameters
-    ----------
-    odd
-        Cells by name of the columns that are not written as plain numbers throughout.
-    usual
-        Returns those that are.
-
-    Returns
-    -------
-    The rewritten columns by name, and notes on how they were read.
-
-    Raises
-    ------
-    UnclearCellError
-        If a comma may be a decimal comma or separate thousands.
+    `odd`: cells by name of the columns that are not written as plain numbers throughout; `usual`: returns those that
+    are. Returns the rewritten columns by name, and notes on how they were read. Raises UnclearCellError if a comma may
+    be a decimal comma or separate thousands.
     """
     columns = dict(odd)
     read = {name: found for name, cells in odd.items() if (found := _Quantities.of(cells)) is not None}

@@ -184,16 +184,8 @@ def _led_words_to_numbers(values: ArrayLike) -> ArrayLike:
 def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
     """Assign scan numbers: every change of name, even to an earlier one, begins a new scan; a single name is one scan.
 
-    Returns
-    -------
-    The number of each reading's scan, (n_points,), and the scans' names.
-
-    Raises
-    ------
-    ShapeError
-        If there is neither a single name nor one per reading.
-    ParameterError
-        If a name is missing, or empty where others are not.
+    Returns the number of each reading's scan, (n_points,), and the scans' names. Raises ShapeError if there is neither
+    a single name nor one per reading; ParameterError if a name is missing, or empty where others are not.
     """
     if names is None or isinstance(names, str):
         return np.zeros(n_points, dtype=np.int64), (_checked_name("scan", names or "scan"),)

@@ -47,10 +47,8 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     Missing readings become NaN, readings outside the declared range keep their value; both are
     counted in the notes and are not `usable`. `progress` is called as rows are read.
 
-    Raises
-    ------
-    FileError
-        If either file cannot be used; it names the file, row and column, what was found and what is allowed.
+    Raises FileError if either file cannot be used; it names the file, row and column, what was found and what is
+    allowed.
     """
     plan, readings, notes = _read_with_json(_checked_csv_path(path), progress)
     if readings is None:
@@ -68,10 +66,8 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
 def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     """Read a plan, or the plan of a recording.
 
-    Raises
-    ------
-    FileError
-        If either file cannot be used; it names the file, row and column, what was found and what is allowed.
+    Raises FileError if either file cannot be used; it names the file, row and column, what was found and what is
+    allowed.
     """
     return _read_with_json(_checked_csv_path(path), progress)[0]
 
@@ -79,10 +75,8 @@ def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
     """Read a plan or a recording: return the plan, and the readings (n_points,) or None.
 
-    Raises
-    ------
-    FileError
-        If either file cannot be used; it names the file, row and column, what was found and what is allowed.
+    Raises FileError if either file cannot be used; it names the file, row and column, what was found and what is
+    allowed.
     """
     plan, readings, _ = _read_with_json(_checked_csv_path(path), progress)
     return plan, readings
@@ -91,12 +85,8 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
 def write_recording(recording: Recording, path: PathLike) -> None:
     """Write NAME.csv, NAME.json and the images of its patterns, each file atomically, in full precision.
 
-    Raises
-    ------
-    ParameterError
-        If the format cannot hold the recording (an unknown pattern, a name with line ends).
-    FileError
-        If the files cannot be written.
+    Raises ParameterError if the format cannot hold the recording (an unknown pattern, a name with line ends); FileError
+    if the files cannot be written.
     """
     require_recording(recording)
     inst = recording.plan.instrumentation
@@ -108,12 +98,8 @@ def write_recording(recording: Recording, path: PathLike) -> None:
 def write_plan(plan: Plan, path: PathLike) -> None:
     """Write a plan as NAME.csv, NAME.json and the images of its patterns, each file atomically.
 
-    Raises
-    ------
-    ParameterError
-        If the format cannot hold the plan (an unknown pattern, a name with line ends).
-    FileError
-        If the files cannot be written.
+    Raises ParameterError if the format cannot hold the plan (an unknown pattern, a name with line ends); FileError if
+    the files cannot be written.
     """
     require_plan(plan)
     _write_with_json(plan, checked_path("path", path), plan_columns(plan))

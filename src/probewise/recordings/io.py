@@ -25,10 +25,7 @@ from probewise.errors import FileError, ParameterError, PipeWarning, message_of,
 def read_bytes(path: Path, what: str) -> bytes:
     """Read a whole file; `what`, for messages, is what it should be. A pipe gives a PipeWarning.
 
-    Raises
-    ------
-    FileError
-        If it is missing, cannot be read or is a device.
+    Raises FileError if it is missing, cannot be read or is a device.
     """
     try:
         device = path.is_char_device() or path.is_block_device()  # /dev/zero never ends
@@ -47,10 +44,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 def read_text(path: Path, what: str) -> str:
     """Read a whole file of UTF-8, or of UTF-16 with its byte-order mark, without that mark; `what` as in `read_bytes`.
 
-    Raises
-    ------
-    FileError
-        If it is missing, cannot be read or is no such text.
+    Raises FileError if it is missing, cannot be read or is no such text.
     """
     content = read_bytes(path, what)
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -70,6 +64,8 @@ def parse_json_file_text(
 ) -> Any:
     """Parse a JSON text, or UTF-8 bytes, from a file.
 
+    Raises FileError if it is not strict JSON; see `parse_strict_json`.
+
     Parameters
     ----------
     path, row
@@ -78,11 +74,6 @@ def parse_json_file_text(
         The text.
     allowed
         What the file should contain, for messages.
-
-    Raises
-    ------
-    FileError
-        If it is not strict JSON; see `parse_strict_json`.
     """
     try:
         return parse_strict_json(text)
@@ -96,13 +87,8 @@ def parse_json_file_text(
 def parse_strict_json(text: str | bytes) -> Any:
     """Parse a JSON text, or UTF-8 bytes; a byte-order mark is skipped.
 
-    Raises
-    ------
-    json.JSONDecodeError
-        If it does not parse.
-    ValueError
-        If it is nested too deep, bytes are not UTF-8, a lone surrogate is escaped, a number is NaN, infinite or
-        beyond the floats, or an object repeats a name.
+    Raises json.JSONDecodeError if it does not parse; ValueError if it is nested too deep, bytes are not UTF-8, a lone
+    surrogate is escaped, a number is NaN, infinite or beyond the floats, or an object repeats a name.
     """
     text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
     try:
@@ -154,17 +140,8 @@ def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any
 
     Its folder is added to the module search path, as by `python FILE.py`.
 
-    Parameters
-    ----------
-    path
-        The file.
-    what
-        What the file should be, for messages.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read or run; the error names the line if there is one.
+    `path`: the file; `what`: what the file should be, for messages. Raises FileError if it cannot be read or run; the
+    error names the line if there is one.
     """
     path = checked_path("path", path, what)
     return run_python_text(read_text(path, what), path)
@@ -226,10 +203,7 @@ def shipped(name: str) -> Path:
     and four over the quadrants. `concealed`: 961 readings of scans out and back, with one effect that the sensor model
     leaves out, drawn from a seed.
 
-    Raises
-    ------
-    ParameterError
-        If there is no recording of that name.
+    Raises ParameterError if there is no recording of that name.
     """
     if name not in SHIPPED:
         raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))

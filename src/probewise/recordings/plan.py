@@ -169,6 +169,9 @@ class Plan:
     ) -> Self:
         """Make a plan from arrays, lists or columns of a table, with one entry per reading in the order they are taken.
 
+        Raises ParameterError if a pattern is named but not described, or an argument has the wrong type; ShapeError if
+        the arguments differ in length.
+
         Parameters
         ----------
         x_mm, y_mm
@@ -194,13 +197,6 @@ class Plan:
             Range and quantisation of a reading, where they are known.
         sensor, height_mm, controls
             Name of the sensor, its height above the surface, and what else can be commanded, such as "orientation_deg".
-
-        Raises
-        ------
-        ParameterError
-            If a pattern is named but not described, or an argument has the wrong type.
-        ShapeError
-            If the arguments differ in length.
 
         Examples
         --------
@@ -368,6 +364,9 @@ class Recording(ShowsItself):
     ) -> Self:
         """Make a recording from arrays, lists or columns of a table, with one entry per reading in the order taken.
 
+        Raises ParameterError if a pattern is named but not described, an argument has the wrong type, or no reading is
+        usable; ShapeError if the arguments differ in length.
+
         Parameters
         ----------
         x_mm, y_mm
@@ -382,13 +381,6 @@ class Recording(ShowsItself):
             As in `Plan.from_arrays`.
         source
             Origin of the readings, for reports.
-
-        Raises
-        ------
-        ParameterError
-            If a pattern is named but not described, an argument has the wrong type, or no reading is usable.
-        ShapeError
-            If the arguments differ in length.
 
         Examples
         --------
@@ -444,6 +436,9 @@ class Recording(ShowsItself):
     ) -> Self:
         """Make a recording from a data frame or a dict of columns, named as in a recording's CSV file.
 
+        Raises ParameterError if a column is missing, a pattern is named but not described, or an argument has the wrong
+        type; ShapeError if the columns differ in length.
+
         Parameters
         ----------
         table
@@ -452,13 +447,6 @@ class Recording(ShowsItself):
             ignored, except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers.
         patterns, unit, min, max, step, sensor, height_mm, controls, source
             As in `Recording.from_arrays`.
-
-        Raises
-        ------
-        ParameterError
-            If a column is missing, a pattern is named but not described, or an argument has the wrong type.
-        ShapeError
-            If the columns differ in length.
 
         Examples
         --------

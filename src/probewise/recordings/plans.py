@@ -55,12 +55,8 @@ def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
     at 0, 90, 180 and 270 degrees, `edge_0` to `edge_270`, then one reading on each of the four
     quadrant patterns at 0 degrees, `quadrants`.
 
-    Parameters
-    ----------
-    reading_s
-        Seconds from one reading to the next; about 1.2 for the paper's arm.
-    break_s
-        Seconds to turn the sensor between scans, or to change the pattern.
+    `reading_s`: seconds from one reading to the next; about 1.2 for the paper's arm; `break_s`: seconds to turn the
+    sensor between scans, or to change the pattern.
     """
     line = _line_places(-50, 50, 1)
     scans = [_Scan(f"edge_{deg}", line, ("boundary",), deg, reading_s, break_s) for deg in ORIENTATIONS_DEG]
@@ -75,12 +71,8 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
     degrees, since lag depends on speed and backlash does not), plain white and plain black every 8 mm.
     Then the four quadrants, and a scan along Y across a disc, the only one that moves in Y.
 
-    Parameters
-    ----------
-    reading_s
-        Seconds from one reading to the next.
-    break_s
-        Seconds to turn the sensor between scans, or to change the pattern.
+    `reading_s`: seconds from one reading to the next; `break_s`: seconds to turn the sensor between scans, or to change
+    the pattern.
     """
     out, flat = _line_places(-50, 50, 1), _line_places(-40, 40, 8)
     scans: list[_Scan] = []
@@ -101,6 +93,8 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
 def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
     """Return the plan with jittered time intervals; its covariate `battery_mv`, if any, is computed anew, with noise.
 
+    Raises ParameterError if `share` is outside 0 to 1.
+
     Parameters
     ----------
     plan
@@ -109,11 +103,6 @@ def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 
         Source of randomness.
     share
         Largest change of an interval as a share of it, 0 to 1.
-
-    Raises
-    ------
-    ParameterError
-        If `share` is outside 0 to 1.
     """
     if not 0 <= share <= 1:
         raise ParameterError("share", share, "0 to 1")

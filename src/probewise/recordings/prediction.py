@@ -81,10 +81,7 @@ def prediction_summary(readings: FloatArray, mean: FloatArray, sd: FloatArray, l
 def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:
     """Write a CSV file of the plan's rows in order, with `mean`, `sd` and `log_density`, in full precision.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     columns = plan_columns(prediction.plan)
     for name in ("mean", "sd", "log_density"):
@@ -95,10 +92,7 @@ def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> No
 def read_prediction_columns(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return `mean`, `sd` and `log_density` from a file of predictions, (n_points,) each; an empty density becomes NaN.
 
-    Raises
-    ------
-    FileError
-        If the file is missing, a cell is not a valid number, or an sd is not above 0.
+    Raises FileError if the file is missing, a cell is not a valid number, or an sd is not above 0.
     """
     table = read_table(checked_path("path", path), wanted=("mean", "sd", "log_density"))
     table.require_columns("mean", "sd", "log_density")

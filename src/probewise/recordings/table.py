@@ -79,6 +79,8 @@ class CSVTable:
     ) -> FloatArray:
         """Read a column as numbers, shape (n_rows,).
 
+        Raises FileError at the first cell that is not such a number.
+
         Parameters
         ----------
         name
@@ -89,11 +91,6 @@ class CSVTable:
             Largest magnitude allowed; None: any finite number.
         allowed
             What is allowed, for the error; "": in words of the other arguments.
-
-        Raises
-        ------
-        FileError
-            At the first cell that is not such a number.
         """
         cells = self.columns[name]
         most = np.finfo(np.float64).max if largest is None else largest
@@ -275,6 +272,9 @@ def read_table(
     Cells may be separated by commas, semicolons, tabs or blanks. The header is the row above the numbers, or the one
     with more of the `wanted` columns. Numbers and times are rewritten as plain numbers; `notes` says how.
 
+    Raises FileError if it cannot be read, has no header or a repeated column, a row is too short or too long, quotes do
+    not close, or a cell can be read in several ways.
+
     Parameters
     ----------
     path
@@ -287,12 +287,6 @@ def read_table(
         Name of a column of numbers, or of dates or clocks, which count from the first row in this unit.
     progress
         Called as rows are read.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read, has no header or a repeated column, a row is too short or too long, quotes do not close,
-        or a cell can be read in several ways.
     """
     text = read_text(path, "a CSV file")
     layout = _Layout.of_text(text, wanted)

@@ -48,14 +48,8 @@ def require_unit_of_time(name: str, unit: str, wanted: str) -> None:
 def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[ArrayLike, str]:
     """Convert dates, clocks and time differences (NumPy's, Python's, texts) to the time since the first, in `unit`.
 
-    Returns
-    -------
-    The times, (n_points,), and a note on how they were read; anything else unchanged, and "".
-
-    Raises
-    ------
-    ParameterError
-        If a cell is missing or can be read in several ways, or some dates have a time zone and others none.
+    Returns the times, (n_points,), and a note on how they were read; anything else unchanged, and "". Raises
+    ParameterError if a cell is missing or can be read in several ways, or some dates have a time zone and others none.
     """
     array = array_or_none(values)
     if array is None:
@@ -87,10 +81,7 @@ def texts_to_times(name: str, cells: Sequence[str], unit: str) -> tuple[FloatArr
 
     None if the first is neither.
 
-    Raises
-    ------
-    UnclearCellError
-        At the first cell of another form, or one that can be read in several ways.
+    Raises UnclearCellError at the first cell of another form, or one that can be read in several ways.
     """
     form = next((form for form in (_CLOCK_ALONE, _YEAR_FIRST, _YEAR_LAST) if form.fullmatch(cells[0])), None)
     if form is None:

@@ -89,22 +89,10 @@ def require_positive(name: str, values: FloatArray) -> None:
 def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
     """Trace the closed edge of each hypothesis, for drawing, rasterising and culling.
 
-    Parameters
-    ----------
-    region
-        Ellipses, polygons, a mixture of these, or any kind that registers its outline (`outlines.register`).
-    n_vertices
-        Number of vertices of a curved edge.
-
-    Returns
-    -------
-    One array (n, 2) per hypothesis, mm, the first vertex repeated at the end; pieces of a
-    polygon that crosses itself are separated by NaN.
-
-    Raises
-    ------
-    ParameterError
-        If the region has no closed edge.
+    `region`: ellipses, polygons, a mixture of these, or any kind that registers its outline (`outlines.register`);
+    `n_vertices`: number of vertices of a curved edge. Returns one array (n, 2) per hypothesis, mm, the first vertex
+    repeated at the end; pieces of a polygon that crosses itself are separated by NaN. Raises ParameterError if the
+    region has no closed edge.
     """
     raise ParameterError("region", type(region).__name__, "EllipseRegion, PolygonRegion or a mixture of them")
 
@@ -113,23 +101,17 @@ def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
 def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the distance of places from the nearest edge of a region, mm.
 
-    Parameters
-    ----------
-    region
-        A region of n_regions hypotheses; the distance is infinite for kinds without edges (uniform, ramp, image).
-    x_mm, y_mm
-        Places, (n_samples or 1, n_points).
-
-    Returns
-    -------
-    Distances, (n_samples or n_regions or 1, n_points): exact, but to first order in the distance for an ellipse
-    that is no disc.
+    `region`: A region of n_regions hypotheses; the distance is infinite for kinds without edges (uniform, ramp, image);
+    `x_mm`, `y_mm`: places, (n_samples or 1, n_points). Returns distances, (n_samples or n_regions or 1, n_points):
+    exact, but to first order in the distance for an ellipse that is no disc.
     """
     return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
 
 
 def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
     """Return the share of each square pixel on the positive side of a straight edge.
+
+    Returns share, 0 to 1: the cumulative of the square's projection on the normal, a trapezium.
 
     Parameters
     ----------
@@ -139,10 +121,6 @@ def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixe
         Angle between the edge's normal and a side of the square; broadcasts with the distance.
     pixel_mm
         Side of the square.
-
-    Returns
-    -------
-    Share, 0 to 1: the cumulative of the square's projection on the normal, a trapezium.
     """
     cosine, sine = np.abs(np.cos(angle_rad)), np.abs(np.sin(angle_rad))
     wide = 0.5 * pixel_mm * np.maximum(cosine, sine)
@@ -166,6 +144,8 @@ def share_inside_polygon(
     Green's theorem on the polygon clipped to the square: the sum over directed edges (inside
     on their left) of the area between the edge, clamped to the square, and its lower side.
 
+    Returns share, shape (n_regions, n_points).
+
     Parameters
     ----------
     edges_mm
@@ -176,10 +156,6 @@ def share_inside_polygon(
         Side of the square.
     turn_rad
         Angle by which each square is turned, shape (n_points,).
-
-    Returns
-    -------
-    Share, shape (n_regions, n_points).
     """
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
     total = np.zeros((len(edges_mm), len(centers_mm)))
@@ -724,10 +700,7 @@ def _edge_distance_of_mixed_kinds(region: RegionsOfMixedKinds, x_mm: FloatArray,
 def region_of(pattern: Pattern) -> Region:
     """Build the region that a pattern of a recording describes (n_regions is 1).
 
-    Raises
-    ------
-    ParameterError
-        If the pattern is of no known kind, or its numbers describe no area.
+    Raises ParameterError if the pattern is of no known kind, or its numbers describe no area.
     """
     match pattern:
         case kinds.Uniform(level):

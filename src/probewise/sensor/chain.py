@@ -161,24 +161,10 @@ class Chain:
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings.
 
-        Parameters
-        ----------
-        theta
-            Hypotheses, shape (n_samples, n_params), columns as `names`.
-        plan
-            Pose, time and pattern of every reading, n_points rows.
-
-        Returns
-        -------
-        Readings, shape (n_samples, n_points).
-
-        Raises
-        ------
-        ShapeError
-            If the columns of theta do not match `names`.
-        ParameterError
-            If the plan has a pattern that the scene lacks, theta holds no valid SSF, or a height is commanded of a
-            `DiscreteSSF`.
+        `theta`: hypotheses, shape (n_samples, n_params), columns as `names`; `plan`: pose, time and pattern of every
+        reading, n_points rows. Returns readings, shape (n_samples, n_points). Raises ShapeError if the columns of theta
+        do not match `names`; ParameterError if the plan has a pattern that the scene lacks, theta holds no valid SSF,
+        or a height is commanded of a `DiscreteSSF`.
         """
         plan = self.plan_at_calibrated_height(plan)
         at_once = self._n_hypotheses_at_once(theta, plan)
@@ -398,6 +384,8 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
     By closed forms, and quadrature at curved edges. A kind of region without a closed form is summed over pixels: error
     about 1e-3, with a `SlowWarning`.
 
+    Returns R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
+
     Parameters
     ----------
     layout
@@ -406,10 +394,6 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
         SSF in the sensor frame, arrays broadcasting to (n_samples, n_points, n_gaussians).
     n_nodes
         Nodes of the quadrature over curved edges.
-
-    Returns
-    -------
-    R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
     """
     out = np.zeros(
         (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
@@ -446,6 +430,8 @@ class _HypothesesByGeometry:
     def response(self, layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int) -> FloatArray:
         """Integrate as `response` does, but each Gaussian of each geometry only once.
 
+        Returns R of every hypothesis, (n_samples, n_points).
+
         Parameters
         ----------
         layout
@@ -454,10 +440,6 @@ class _HypothesesByGeometry:
             Footprints of all hypotheses, with weights that are the same at every reading.
         n_nodes
             Nodes of the quadrature over curved edges.
-
-        Returns
-        -------
-        R of every hypothesis, (n_samples, n_points).
         """
         n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
 

@@ -21,6 +21,9 @@ _PIXELS_AT_ONCE = 2**16
 def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> FloatArray:
     """Compute the response of a discrete SSF: the sum of its pixels' values times the mean albedo of each pixel.
 
+    Returns response R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses. Raises
+    ShapeError if poses and region hold different numbers of hypotheses, neither of them 1.
+
     Parameters
     ----------
     region
@@ -29,15 +32,6 @@ def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> Floa
         The discrete SSF in the sensor frame; its pixels turn with the sensor.
     poses
         Where the sensor stands; arrays broadcast to (n_samples, n_points).
-
-    Returns
-    -------
-    Response R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
-
-    Raises
-    ------
-    ShapeError
-        If poses and region hold different numbers of hypotheses, neither of them 1.
     """
     x, y, turn = np.broadcast_arrays(poses.x_mm, poses.y_mm, poses.orientation_rad)
     n_poses, n_points = x.shape

@@ -49,16 +49,9 @@ N_FREE_FORM = 1 + len(_WIDTHS)
 def free_form_theta(one: FloatArray, bends: FloatArray) -> FloatArray:
     """Return the parameters of free forms: each a Gaussian bent without a change of its mean and covariance.
 
-    Parameters
-    ----------
-    one
-        The paper's a, u, v, A, B, C of one Gaussian that holds the whole mass, (n_samples, 6).
-    bends
-        Coefficients of the basis of shares that keep mean and covariance, of either sign, (n_samples, N_BENDS).
-
-    Returns
-    -------
-    The paper's parameters of the mixture, (n_samples, 6 N_FREE_FORM).
+    `one`: the paper's a, u, v, A, B, C of one Gaussian that holds the whole mass, (n_samples, 6); `bends`: coefficients
+    of the basis of shares that keep mean and covariance, of either sign, (n_samples, N_BENDS). Returns the paper's
+    parameters of the mixture, (n_samples, 6 N_FREE_FORM).
     """
     shares = bends @ _DIRECTIONS.T
     a, u, v, aa, bb, cc = (one[:, k, None] for k in range(6))

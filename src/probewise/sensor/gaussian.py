@@ -98,6 +98,8 @@ def mean_albedo_under_gaussians(
 
     A kind of region without a closed form is summed over pixels: error about 1e-3, with a `SlowWarning`.
 
+    Returns mean albedo, shape (n_samples, n_points, n_gaussians).
+
     Parameters
     ----------
     region
@@ -108,10 +110,6 @@ def mean_albedo_under_gaussians(
         Their covariances in the lab frame, mm^2, broadcasting likewise.
     n_nodes
         Nodes of the quadrature over curved edges.
-
-    Returns
-    -------
-    Mean albedo, shape (n_samples, n_points, n_gaussians).
     """
     arrays = np.broadcast_arrays(x_mm, y_mm, var_x, var_y, cov_xy)
     zero = np.zeros((1, 1))

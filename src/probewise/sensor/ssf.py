@@ -33,23 +33,10 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     The exponent A x^2 + B y^2 + 2 C x y belongs to the covariance 1/2 inv([[A, C], [C, B]]);
     its mass is a pi / sqrt(AB - C^2).
 
-    Parameters
-    ----------
-    theta
-        Columns a_n, u_n, v_n (mm), A_n, B_n, C_n (1/mm^2), shape (n_samples, 6 n_gaussians).
-    n_gaussians
-        Number of Gaussians, N.
-
-    Returns
-    -------
-    Footprint with arrays (n_samples, 1, n_gaussians).
-
-    Raises
-    ------
-    ParameterError
-        If A, AB - C^2 or the total mass is not positive. Single amplitudes may be negative.
-    ShapeError
-        If theta has another number of columns.
+    `theta`: columns a_n, u_n, v_n (mm), A_n, B_n, C_n (1/mm^2), shape (n_samples, 6 n_gaussians); `n_gaussians`: number
+    of Gaussians, N. Returns footprint with arrays (n_samples, 1, n_gaussians). Raises ParameterError if A, AB - C^2 or
+    the total mass is not positive. Single amplitudes may be negative; ShapeError if theta has another number of
+    columns.
     """
     if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:
         raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (n_samples, {6 * n_gaussians})")
@@ -225,6 +212,9 @@ def mean_ssf_field(
 ) -> SSFField:
     """Return the mean field of sampled SSFs, evaluated at pixel centres: a mean of fields, not of parameters.
 
+    Returns the mean field (paper, "logWt-weighted average of the sampled SSF fields"). Raises ShapeError if an axis has
+    fewer than two pixels; ParameterError if the pixels are not evenly spaced, with one spacing for both axes.
+
     Parameters
     ----------
     footprint
@@ -233,17 +223,6 @@ def mean_ssf_field(
         Evenly spaced pixel centres with one spacing for both axes, (n_x,) and (n_y,).
     weights
         Weight of each sample in the mean, (n_samples,); equal when None.
-
-    Returns
-    -------
-    The mean field (paper, "logWt-weighted average of the sampled SSF fields").
-
-    Raises
-    ------
-    ShapeError
-        If an axis has fewer than two pixels.
-    ParameterError
-        If the pixels are not evenly spaced, with one spacing for both axes.
     """
     if len(u_mm) < 2 or len(v_mm) < 2:
         raise ShapeError(f"u_mm has {len(u_mm)} pixels, v_mm {len(v_mm)}; allowed: 2 or more each")

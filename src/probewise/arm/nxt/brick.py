@@ -61,10 +61,7 @@ class Brick:
     ) -> None:
         """Stop and release the motors, switch the LEDs off and close the connection; signals are deferred until then.
 
-        Raises
-        ------
-        LinkError
-            If this could not be confirmed, and no other exception is pending.
+        Raises LinkError if this could not be confirmed, and no other exception is pending.
         """
         with defer_signals():
             try:
@@ -88,10 +85,7 @@ class Brick:
 
         Since the protocol has no checksum, the voltage is read until two successive values agree within 50 mV.
 
-        Raises
-        ------
-        LinkError
-            If the brick does not answer, or no two of six successive voltages agree.
+        Raises LinkError if the brick does not answer, or no two of six successive voltages agree.
 
         Warns
         -----

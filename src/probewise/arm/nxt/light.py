@@ -27,10 +27,7 @@ def normalized_from_counts(raw_counts: int) -> int:
 
     The firmware's integer arithmetic for types 05 and 06: only 697 of the 1024 values occur.
 
-    Raises
-    ------
-    ParameterError
-        If the counts are outside the converter's 0 to 1023.
+    Raises ParameterError if the counts are outside the converter's 0 to 1023.
     """
     if not 0 <= raw_counts <= AD_MAX:
         raise ParameterError("raw_counts", raw_counts, f"0 to {AD_MAX}")
@@ -87,12 +84,8 @@ class LightSensor:
     def read(self) -> LightReading:
         """Read once, with the LED as last set (by default on).
 
-        Raises
-        ------
-        SensorError
-            If the brick marks every reading as invalid.
-        TelegramError
-            If the brick's answers remain inconsistent after repeated questions.
+        Raises SensorError if the brick marks every reading as invalid; TelegramError if the brick's answers remain
+        inconsistent after repeated questions.
         """
         if self._type is None:
             self.set_led()

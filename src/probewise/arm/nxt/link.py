@@ -118,23 +118,10 @@ class Link:
 
         A repeatable command is repeated if the answer is missing, corrupted or a refusal; others are sent once.
 
-        Parameters
-        ----------
-        request
-            The command.
-        check
-            Function that raises TelegramError for an impossible answer; None: any answer is accepted.
-
-        Raises
-        ------
-        BrickError
-            If the brick refuses the command.
-        NoAnswerError
-            If the brick did not answer in time, although the connection may still work.
-        TelegramError
-            If the received bytes are not an answer.
-        LinkError
-            If the connection is dead.
+        `request`: the command; `check`: function that raises TelegramError for an impossible answer; None: any answer
+        is accepted. Raises BrickError if the brick refuses the command; NoAnswerError if the brick did not answer in
+        time, although the connection may still work; TelegramError if the received bytes are not an answer; LinkError
+        if the connection is dead.
         """
         self.keep_awake()
         for n_left in reversed(range(1 + self._timing.n_repeats if request.is_repeatable else 1)):

@@ -252,10 +252,7 @@ class Motor:
     def _try_to_start_limited_move(self, target: int, side: Side, command: SetOutputState) -> bool:
         """Command a limited move, exactly once; return whether the brick accepted it.
 
-        Raises
-        ------
-        LinkError
-            If several successive commands were not accepted.
+        Raises LinkError if several successive commands were not accepted.
         """
         try:
             self._link.ask(command)

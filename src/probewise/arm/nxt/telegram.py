@@ -166,12 +166,8 @@ class Request(Body, Generic[A_co]):
     def decode_answer(self, reply: Reply) -> A_co:
         """Decode a reply to this command into its answer.
 
-        Raises
-        ------
-        BrickError
-            If the brick refused the command; the status gives the reason.
-        TelegramError
-            If the reply belongs to another command or port, or its length is wrong.
+        Raises BrickError if the brick refused the command; the status gives the reason; TelegramError if the reply
+        belongs to another command or port, or its length is wrong.
         """
         if reply.opcode != self.OPCODE:
             raise TelegramError(f"a reply to opcode {reply.opcode:02X} came for {self.name}, {self.OPCODE:02X}")

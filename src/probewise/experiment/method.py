@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import nested_sampling_from_scratch, with_evidence_from_prior
+from probewise.experiment.evidence import can_sleep_mask, nested_sampling_from_scratch, with_evidence_from_prior
 from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
 from probewise.experiment.smc import BRIEF, STEADY, THOROUGH, resample_and_move, update
 from probewise.nested import Weighted
@@ -78,9 +78,11 @@ class SequentialMonteCarlo:
             return replace(previous, particles=(found,))
         usual, unsuspected = STEADY if previous.doubts_sensor else THOROUGH, SUSPECTED[1][0]
         updated = tuple(
-            update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < unsuspected else usual)
-            for kind, particles, problem, p in zip(
-                previous.kinds, previous.particles, problems, previous.probability, strict=True
+            particles.asleep_with(problem)
+            if can_sleep
+            else update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < unsuspected else usual)
+            for kind, particles, problem, p, can_sleep in zip(
+                previous.kinds, previous.particles, problems, previous.probability, can_sleep_mask(previous), strict=True
             )
         )
         now = replace(previous, particles=updated)
@@ -90,7 +92,7 @@ class SequentialMonteCarlo:
         particles = list(now.particles)
         for k, (kind, p) in enumerate(zip(now.kinds, now.probability, strict=True)):
             n = n_samples_of_kind(kind, p, self.n_particles)
-            if n > len(particles[k].ancestor) or p < IMPROBABLE:
+            if not particles[k].asleep and (n > len(particles[k].ancestor) or p < IMPROBABLE):
                 effort = BRIEF if kind.left_out else THOROUGH
                 particles[k] = resample_and_move(particles[k], n, problems[k], rng=rng, effort=effort)
         return replace(now, particles=tuple(particles))

@@ -87,6 +87,8 @@ class Particles:
         posterior, and the product of mean weights is nearly always too small.
     searched_at
         Number of readings at the last search of the prior; -inf if there was none.
+    asleep
+        Whether the samples are those of fewer readings, and the evidence an upper bound: see `asleep_with`.
     """
 
     weighted: Weighted
@@ -96,6 +98,7 @@ class Particles:
     strained: bool = False
     hurried: bool = False
     searched_at: float = -math.inf
+    asleep: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -121,6 +124,11 @@ class Particles:
         lineages = np.bincount(self.ancestor, weights=self.weighted.weight)
         related = float(lineages @ lineages) - (self.n_resampled + 1) / len(self.ancestor)
         return max(math.sqrt(max(related, 0.0) + self.start_variance), self.weighted.log_z_error)
+
+    def asleep_with(self, problem: SensorProblem) -> Self:
+        """Return the samples as they are, with the evidence as if the last reading had been predicted exactly."""
+        log_z = self.log_z + _LastReadingEvaluator(problem).perfect_log_likelihood
+        return replace(self, weighted=replace(self.weighted, log_z=log_z), asleep=True)
 
     def with_zero_evidence(self) -> Self:
         """Return the samples with an evidence of zero: none of them could have given the readings."""
@@ -168,9 +176,7 @@ def update(
         if fall_back is not None:
             return _particles_from_run(fall_back(), n, last, n, rng)
         strained = True
-    now = _EvaluatedSamples(
-        before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods_without_and_with(predicted)
-    )
+    now = _EvaluatedSamples(before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods(predicted, 1.0))
     log_weight, base = before.log_weight, before.log_likelihood
     log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
     while True:
@@ -181,7 +187,12 @@ def update(
             return replace(previous.with_zero_evidence(), strained=True)
         given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
         strained |= given_up and all_at_once < least
-        share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
+        if all_at_once >= least or given_up:
+            share = 1.0
+        else:
+            if n_resampled == previous.n_resampled:  # the first temperature: only now the readings before count too
+                now = replace(now, before=last.log_likelihoods(predicted, share)[0])
+            share = _next_power(log_weight, base, now, share, least)
         weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.log_likelihood_at_power(share)
@@ -335,10 +346,13 @@ class _LastReadingEvaluator:
             return 0.0
         return float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0])
 
-    def log_likelihoods_without_and_with(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return log likelihoods without and with the last reading, from predictions, -> (n_samples,) each."""
+    def log_likelihoods(self, predicted: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods without and with the last reading, from predictions, -> (n_samples,) each.
+
+        Those without it count for nothing where that reading's likelihood has the power 1, and are zero then.
+        """
         usable, readings = self.problem.recording.usable, self.problem.recording.readings
-        earlier = usable.copy()
+        earlier = usable & (share < 1.0)
         earlier[-1] = False
         without, with_last = (
             checked_log_prob(self.problem.likelihood, readings[rows], predicted[:, rows])
@@ -348,15 +362,15 @@ class _LastReadingEvaluator:
         )
         return without, with_last
 
-    def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
-        """Evaluate prior and likelihoods of samples; those outside the prior get a likelihood of zero."""
+    def evaluate_samples(self, theta: FloatArray, share: float = 1.0) -> _EvaluatedSamples:
+        """Evaluate prior and likelihoods (see `log_likelihoods`) of samples; outside the prior a likelihood is zero."""
         problem = self.problem
         log_prior = problem.prior.log_prob(theta)
         before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
         possible = np.isfinite(log_prior)
         if possible.any():
             predicted = problem.model.predict(theta[possible], problem.recording.plan)
-            before[possible], after[possible] = self.log_likelihoods_without_and_with(predicted)
+            before[possible], after[possible] = self.log_likelihoods(predicted, share)
         return _EvaluatedSamples(theta, log_prior, before, after)
 
 
@@ -386,7 +400,7 @@ def _move_by_metropolis(
             theta, log_ratio = np.empty_like(now.theta), np.empty(n)
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
-            proposed = last.evaluate_samples(theta)
+            proposed = last.evaluate_samples(theta, share)
             odds = (
                 proposed.log_prior
                 + proposed.log_likelihood_at_power(share)

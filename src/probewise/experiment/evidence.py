@@ -17,10 +17,9 @@ from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
-from probewise.experiment.kinds import Posterior, n_samples_of_kind
-from probewise.experiment.smc import BRIEF, LocalKernels, particles_from_posterior
-from probewise.inference.problem import SensorProblem
-from probewise.nested import LIVE_PER_PARAM, KernelMove, NestedResult, RemainingEvidence, Weighted, pareto_k, run
+from probewise.experiment.kinds import KindProblem, Posterior, n_samples_of_kind
+from probewise.inquiry.smc import BRIEF, LocalKernels, nested_sampling_from_scratch, particles_from_posterior
+from probewise.nested import Weighted, pareto_k
 from probewise.nested.importance import evenly_weighted
 from probewise.nested.weights import n_effective
 
@@ -32,21 +31,7 @@ _BEHIND = 20.0  # nats behind what the prior's search found, from which on carri
 _LOST_SHARE = 0.05  # of a posterior that may lie outside the samples' range, besides what chance leaves there
 _FOUND, _WELL_FOUND = 15.0, 100.0  # effective draws from which on importance sampling counts, and need not go on
 _ROUNDS = 3  # of importance sampling, each about the draws of those before
-_DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 _WIDE, _OF_WIDE = 3.0, 0.15  # factor on the width of some kernels, beyond the samples they are fitted to; their share
-
-
-def nested_sampling_from_scratch(problem: SensorProblem, *, n_live: int, rng: np.random.Generator) -> NestedResult:
-    """Solve a problem, all readings at once, by nested sampling."""
-    return run(
-        problem,
-        rng=rng,
-        n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
-        move=KernelMove(),
-        stop=RemainingEvidence(_DLOGZ),
-        max_cost=1.0,  # speed matters, since the robot waits
-        return_interrupted=False,
-    )
 
 
 def can_sleep_mask(now: Posterior) -> BoolArray:
@@ -62,7 +47,7 @@ def can_sleep_mask(now: Posterior) -> BoolArray:
 
 def with_evidence_from_prior(
     now: Posterior,
-    problems: list[SensorProblem],
+    problems: list[KindProblem],
     n_particles: int,
     n_live: int,
     *,
@@ -106,7 +91,7 @@ def with_evidence_from_prior(
 
 
 def posterior_from_prior(
-    own: Weighted, problem: SensorProblem, n: int, n_live: int, rng: np.random.Generator
+    own: Weighted, problem: KindProblem, n: int, n_live: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Return samples and evidence of a problem by a search of the prior; None if nothing could give the readings.
 
@@ -146,7 +131,7 @@ def _has_lost_mode(own: Weighted, found: Weighted) -> bool:
 
 
 def sampled_about_points(
-    points: FloatArray, problem: SensorProblem, n_draws: int, rng: np.random.Generator
+    points: FloatArray, problem: KindProblem, n_draws: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Sample a posterior by draws from kernels about points near it, (n_points, n_params); None if none is possible."""
     density = _KernelDensity.fitted_to(points, rng=rng)

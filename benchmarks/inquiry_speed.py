@@ -30,10 +30,9 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import ArmReachAndTravel, Experiment, Step, explore
-from probewise.experiment.evidence import nested_sampling_from_scratch
 from probewise.experiment.inquire import predict_readings_and_utilities
-from probewise.experiment.smc import Particles, update
 from probewise.inquiry import Grid
+from probewise.inquiry.smc import Particles, nested_sampling_from_scratch, update
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import Trial, arm_of, experiment_of
 from probewise.scene import SHAPES, HypothesisScene

@@ -39,7 +39,7 @@ BESIDE = {
     "inquiry.forecast",
     "experiment.journal",
     "experiment.kinds",
-    "experiment.smc",
+    "inquiry.smc",
 }
 """What the eight may import beside each other, NumPy and SciPy."""
 

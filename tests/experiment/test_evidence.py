@@ -10,9 +10,9 @@ import pytest
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration.sensor_file import read_sensor
 from probewise.experiment import experiment_for, read_journal
-from probewise.experiment.evidence import nested_sampling_from_scratch, posterior_from_prior
+from probewise.experiment.evidence import posterior_from_prior
 from probewise.experiment.kinds import prior_posterior
-from probewise.experiment.smc import prior_particles
+from probewise.inquiry.smc import nested_sampling_from_scratch, prior_particles
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import experiment_of
 from probewise.scene import Circle, Field

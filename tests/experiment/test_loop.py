@@ -20,7 +20,7 @@ from probewise.experiment import Exploration, OneScan, arm_over, begin, explore,
 from probewise.experiment.stopping import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
-from probewise.inquiry.any_instrument import prior_samples
+from probewise.inquiry.smc import prior_particles
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene
@@ -403,7 +403,7 @@ def test_a_reading_at_an_end_of_the_scale_fits_what_is_predicted_beyond(small, r
     """Ten noise sds lie between the 60 that is predicted on white and a reading of 50."""
     experiment = small.experiment(reading_range=reading_range, step=step)
     problem = experiment.problem([Reading(value, Pose(250.0, 140.0), 0.0)])
-    posterior = prior_samples(experiment.prior, 1, rng=rng())
+    posterior = prior_particles(experiment.prior, 1, rng=rng()).weighted
     posterior = replace(posterior, theta=np.array([[250.0, 140.0, 60.0]]))
     p_value, _ = p_value_and_worst_reading(experiment, posterior, problem)
     assert (p_value > 0.01) == fits

@@ -11,18 +11,18 @@ from scipy.stats import multivariate_normal
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
 from probewise.experiment.evidence import sampled_about_points
-from probewise.experiment.smc import (
+from probewise.experiment.stopping import information_nats
+from probewise.inquiry.smc import (
     THOROUGH,
     LocalKernels,
     Particles,
-    _LastReadingEvaluator,
+    _EvaluatedSamples,
     _move_by_metropolis,
     _partition_rows,
     prior_particles,
     resample_and_move,
     update,
 )
-from probewise.experiment.stopping import information_nats
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 
@@ -254,8 +254,7 @@ def test_copies_of_one_sample_are_not_moved(small):
     """They are left where they are, and the posterior is marked as strained."""
     problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
     theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
-    last = _LastReadingEvaluator(problem)
-    start = last.evaluate_samples(theta)
-    moved, accepted, _ = _move_by_metropolis(start, 1.0, last, rng(1), [np.arange(len(theta))], THOROUGH)
+    start = _EvaluatedSamples.of(theta, problem, 1.0)
+    moved, accepted, _ = _move_by_metropolis(start, 1.0, problem, rng(1), [np.arange(len(theta))], THOROUGH)
     assert accepted == 0.0
     np.testing.assert_array_equal(moved.theta, theta)

@@ -15,74 +15,73 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
-from probewise.experiment.kinds import Posterior, n_samples_of_kind
-from probewise.experiment.smc import BRIEF, LocalKernels, particles_from_posterior
-from probewise.inference.problem import SensorProblem
-from probewise.nested import LIVE_PER_PARAM, KernelMove, NestedResult, RemainingEvidence, Weighted, pareto_k, run
+from probewise.experiment.kinds import KindProblem, Posterior, n_samples_of_kind
+from probewise.inquiry.smc import BRIEF, LocalKernels, nested_sampling_from_scratch, particles_from_posterior
+from probewise.nested import Weighted, pareto_k
 from probewise.nested.importance import evenly_weighted
 from probewise.nested.weights import n_effective
 
-_MATTERS = 1e-3  # probability, by the raised odds, of a kind that is solved at a doubt
+_MATTERS = 1e-4  # probability, by the raised odds, from which on a kind is solved at a doubt, and wakes
 _HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
-_HOLDS = 5  # readings for which an evidence from the prior is good, if the samples follow them with ease
-_PER_READING = 3  # kinds that are solved after a reading in any case, in turn, while the sensor is in doubt
+_SLEEPS = 1e-8  # probability, by the raised odds, below which a kind falls asleep
+_PER_READING = 3  # kinds never solved, or with difficulties since, that are while the sensor is in doubt
 _BEHIND = 20.0  # nats behind what the prior's search found, from which on carried samples are not drawn about
 _LOST_SHARE = 0.05  # of a posterior that may lie outside the samples' range, besides what chance leaves there
 _FOUND, _WELL_FOUND = 15.0, 100.0  # effective draws from which on importance sampling counts, and need not go on
 _ROUNDS = 3  # of importance sampling, each about the draws of those before
-_DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 _WIDE, _OF_WIDE = 3.0, 0.15  # factor on the width of some kernels, beyond the samples they are fitted to; their share
 
 
-def nested_sampling_from_scratch(problem: SensorProblem, *, n_live: int, rng: np.random.Generator) -> NestedResult:
-    """Solve a problem, all readings at once, by nested sampling."""
-    return run(
-        problem,
-        rng=rng,
-        n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
-        move=KernelMove(),
-        stop=RemainingEvidence(_DLOGZ),
-        max_cost=1.0,  # speed matters, since the robot waits
-        return_interrupted=False,
-    )
+def can_sleep_mask(now: Posterior) -> BoolArray:
+    """Mark the kinds whose samples need not follow the next reading, (n_kinds,).
+
+    A search of the prior has found that such a kind is far behind, and even if it had predicted every reading since
+    exactly, it would be; which is what its evidence then says.
+    """
+    raised = now.with_raised_fault_odds().probability
+    known = np.array([p.asleep or (p.searched_at > -math.inf and not p.is_doubtful) for p in now.particles])
+    return np.asarray(known & (raised < _SLEEPS) & now.doubts_sensor)
 
 
 def with_evidence_from_prior(
     now: Posterior,
-    problems: list[SensorProblem],
+    problems: list[KindProblem],
     n_particles: int,
     n_live: int,
     *,
     at_end: bool,
     rng: np.random.Generator,
 ) -> Posterior:
-    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, all but recent ones.
+    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those never solved too.
 
     `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. After a
-    reading, the probable kinds are solved whose samples followed it with difficulty; if these hold most of the
+    reading, the probable kinds are solved whose samples followed it with difficulty or sleep; if these hold most of the
     posterior, every such kind. Where no effect can be left out, the end changes samples only if they had lost a mode.
     """
     n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
     raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
+    matters, asleep = raised > _MATTERS, np.array([p.asleep for p in now.particles])
     doubtful = np.array([p.is_doubtful for p in now.particles])
+    unsure = doubtful | np.array([p.searched_at == -math.inf for p in now.particles])
+    due = asleep & matters
     if at_end:
-        due = doubtful | np.array([n_readings >= p.searched_at + _HOLDS for p in now.particles])
-        due &= now.doubts_sensor | (raised > _HAS_A_SAY)
+        due |= unsure & (now.doubts_sensor | (raised > _HAS_A_SAY))
     else:
-        due = doubtful & ((raised > _MATTERS) | (raised[doubtful].sum() > 0.5))
+        due |= doubtful & (matters | (raised[doubtful].sum() > 0.5))
         if now.doubts_sensor and possible and now.left_out[""] < 0.5:
-            longest_ago = np.argsort([p.searched_at for p in now.particles], kind="stable")
-            due[longest_ago[:_PER_READING]] = True
+            due[np.flatnonzero(unsure)[np.argsort(-raised[unsure], kind="stable")[:_PER_READING]]] = True
     particles = list(now.particles)
     for k in np.flatnonzero(due).tolist():
         own, kind, problem = particles[k], now.kinds[k], problems[k]
         n = max(len(own.ancestor), n_samples_of_kind(kind, float(raised[k]), n_particles))
-        found = posterior_from_prior(own.weighted, problem, n, n_live, rng)
+        carried = own.with_zero_evidence() if own.asleep else own
+        found = posterior_from_prior(carried.weighted, problem, n, n_live, rng)
         keep = not own.is_doubtful and not now.doubts_sensor and not (found and _has_lost_mode(own.weighted, found))
         if found is None:
-            particles[k] = replace(own.with_zero_evidence(), strained=False, hurried=False, searched_at=n_readings)
+            none = own.with_zero_evidence()
+            particles[k] = replace(none, strained=False, hurried=False, asleep=False, searched_at=n_readings)
         elif keep:
             particles[k] = replace(own, searched_at=n_readings)
         else:
@@ -92,7 +91,7 @@ def with_evidence_from_prior(
 
 
 def posterior_from_prior(
-    own: Weighted, problem: SensorProblem, n: int, n_live: int, rng: np.random.Generator
+    own: Weighted, problem: KindProblem, n: int, n_live: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Return samples and evidence of a problem by a search of the prior; None if nothing could give the readings.
 
@@ -132,7 +131,7 @@ def _has_lost_mode(own: Weighted, found: Weighted) -> bool:
 
 
 def sampled_about_points(
-    points: FloatArray, problem: SensorProblem, n_draws: int, rng: np.random.Generator
+    points: FloatArray, problem: KindProblem, n_draws: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Sample a posterior by draws from kernels about points near it, (n_points, n_params); None if none is possible."""
     density = _KernelDensity.fitted_to(points, rng=rng)

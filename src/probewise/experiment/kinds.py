@@ -18,9 +18,9 @@ from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
 from probewise.experiment.rivals import DescribedEffect, SensorModelRival
-from probewise.experiment.smc import Particles, prior_particles
-from probewise.inference.problem import Likelihood, SensorProblem
+from probewise.inference.problem import Likelihood, SensorProblem, checked_log_prob
 from probewise.inquiry import TabulatedChain
+from probewise.inquiry.smc import Particles, prior_particles
 from probewise.nested import Weighted
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
@@ -37,6 +37,40 @@ FAULT_ODDS_FACTOR = 14.0
 """Factor on the odds that the sensor model is incomplete, wherever something is concluded: choice of readings, stopping
 rule, reported shape and its error, credible set. By the plain odds a fault that a dozen readings can hardly show would
 be right one time in ten, and whatever is concluded of a run that has it would miss."""
+
+
+class KindProblem(SensorProblem):
+    """The problem of one kind, for nested sampling and, reading by reading, for `inquiry.smc`."""
+
+    def predict(self, theta: FloatArray) -> FloatArray:
+        """Predict all readings, (n_samples, n_params) -> (n_samples, n_points)."""
+        return self.model.predict(theta, self.recording.plan)
+
+    def log_likelihoods(self, predicted: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods, (n_samples,), without (zero where `share` is 1) and with the last reading."""
+        usable, readings = self.recording.usable, self.recording.readings
+        earlier = usable & (share < 1.0)
+        earlier[-1:] = False
+        without, with_last = (
+            checked_log_prob(self.likelihood, readings[rows], predicted[:, rows])
+            if rows.any()
+            else np.zeros(len(predicted))
+            for rows in (earlier, usable)
+        )
+        return without, with_last
+
+    def least_misfit_nats(self, predicted: FloatArray) -> float:
+        """Return by how many nats the best prediction of the last reading misses it; 0 if that reading is missing."""
+        if not self.recording.usable[-1]:
+            return 0.0
+        best = checked_log_prob(self.likelihood, self.recording.readings[-1:], predicted[:, -1:]).max()
+        return float(self.perfect_log_likelihood - best)
+
+    @property
+    def perfect_log_likelihood(self) -> float:
+        """Log likelihood of the last reading if predicted exactly; 0 if that reading is missing."""
+        reading = self.recording.readings[-1:]
+        return float(checked_log_prob(self.likelihood, reading, reading[None])[0]) if self.recording.usable[-1] else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +106,9 @@ class HypothesisKind:
     whole_names: tuple[str, ...]
     effect: DescribedEffect | None = None
 
-    def problem(self, recording: Recording) -> SensorProblem:
+    def problem(self, recording: Recording) -> KindProblem:
         """Set up the inference of this kind from a recording."""
-        return SensorProblem(self.prior, self.model, self.likelihood, recording)
+        return KindProblem(self.prior, self.model, self.likelihood, recording)
 
 
 def kinds_of(

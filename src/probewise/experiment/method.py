@@ -10,9 +10,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import nested_sampling_from_scratch, with_evidence_from_prior
+from probewise.experiment.evidence import can_sleep_mask, with_evidence_from_prior
 from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
-from probewise.experiment.smc import BRIEF, STEADY, THOROUGH, resample_and_move, update
+from probewise.inquiry.smc import BRIEF, STEADY, THOROUGH, nested_sampling_from_scratch, resample_and_move, update
 from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
 
@@ -77,20 +77,22 @@ class SequentialMonteCarlo:
             found = update(previous.particles[0], problems[0], rng=rng, fall_back=from_scratch)
             return replace(previous, particles=(found,))
         usual, unsuspected = STEADY if previous.doubts_sensor else THOROUGH, SUSPECTED[1][0]
-        updated = tuple(
-            update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < unsuspected else usual)
-            for kind, particles, problem, p in zip(
-                previous.kinds, previous.particles, problems, previous.probability, strict=True
-            )
-        )
-        now = replace(previous, particles=updated)
+        updated = list(previous.particles)
+        probability, can_sleep = previous.probability, can_sleep_mask(previous)
+        for k, (kind, own, problem) in enumerate(zip(previous.kinds, previous.particles, problems, strict=True)):
+            if can_sleep[k]:
+                updated[k] = own.asleep_with(problem.perfect_log_likelihood)
+            else:
+                effort = BRIEF if kind.left_out and probability[k] < unsuspected else usual
+                updated[k] = update(own, problem, rng=rng, effort=effort)
+        now = replace(previous, particles=tuple(updated))
         now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():
             raise NotConvergedError("no hypothesis of any kind could have given these readings")
         particles = list(now.particles)
         for k, (kind, p) in enumerate(zip(now.kinds, now.probability, strict=True)):
             n = n_samples_of_kind(kind, p, self.n_particles)
-            if n > len(particles[k].ancestor) or p < IMPROBABLE:
+            if not particles[k].asleep and (n > len(particles[k].ancestor) or p < IMPROBABLE):
                 effort = BRIEF if kind.left_out else THOROUGH
                 particles[k] = resample_and_move(particles[k], n, problems[k], rng=rng, effort=effort)
         return replace(now, particles=tuple(particles))

@@ -18,10 +18,10 @@ from probewise.arm import Instrument, Pose, Reading
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.experiment.journal import PATTERN, recording_of
 from probewise.experiment.kinds import HypothesisKind, Posterior
-from probewise.experiment.smc import Particles
 from probewise.inference.likelihoods import StudentT
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import Grid, choose, entropy_map
+from probewise.inquiry.smc import Particles
 from probewise.nested import EvidenceChange, KernelMove, Move, NestedResult, StopRule, Weighted, diversify, run
 from probewise.nested.weights import resampled_rows
 from probewise.recordings import Recording

@@ -18,10 +18,10 @@ from probewise.arm.instrument import Reading
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.errors import ParameterError
 from probewise.experiment.journal import recording_of, value_digest
-from probewise.experiment.kinds import HypothesisKind, kinds_of
+from probewise.experiment.kinds import HypothesisKind, KindProblem, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.rivals import Pace, SensorModelRival, rivals_of
-from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
+from probewise.inference.problem import Likelihood, require_likelihood, require_model
 from probewise.inquiry import (
     Designs,
     Finishing,
@@ -315,7 +315,7 @@ class Experiment:
             return forecast_of(self.model)
         return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)
 
-    def problem(self, readings: Sequence[Reading]) -> SensorProblem:
+    def problem(self, readings: Sequence[Reading]) -> KindProblem:
         """Return the inference problem for these readings; with `trust` below 1, its times are paced (see `Pace`)."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if not self.heights_mm and self.calibrated_height_mm is not None:
@@ -324,7 +324,7 @@ class Experiment:
             recording = replace(recording, plan=replace(recording.plan, covariates=covariates))
         if self.trust < 1:
             recording = Pace.from_readings(readings).recording_with_paced_time(recording)
-        return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
+        return KindProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     @property
     def _rivals(self) -> tuple[SensorModelRival, ...]:

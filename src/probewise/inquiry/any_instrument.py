@@ -1,7 +1,7 @@
 """The choice of the next setting of any instrument, from a model of its readings, a prior, settings and noise.
 
 The paper's machine learning system without a field of shapes: readings update weighted samples of the posterior
-(iterated batch importance sampling, Chopin 2002), and the next setting maximises an acquisition function
+(`inquiry.smc`), and the next setting maximises an acquisition function
 (`Inquiry.utility`): expected information (Lindley 1956) or, near a goal, the expected decrease of the posterior sds
 towards the goal.
 """
@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,10 +24,10 @@ from probewise._kinds import checked_finite_number, checked_whole, require_calla
 from probewise.errors import ParameterError, ShapeError, did_you_mean
 from probewise.inquiry.entropy import choose
 from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
-from probewise.nested import Evaluator, Weighted, diversify, make_problem, run
-from probewise.nested.importance import draw_and_weigh, evenly_weighted, fit_wide_and_narrow_proposals
-from probewise.nested.problem import AnyPrior, unbounded_space_of
-from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.inquiry.smc import STEADY, nested_sampling_from_scratch, particles_from_run, prior_particles, update
+from probewise.nested import Weighted, make_problem
+from probewise.nested.problem import AnyPrior
+from probewise.nested.weights import resampled_rows
 from probewise.priors import Joint, Prior, Product, require_prior
 from probewise.systems.calls import Caller
 
@@ -41,13 +41,6 @@ _ALLOWED = (
     "by name, all of one length"
 )
 _BLOCK = 2_000_000  # densities held, or readings predicted, at a time
-_KEEP = 0.25  # share of the samples that must count, else they are drawn anew
-_N_FITTED = 600  # samples to which the density of draws is fitted
-_SURPRISED = 0.01  # share of the samples that must count for a fit
-_PRIOR_SHARE = 0.1  # of the draws: they find parts without samples, and bound the weights
-_N_MOVES = 10  # steps of each sample
-_LEAST_STEP = 1e-5  # of a reading's likelihood at a time: with less, the samples cannot follow it
-_IMPOSSIBLE = 1e200  # nats, of a reading that a sample excludes
 _LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
 _N_PROBED = 3
 _N_ASKED = 500  # samples whose predictions value the settings
@@ -240,17 +233,16 @@ class InstrumentModel:
 
 @dataclass(frozen=True, eq=False)
 class ReadingsProblem:
-    """Readings with their settings, as a problem for nested sampling.
+    """Readings with their settings, as a problem for nested sampling and, reading by reading, for `inquiry.smc`.
 
     `settings` holds each distinct setting once; `row`, the setting's index, and `values` are of each reading,
-    (n_readings,). The likelihood of the last reading counts to the power `last_power`.
+    (n_readings,).
     """
 
     model: InstrumentModel
     settings: Settings
     row: IntArray
     values: FloatArray
-    last_power: float = 1.0
 
     @property
     def prior(self) -> Prior:
@@ -259,20 +251,29 @@ class ReadingsProblem:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
-        out = np.empty(len(theta))
         at_once = max(_BLOCK // len(self.values), 1)
-        for k in range(0, len(theta), at_once):
-            predicted = self.model.predict(theta[k : k + at_once], self.settings)
-            scale = self.model.scale(theta[k : k + at_once], predicted)
-            density = self.model.noise.log_density(self.values, predicted[:, self.row], scale[:, self.row])
-            density[:, -1] *= self.last_power
-            out[k : k + at_once] = density.sum(axis=1)
-        return out
+        return np.concatenate([self.predict(theta[k : k + at_once]).sum(axis=1) for k in range(0, len(theta), at_once)])
+
+    def predict(self, theta: FloatArray) -> FloatArray:
+        """Return the log density of every reading, (n_samples, n_params) -> (n_samples, n_readings)."""
+        predicted = self.model.predict(theta, self.settings)
+        scale = self.model.scale(theta, predicted)
+        return self.model.noise.log_density(self.values, predicted[:, self.row], scale[:, self.row])
+
+    def log_likelihoods(self, predicted: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods without and with the last reading, (n_samples,) each, from `predict`."""
+        return predicted[:, :-1].sum(axis=1), predicted.sum(axis=1)
+
+    def least_misfit_nats(self, predicted: FloatArray) -> float:
+        """Return by how many nats the best density of the last reading misses its largest; 0 if the sd is unknown."""
+        noise, last = self.model.noise, self.values[-1:]
+        if noise.is_sd_inferred:  # wide enough, it explains any reading
+            return 0.0
+        return float(noise.log_density(last, last, noise.scale(last[None], None)[0])[0] - predicted[:, -1].max())
 
     def log_density_of_last(self, theta: FloatArray) -> FloatArray:
-        """Return the log density of the last reading, (n_samples, n_params) -> (n_samples,); finite."""
-        density = self.model.log_density(theta, self.settings.take(self.row[-1:]), self.values[-1:])[:, 0]
-        return np.maximum(density, -_IMPOSSIBLE)
+        """Return the log density of the last reading, (n_samples, n_params) -> (n_samples,)."""
+        return self.model.log_density(theta, self.settings.take(self.row[-1:]), self.values[-1:])[:, 0]
 
     def p_value_and_worst_reading(self, theta: FloatArray) -> tuple[float, int]:
         """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
@@ -284,102 +285,6 @@ class ReadingsProblem:
         tail = self.model.noise.smaller_tail(self.values, predicted[0, self.row], scale[0, self.row])
         z = np.abs(ndtri(np.clip(tail, 1e-300, 0.5)))
         return float(chdtrc(len(z), float(z @ z))), int(np.argmax(z))
-
-
-def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
-    """Draw `n` equally weighted samples of the prior, as the posterior without readings: its evidence is one."""
-    return evenly_weighted(prior.names, prior.from_unit_cube(rng.random((n, len(prior.names)))), np.zeros(n))
-
-
-def updated_posterior(
-    previous: Weighted, readings: ReadingsProblem, n: int, *, rng: np.random.Generator
-) -> Weighted | None:
-    """Update the posterior given all readings but the last by the last; None if the samples cannot follow it.
-
-    Samples are reweighted. Where fewer than a quarter of them would count, new ones are drawn from a density fitted to
-    them and from the prior, and weighted by all readings; where such draws are not reliable, the samples are moved
-    first.
-    """
-    log_density = readings.log_density_of_last(previous.theta)
-    log_weight = previous.log_weight + log_density
-    gained, n_eff = float(logsumexp(log_weight)), n_effective(log_weight)
-    if gained < -0.5 * _IMPOSSIBLE:
-        return None
-    now = _reweighted(previous, log_weight - gained, log_density, gained, n_eff)
-    if n_eff >= _KEEP * len(now.theta):
-        return now
-    found = _drawn_anew(now, readings, n, rng)
-    if found is None:
-        moved = _moved_in_steps(previous, readings, rng)
-        found = None if moved is None else (_drawn_anew(moved, readings, n, rng) or moved)
-    return found
-
-
-def _reweighted(
-    found: Weighted, log_weight: FloatArray, log_density: FloatArray, gained: float, n_eff: float
-) -> Weighted:
-    return replace(
-        found,
-        log_likelihood=found.log_likelihood + log_density,
-        log_weight=log_weight,
-        log_z=found.log_z + gained,
-        log_z_error=math.hypot(found.log_z_error, math.sqrt(max(1 / n_eff - 1 / found.n_eff, 0.0))),
-        n_eff=n_eff,
-        run=None,
-    )
-
-
-def _drawn_anew(found: Weighted, readings: ReadingsProblem, n: int, rng: np.random.Generator) -> Weighted | None:
-    """Draw `n` samples from a density fitted to these; None if their weights are not reliable."""
-    if found.n_eff < max(_SURPRISED * n, 3 * len(found.names)):
-        return None
-    space, evaluate = unbounded_space_of(readings.prior), Evaluator(readings)
-    rows = np.unique(resampled_rows(found.weight, _N_FITTED, rng))
-    proposal = fit_wide_and_narrow_proposals(space.enter(found.theta[rows]), rng=rng)[-1]
-    drawn = draw_and_weigh(proposal, _PRIOR_SHARE, None, space, evaluate, n_draws=n, rng=rng)
-    return drawn if drawn.sound else None
-
-
-def _moved_in_steps(previous: Weighted, readings: ReadingsProblem, rng: np.random.Generator) -> Weighted | None:
-    """Apply the last reading's likelihood in powers, so that a quarter of the samples count each time, and move them.
-
-    After each power the samples are resampled and moved (`nested.diversify`). None if the powers are too small.
-    """
-    now, power, n = previous, 0.0, len(previous.theta)
-    while power < 1.0:
-        log_density = readings.log_density_of_last(now.theta)
-
-        def log_weight_at(step: float, now: Weighted = now, log_density: FloatArray = log_density) -> FloatArray:
-            return now.log_weight + step * log_density
-
-        step = 1.0 - power
-        if n_effective(log_weight_at(step)) < _KEEP * n:
-            step = power_bracket(log_weight_at, 0.0, step, wanted=_KEEP * n, n_steps=30)[0]
-        if step < min(_LEAST_STEP, 1.0 - power):
-            return None
-        log_weight = log_weight_at(step)
-        gained, n_eff = float(logsumexp(log_weight)), n_effective(log_weight)
-        power = min(power + step, 1.0) if step < 1.0 - power else 1.0
-        now = _reweighted(now, log_weight - gained, step * log_density, gained, n_eff)
-        if power < 1.0:
-            moved = _moved(now, replace(readings, last_power=power), rng)
-            now = replace(moved, log_z=now.log_z, log_z_error=now.log_z_error)
-    return now
-
-
-def _moved(found: Weighted, problem: ReadingsProblem, rng: np.random.Generator) -> Weighted:
-    """Resample and move the samples of a problem's posterior."""
-    rows = resampled_rows(found.weight, len(found.theta), rng)
-    theta, _ = diversify(found.theta[rows], problem, rng=rng, n_steps=_N_MOVES)
-    return evenly_weighted(found.names, theta, problem.log_likelihood(theta))
-
-
-def nested_posterior(readings: ReadingsProblem, n: int, n_live: int, *, rng: np.random.Generator) -> Weighted:
-    """Return `n` samples of the posterior by nested sampling of all readings with `n_live` points."""
-    found = run(readings, rng=rng, n_live=n_live)
-    theta = found.samples(n, rng=rng)
-    start = evenly_weighted(found.names, theta, readings.log_likelihood(theta))
-    return replace(_moved(start, readings, rng), log_z=found.log_z, log_z_error=found.log_z_error, run=found)
 
 
 class Inquiry(ShowsItself):
@@ -448,8 +353,8 @@ class Inquiry(ShowsItself):
             checked_whole("n_samples", n_samples, least=400, most=1_000_000),
             checked_whole("n_live", n_live),
         )
-        self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
-        self._prior_theta = self._posterior.theta
+        self._particles = prior_particles(self._model.prior, self._n_samples, rng=rng)
+        self._prior_theta = self.posterior.theta
         self._prior_log_likelihood, self._lost_nats = np.zeros(self._n_samples), 0.0
         self._taken: list[tuple[Any, float]] = []
         self._readings: ReadingsProblem | None = None
@@ -460,12 +365,12 @@ class Inquiry(ShowsItself):
     @property
     def posterior(self) -> Weighted:
         """The posterior as `nested.Weighted` samples: `mean()`, `sd()`, `interval(0.95)`, `samples(n, rng=rng)`."""
-        return self._posterior
+        return self._particles.weighted
 
     @property
     def evidence(self) -> tuple[float, float]:
         """Natural log of the evidence of the readings, and its standard error."""
-        return self._posterior.log_z, self._posterior.log_z_error
+        return self.posterior.log_z, self._particles.log_z_error
 
     @property
     def readings(self) -> tuple[tuple[Any, float], ...]:
@@ -482,7 +387,7 @@ class Inquiry(ShowsItself):
         again.
         """
         if self._utility is None:
-            self._utility = self._utility_for_weights(self._posterior.weight) / self._costs_s(self._last_setting)
+            self._utility = self._utility_for_weights(self.posterior.weight) / self._costs_s(self._last_setting)
             self._utility.flags.writeable = False
         return self._utility
 
@@ -512,7 +417,7 @@ class Inquiry(ShowsItself):
         """
         if self._readings is None:
             return None
-        best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
+        best = self.posterior.theta[[int(np.argmax(self.posterior.log_likelihood))]]
         p_value, worst = self._readings.p_value_and_worst_reading(best)
         if p_value >= _DOUBT_P:
             return None
@@ -561,12 +466,14 @@ class Inquiry(ShowsItself):
         readings = _append_reading(self._readings, self._model, at, value)
         of_prior = self._prior_log_likelihood + readings.log_density_of_last(self._prior_theta)
         by_prior = float(logsumexp(of_prior)) - math.log(self._n_samples)
-        found = updated_posterior(self._posterior, readings, self._n_samples, rng=self._rng)
+        search = partial(nested_sampling_from_scratch, readings, n_live=self._n_live, rng=self._rng)
+        found = update(self._particles, readings, rng=self._rng, fall_back=search, effort=STEADY)
         # Samples of the prior that explain the readings better than the posterior does lie in a part that it has lost.
-        if found is None or by_prior - found.log_z > _LOST_NATS + self._lost_nats:
-            found = nested_posterior(readings, self._n_samples, self._n_live, rng=self._rng)
+        if found.weighted.run is None and by_prior - found.log_z > _LOST_NATS + self._lost_nats:
+            found = particles_from_run(search(), self._n_samples, readings, n_calls=0, rng=self._rng)
+        if found.weighted.run is not None:
             self._lost_nats = max(by_prior - found.log_z, 0.0)
-        self._posterior, self._prior_log_likelihood = found, of_prior
+        self._particles, self._prior_log_likelihood = found, of_prior
         self._readings = readings
         self._taken.append((at[0], value))
         self._utility, self._next = None, None
@@ -583,8 +490,8 @@ class Inquiry(ShowsItself):
         checked_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)
         rows = [choose(self.utility, everywhere, rng=self._rng)]
-        theta, noise = self._posterior.theta, self._model.noise
-        weights = [self._posterior.weight] * _N_IMAGINED
+        theta, noise = self.posterior.theta, self._model.noise
+        weights = [self.posterior.weight] * _N_IMAGINED
         while len(rows) < n:
             predicted = self._model.predict(theta, self._settings.take(np.array(rows[-1:])))
             scale = self._model.scale(theta, predicted)
@@ -601,7 +508,7 @@ class Inquiry(ShowsItself):
     @own_arithmetic
     def summary(self) -> str:
         """Describe the posterior in plain text."""
-        found = self._posterior
+        found = self.posterior
         width = max(9, *(len(name) for name in found.names))
         low, high = found.interval(0.95)
         lines = [
@@ -617,7 +524,7 @@ class Inquiry(ShowsItself):
     @property
     def _largest_sd_over_goal(self) -> float:
         """Largest ratio of a posterior sd to its goal."""
-        sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
+        sd = dict(zip(self.posterior.names, self.posterior.sd(), strict=True))
         return float(max(sd[name] / goal for name, goal in self._goal.items()))
 
     @property
@@ -628,13 +535,13 @@ class Inquiry(ShowsItself):
     def _utility_for_weights(self, weight: FloatArray) -> FloatArray:
         """Compute the acquisition function per reading, (n_settings,), for the posterior samples with these weights."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
-        theta = self._posterior.theta[resampled_rows(weight, n, self._rng)]
+        theta = self.posterior.theta[resampled_rows(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart
         predicted = self._model.predict(theta, self._settings)
         even = np.full(n, 1.0 / n)
         given = readings_given_noise(predicted, self._model.scale(theta, predicted), even, self._model.noise)
         if self._is_near_goal:
-            values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
+            values, goal = theta[:, [self.posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
             now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
             fall = np.asarray(now - expected_nats_above_goal(given, values, np.array(goal)))
             if fall.max() > 0.0:  # else most readings lead to the goal, but a few far away from it

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,8 +24,16 @@ from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
-from probewise.inference.problem import SensorProblem, checked_log_prob
-from probewise.nested import NestedResult, Weighted, pareto_k
+from probewise.nested import (
+    LIVE_PER_PARAM,
+    KernelMove,
+    NestedResult,
+    RemainingEvidence,
+    Samplable,
+    Weighted,
+    pareto_k,
+    run,
+)
 from probewise.nested.importance import evenly_weighted
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Prior
@@ -42,7 +50,32 @@ _RIDGE = 1e-6  # of the overall covariance, to avoid singular ones
 _RESOLUTION = 1e-9  # of a coordinate's mean, below which a spread is rounding error
 _SMALLEST = 1e-100  # spread of a coordinate that is zero in all points, whose square is still a number
 _BLOCK = 256  # points per batch, to fit the cache
+_DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 _FEW = 600  # points up to which all distances are faster than a tree
+
+
+class SequentialProblem(Protocol):
+    """The problem of inferring parameters from readings in order, of which the last is new."""
+
+    @property
+    def prior(self) -> Prior:
+        """Prior of the parameters."""
+        ...
+
+    def predict(self, theta: FloatArray) -> Any:
+        """Predict all readings, theta (n_samples, n_params), for the two functions below."""
+        ...
+
+    def log_likelihoods(self, predicted: Any, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods without and with the last reading, (n_samples,) each.
+
+        Those without it count for nothing where that reading's likelihood has the power `share` 1: any number will do.
+        """
+        ...
+
+    def least_misfit_nats(self, predicted: Any) -> float:
+        """Return by how many nats the best prediction of the last reading misses it."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -87,6 +120,8 @@ class Particles:
         posterior, and the product of mean weights is nearly always too small.
     searched_at
         Number of readings at the last search of the prior; -inf if there was none.
+    asleep
+        Whether the samples are those of fewer readings, and the evidence an upper bound: see `asleep_with`.
     """
 
     weighted: Weighted
@@ -96,6 +131,7 @@ class Particles:
     strained: bool = False
     hurried: bool = False
     searched_at: float = -math.inf
+    asleep: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -122,6 +158,10 @@ class Particles:
         related = float(lineages @ lineages) - (self.n_resampled + 1) / len(self.ancestor)
         return max(math.sqrt(max(related, 0.0) + self.start_variance), self.weighted.log_z_error)
 
+    def asleep_with(self, log_likelihood: float) -> Self:
+        """Return the samples as they are, with the evidence as if they all gave a reading this log likelihood."""
+        return replace(self, weighted=replace(self.weighted, log_z=self.log_z + log_likelihood), asleep=True)
+
     def with_zero_evidence(self) -> Self:
         """Return the samples with an evidence of zero: none of them could have given the readings."""
         return replace(self, weighted=replace(self.weighted, log_z=-math.inf, log_z_error=math.inf))
@@ -142,7 +182,7 @@ def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator)
 
 def update(
     previous: Particles,
-    problem: SensorProblem,
+    problem: SequentialProblem,
     *,
     rng: np.random.Generator,
     fall_back: Callable[[], NestedResult] | None = None,
@@ -156,20 +196,19 @@ def update(
     Return as many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
     given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
-    last = _LastReadingEvaluator(problem)
     before = previous.weighted
     n = len(before.theta)
     least = effort.least_share * n
     if before.log_z == -math.inf:
         return previous
-    predicted = problem.model.predict(before.theta, problem.recording.plan)
+    predicted = problem.predict(before.theta)
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if last.least_misfit_nats(predicted) > _SURPRISED:
+    if problem.least_misfit_nats(predicted) > _SURPRISED:
         if fall_back is not None:
-            return _particles_from_run(fall_back(), n, last, n, rng)
+            return particles_from_run(fall_back(), n, problem, n_calls=n, rng=rng)
         strained = True
     now = _EvaluatedSamples(
-        before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods_without_and_with(predicted)
+        before.theta, problem.prior.log_prob(before.theta), *problem.log_likelihoods(predicted, 1.0)
     )
     log_weight, base = before.log_weight, before.log_likelihood
     log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
@@ -177,11 +216,19 @@ def update(
         all_at_once = n_effective(_updated_log_weights(log_weight, now.after, base))
         if all_at_once == 0.0:
             if fall_back is not None:
-                return _particles_from_run(fall_back(), n, last, n_calls, rng)
+                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
             return replace(previous.with_zero_evidence(), strained=True)
         given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
-        strained |= given_up and all_at_once < least
-        share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
+        if given_up and all_at_once < least:
+            if fall_back is not None:
+                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
+            strained = True
+        if all_at_once >= least or given_up:
+            share = 1.0
+        else:
+            if n_resampled == previous.n_resampled:  # the first temperature: only now the readings before count too
+                now = replace(now, before=problem.log_likelihoods(predicted, share)[0])
+            share = _next_power(log_weight, base, now, share, least)
         weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.log_likelihood_at_power(share)
@@ -191,11 +238,11 @@ def update(
             break
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         parts = _partition_rows(rows) if fall_back is None else [np.arange(n)]
-        now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), share, last, rng, parts, effort)
+        now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), share, problem, rng, parts, effort)
         n_calls, n_resampled, ancestor = n_calls + n_moves, n_resampled + 1, ancestor[rows]
         if accepted < _STIFF:
             if fall_back is not None:
-                return _particles_from_run(fall_back(), n, last, n_calls, rng)
+                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
             strained = True
         base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
         if share == 1.0:
@@ -223,7 +270,12 @@ def update(
 
 
 def resample_and_move(
-    particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
+    particles: Particles,
+    n: int,
+    problem: SequentialProblem,
+    *,
+    rng: np.random.Generator,
+    effort: UpdateSettings = THOROUGH,
 ) -> Particles:
     """Resample to `n` samples, and move the copies apart; unchanged if there are `n` already or the evidence is 0.
 
@@ -237,31 +289,40 @@ def resample_and_move(
     moved = _EvaluatedSamples(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), log_likelihood, log_likelihood.copy()
     )
-    n_moves = 0
-    if len(problem.recording):
-        last = _LastReadingEvaluator(problem)
-        moved, _, n_moves = _move_by_metropolis(moved, 1.0, last, rng, [np.arange(n)], effort)
+    moved, _, n_moves = _move_by_metropolis(moved, 1.0, problem, rng, [np.arange(n)], effort)
     found = replace(_replace_samples(had, moved), n_calls=had.n_calls + n_moves)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
 def particles_from_posterior(
-    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
+    found: Weighted, n: int, problem: SequentialProblem, *, rng: np.random.Generator, effort: UpdateSettings = THOROUGH
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
-    last = _LastReadingEvaluator(problem)
-    start = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
-    moved, _, n_moves = _move_by_metropolis(start, 1.0, last, rng, [np.arange(n)], effort)
+    start = _EvaluatedSamples.of(found.theta[resampled_rows(found.weight, n, rng)], problem, 1.0)
+    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(n)], effort)
     drawn = replace(_replace_samples(found, moved), n_calls=found.n_calls + n + n_moves)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
 
-def _particles_from_run(
-    run: NestedResult, n: int, last: _LastReadingEvaluator, n_calls: int, rng: np.random.Generator
+def nested_sampling_from_scratch(problem: Samplable, *, n_live: int, rng: np.random.Generator) -> NestedResult:
+    """Solve a problem, all readings at once, by nested sampling."""
+    return run(
+        problem,
+        rng=rng,
+        n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
+        move=KernelMove(),
+        stop=RemainingEvidence(_DLOGZ),
+        max_cost=1.0,  # speed matters, since the robot waits
+        return_interrupted=False,
+    )
+
+
+def particles_from_run(
+    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
 ) -> Particles:
     """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
-    start = last.evaluate_samples(run.samples(n, rng=rng))
-    moved, _, n_moves = _move_by_metropolis(start, 1.0, last, rng, [np.arange(n)], THOROUGH)
+    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
+    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(n)], THOROUGH)
     drawn = evenly_weighted(
         run.names,
         moved.theta,
@@ -296,6 +357,17 @@ class _EvaluatedSamples:
     before: FloatArray
     after: FloatArray
 
+    @classmethod
+    def of(cls, theta: FloatArray, problem: SequentialProblem, share: float) -> _EvaluatedSamples:
+        """Evaluate samples (see `SequentialProblem.log_likelihoods`); outside the prior the likelihood is zero."""
+        log_prior = problem.prior.log_prob(theta)
+        before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
+        possible = np.isfinite(log_prior)
+        if possible.any():
+            predicted = problem.predict(theta[possible])
+            before[possible], after[possible] = problem.log_likelihoods(predicted, share)
+        return cls(theta, log_prior, before, after)
+
     def log_likelihood_at_power(self, share: float) -> FloatArray:
         """Return the log likelihood, (n,), with the last reading's likelihood raised to the power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
@@ -313,57 +385,10 @@ class _EvaluatedSamples:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _LastReadingEvaluator:
-    """Evaluator of samples without and with the last reading of a problem, from one prediction of all readings."""
-
-    problem: SensorProblem
-
-    def least_misfit_nats(self, predicted: FloatArray) -> float:
-        """Return by how many nats the best prediction of the last reading misses it; 0 if that reading is missing."""
-        recording = self.problem.recording
-        if not recording.usable[-1]:
-            return 0.0
-        best = checked_log_prob(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
-        return float(self.perfect_log_likelihood - best)
-
-    @property
-    def perfect_log_likelihood(self) -> float:
-        """Log likelihood of the last reading if predicted exactly; 0 if that reading is missing."""
-        reading = self.problem.recording.readings[-1:]
-        if not self.problem.recording.usable[-1]:
-            return 0.0
-        return float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0])
-
-    def log_likelihoods_without_and_with(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return log likelihoods without and with the last reading, from predictions, -> (n_samples,) each."""
-        usable, readings = self.problem.recording.usable, self.problem.recording.readings
-        earlier = usable.copy()
-        earlier[-1] = False
-        without, with_last = (
-            checked_log_prob(self.problem.likelihood, readings[rows], predicted[:, rows])
-            if rows.any()
-            else np.zeros(len(predicted))
-            for rows in (earlier, usable)
-        )
-        return without, with_last
-
-    def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
-        """Evaluate prior and likelihoods of samples; those outside the prior get a likelihood of zero."""
-        problem = self.problem
-        log_prior = problem.prior.log_prob(theta)
-        before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
-        possible = np.isfinite(log_prior)
-        if possible.any():
-            predicted = problem.model.predict(theta[possible], problem.recording.plan)
-            before[possible], after[possible] = self.log_likelihoods_without_and_with(predicted)
-        return _EvaluatedSamples(theta, log_prior, before, after)
-
-
 def _move_by_metropolis(
     start: _EvaluatedSamples,
     share: float,
-    last: _LastReadingEvaluator,
+    problem: SequentialProblem,
     rng: np.random.Generator,
     parts: Sequence[IntArray],
     effort: UpdateSettings,
@@ -386,7 +411,7 @@ def _move_by_metropolis(
             theta, log_ratio = np.empty_like(now.theta), np.empty(n)
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
-            proposed = last.evaluate_samples(theta)
+            proposed = _EvaluatedSamples.of(theta, problem, share)
             odds = (
                 proposed.log_prior
                 + proposed.log_likelihood_at_power(share)

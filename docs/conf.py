@@ -30,6 +30,7 @@ extensions = [
 ]
 exclude_patterns = [
     "_build",
+    "api/help.md",
     "gallery/**/*.md5",
     "gallery/**/*.ipynb",
     "gallery/**/*.py",
@@ -65,14 +66,17 @@ sphinx_gallery_conf = {
 
 
 def write_help(app: object) -> None:
-    """Write what `--help` says to files that the reference includes, so that it cannot fall behind."""
-    folder = HERE / "api" / "cli"
+    """Write what `--help` says to a page that the reference includes, so that it cannot fall behind."""
+    folder = HERE / "api"
     folder.mkdir(parents=True, exist_ok=True)
+    page = []
     for name in ("", *VERBS, *(f"arm {task}" for task in TASKS)):
         text = io.StringIO()
         with redirect_stdout(text):
             main([*name.split(), "--help"])
-        (folder / f"{name.replace(' ', '-') or 'probewise'}.txt").write_text(text.getvalue(), encoding="utf-8")
+        heading = f"## {name}\n\n" if name else ""
+        page.append(f"{heading}```text\n{text.getvalue()}```\n")
+    (folder / "help.md").write_text("\n".join(page), encoding="utf-8")
 
 
 def lead_with_what_people_call(app: object) -> None:

@@ -113,8 +113,9 @@ def _run_demo(
         searches=searches,
         started_alike=started_alike,
         geometry=read_geometry(shipped_geometry_path()),
+        diagnosis=diagnosis,
+        doubt=doubted,
     )
-    figures |= report.diagnosis_figure_drawers(diagnosis) | report.doubt_figure_drawers(doubted)
     figures_of_diagnosis = diagnosis_report.figure_drawers(diagnosis)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     seconds = time.monotonic() - started

@@ -9,7 +9,7 @@ from probewise.diagnosis import EffectAudit, PlanAudit
 from probewise.diagnosis.aliases import LAMBDA
 from probewise.diagnosis.audit import ALIAS, LEAST_NATS
 from probewise.effects import spoken_name
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Markup, Section, figure, page, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.probabilities import audit_matrix
 from probewise.report.words import number_text, typeset_numbers
@@ -73,74 +73,53 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
         f"alias: at size λ = {LAMBDA:g} these readings favour the row over the column by less than {LEAST_NATS:g} "
         "nats.",
     )
-    sections = [
+    helped = (
         Section("Effects that cannot be told apart", _alias_class_elements(audit))
         if audit.classes is not None
-        else Section("The fewest extra readings that would help", _extra_readings_elements(audit)),
-        Section("Every effect", (audit_table(audit.effects, audit.words.null),)),
-        Section(
-            "What was assumed",
-            (
-                definition_list(
-                    (
-                        ("plan", source),
-                        (
-                            "readings",
-                            f"{len(audit.plan)} in {count_with_noun(len(audit.plan.scan_names), audit.words.run)}",
-                        ),
-                        (audit.words.null.removeprefix("the "), audit.assumed),
-                        ("controls of the instrument", ", ".join(audit.plan.instrumentation.controls) or "nothing"),
-                    )
-                ),
-            ),
-        ),
-    ]
+        else Section("The fewest extra readings that would help", _extra_readings_elements(audit))
+    )
+    assumed = {
+        "plan": source,
+        "readings": f"{len(audit.plan)} in {count_with_noun(len(audit.plan.scan_names), audit.words.run)}",
+        audit.words.null.removeprefix("the "): audit.assumed,
+        "controls of the instrument": ", ".join(audit.plan.instrumentation.controls) or "nothing",
+    }
+    every = Section("Every effect", (audit_table(audit.effects, audit.words.null),))
     return page(
         f"Audit of {source}",
         answer=summary_sentence(audit),
         key_figure=shown,
-        sections=sections,
+        sections=[helped, every, Section("What was assumed", (assumed,))],
         terms_in=f"{summary_sentence(audit)} {shown}",
     )
 
 
-def _alias_class_elements(audit: PlanAudit) -> tuple[Markup, ...]:
+def _alias_class_elements(audit: PlanAudit) -> Sequence[str]:
     if not audit.classes:
-        return (paragraph("These rows tell apart all effects that they can detect."),)
-    opening = "Classes of aliased effects, directly or through others in the class:"
+        return ("These rows tell apart all effects that they can detect.",)
     rows = ((str(k), ", ".join(map(spoken_name, names))) for k, names in enumerate(audit.classes, start=1))
-    return (paragraph(opening), table(("class", "effects"), rows))
+    opening = "Classes of aliased effects, directly or through others in the class:"
+    return (opening, table(("class", "effects"), rows))
 
 
-def _extra_readings_elements(audit: PlanAudit) -> tuple[Markup, ...]:
+def _extra_readings_elements(audit: PlanAudit) -> Sequence[str]:
     plan = audit.cure_plan
+    if plan is None and all(effect.detectability == "fine" for effect in audit.effects):
+        return ("None are needed: this plan is fine for every effect.",)
     if plan is None:
-        if all(effect.detectability == "fine" for effect in audit.effects):
-            return (paragraph("None are needed: this plan is fine for every effect."),)
         return (
-            paragraph(
-                "No scan that this arm can take (repeated, reversed, faster or turned) and no other position of the "
-                "sheet would help enough."
-            ),
+            "No scan that this arm can take (repeated, reversed, faster or turned) and no other position of the "
+            "sheet would help enough.",
         )
     left = [spoken_name(e.name) for e in audit.after if e.detectability != "fine"]
+    rows = (
+        (str(k), typeset_numbers(cure.description), str(len(cure.plan)), ", ".join(map(spoken_name, cure.cured)) or "–")
+        for k, cure in enumerate(audit.cures, start=1)
+    )
     return (
-        table(
-            ("step", "what to do", "readings", "effects that are then fine"),
-            (
-                (
-                    str(k),
-                    typeset_numbers(cure.description),
-                    str(len(cure.plan)),
-                    ", ".join(map(spoken_name, cure.cured)) or "–",
-                )
-                for k, cure in enumerate(audit.cures, start=1)
-            ),
-        ),
-        paragraph(
-            f"{count_with_noun(len(plan), 'reading')}, about {number_text(audit.extra_minutes, 0)} minutes; "
-            f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}."
-        ),
+        table(("step", "what to do", "readings", "effects that are then fine"), rows),
+        f"{count_with_noun(len(plan), 'reading')}, about {number_text(audit.extra_minutes, 0)} minutes; "
+        f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}.",
     )
 
 

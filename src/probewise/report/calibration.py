@@ -11,7 +11,7 @@ import numpy as np
 from probewise._words import count_with_noun, unit_after_number
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
-from probewise.report.html import Markup, Section, definition_list, figure, note_paragraphs, page, paragraph, table
+from probewise.report.html import Markup, Section, figure, notes_in_words, page, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.readings import (
     predicted_and_recorded_by_scan,
@@ -87,68 +87,36 @@ def sections(
     """Build the sections of a calibration's page, below the first screen; `drawn` is from `figure_drawers`."""
     ok = recording.usable
     z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
+    by_order = (
+        "Mean SSF of each number of Gaussians, in the sensor frame seen from above. White lines: a half "
+        "and a tenth of the peak; white cross: the package's centre."
+    )
+    chi_square = (
+        f"Chi-square per reading is {number_text(float(np.mean(z**2)), 3)} over "
+        f"{count_with_noun(int(ok.sum()), 'reading')} "
+        "(near 1 where the model and its noise are right; they were fitted, so a little below)."
+    )
+    residuals = "Standardised residuals in the order of the readings; 95 % should lie between the dashed lines."
+    priors = (
+        (p.parameter, _printed_unit(p.unit), typeset_numbers(p.distribution), typeset_numbers(p.reason))
+        for p in sensor.priors
+    )
+    run = {
+        "recording": PurePath(sensor.source).name or "unnamed",
+        "its fingerprint": sensor.fingerprint,
+        "seed": str(seed),
+        "version": f"probewise {sensor.version}",
+    }
+    recorded = figure(drawn["readings.png"], "Readings as recorded, along the scans; single readings are below.")
+    predicted = figure(drawn["predicted.png"], "Recorded readings, and what the model predicts.")
+    parameters = (ssf_centre_and_width_table(sensor), parameter_table(sensor), *notes_in_words(sensor.notes))
     return [
-        Section(
-            "Which number of Gaussians",
-            (
-                figure(
-                    drawn["ssf_by_order.png"],
-                    "Mean SSF of each number of Gaussians, in the sensor frame seen from above. White lines: a half "
-                    "and a tenth of the peak; white cross: the package's centre.",
-                ),
-                evidence_table(sensor),
-            ),
-        ),
-        Section(
-            "Readings",
-            (
-                figure(drawn["readings.png"], "Readings as recorded, along the scans; single readings are below."),
-                *note_paragraphs(recording.notes),
-            ),
-        ),
-        Section(
-            "Predicted against recorded",
-            (
-                figure(drawn["predicted.png"], "Recorded readings, and what the model predicts."),
-                paragraph(
-                    f"Chi-square per reading is {number_text(float(np.mean(z**2)), 3)} over "
-                    f"{count_with_noun(int(ok.sum()), 'reading')} "
-                    "(near 1 where the model and its noise are right; they were fitted, so a little below)."
-                ),
-                figure(
-                    drawn["residuals.png"],
-                    "Standardised residuals in the order of the readings; 95 % should lie between the dashed lines.",
-                ),
-            ),
-        ),
-        Section(
-            "Parameters", (ssf_centre_and_width_table(sensor), parameter_table(sensor), *note_paragraphs(sensor.notes))
-        ),
-        Section(
-            "Prior",
-            (
-                table(
-                    ("parameter", "unit", "prior", "why"),
-                    (
-                        (p.parameter, _printed_unit(p.unit), typeset_numbers(p.distribution), typeset_numbers(p.reason))
-                        for p in sensor.priors
-                    ),
-                ),
-            ),
-        ),
-        Section(
-            "This run",
-            (
-                definition_list(
-                    (
-                        ("recording", PurePath(sensor.source).name or "unnamed"),
-                        ("its fingerprint", sensor.fingerprint),
-                        ("seed", str(seed)),
-                        ("version", f"probewise {sensor.version}"),
-                    )
-                ),
-            ),
-        ),
+        Section("Which number of Gaussians", (figure(drawn["ssf_by_order.png"], by_order), evidence_table(sensor))),
+        Section("Readings", (recorded, *notes_in_words(recording.notes))),
+        Section("Predicted against recorded", (predicted, chi_square, figure(drawn["residuals.png"], residuals))),
+        Section("Parameters", parameters),
+        Section("Prior", (table(("parameter", "unit", "prior", "why"), priors),)),
+        Section("This run", (run,)),
     ]
 
 

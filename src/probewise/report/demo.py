@@ -3,42 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
-import numpy as np
-
-from probewise._arrays import IntArray
 from probewise._words import count_with_noun
 from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
-from probewise.diagnosis.light_sensor import held_out_parts
+from probewise.diagnosis.words import hypothesis_in_words
 from probewise.experiment import left_out_after_step
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
-from probewise.report import html
+from probewise.report import searches as of_searches
+from probewise.report.diagnosis_figures import before_and_after
+from probewise.report.html import Section, element, figure, fragment, page, paragraph, slideshow, table
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.canvas import png
 from probewise.report.plots.probabilities import hypothesis_probabilities
-from probewise.report.plots.readings import (
-    quadrant_patterns,
-    readings_before_and_after_repair,
-    residuals_by_scan,
-    sensor_orientations,
-)
-from probewise.report.searches import (
-    RobotSearch,
-    draw_effect_probabilities,
-    draw_final_posteriors,
-    draw_paper_views,
-    draw_widths_and_information,
-    search_comparison_table,
-)
+from probewise.report.plots.readings import quadrant_patterns, residuals_by_scan, sensor_orientations
+from probewise.report.searches import RobotSearch, search_comparison_table
 from probewise.report.words import number_text, typeset_numbers
 
 FIRST = 3  # as in the paper's figure
-_LIKELY = 1e-3
 SATURATION = 40.0
 """Reading at which the concealed effect of the third world, saturation, sets in; the model expects 60 over white."""
 _SENSOR = (
@@ -98,63 +86,34 @@ def figure_drawers(
     searches: Sequence[RobotSearch],
     started_alike: Sequence[RobotSearch],
     geometry: Geometry,
+    diagnosis: Diagnosis,
+    doubt: Sequence[RobotSearch],
 ) -> dict[str, Callable[[], bytes]]:
-    """List all figures of the demo but the diagnosis's by file name, as functions that draw PNGs.
+    """List all figures of the demo by file name, as functions that draw PNGs.
 
     `searches` are the naive and the SSF robot's from an empty field, `started_alike` from the same first reading, with
-    places chosen by the paper's rule.
+    places chosen by the paper's rule; `doubt` is the search of a trusting and of a doubting robot.
     """
     hidden = started_alike[0].truth_mm
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
+    names = [hypothesis_in_words(h.effects) for h in diagnosis.hypotheses]
+    before, after = diagnosis.repair.before.readings, diagnosis.repair.after.readings
+    drawings: dict[str, Callable[[], Any]] = {
+        "arm.png": lambda: arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden),
+        "orientations.png": lambda: sensor_orientations(recording),
+        "quadrants.png": lambda: quadrant_patterns(recording),
+        "first_three.png": lambda: of_searches.draw_paper_views(started_alike, n_first),
+        "equal_readings.png": lambda: of_searches.draw_paper_views(started_alike, [len(started_alike[-1].run.steps)]),
+        "progress.png": lambda: of_searches.draw_widths_and_information(searches),
+        "explanations.png": lambda: hypothesis_probabilities(names, [h.probability for h in diagnosis.hypotheses]),
+        "scans.png": lambda: residuals_by_scan(diagnosis.recording, before, after),
+        "before_after.png": lambda: before_and_after(diagnosis),
+        "doubt.png": lambda: of_searches.draw_final_posteriors(doubt),
+        "belief.png": lambda: of_searches.draw_effect_probabilities(doubt[-1].run),
+    }
     return calibration_report.figure_drawers(calibration, recording, prediction) | {
-        "arm.png": lambda: png(arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden)),
-        "orientations.png": lambda: png(sensor_orientations(recording)),
-        "quadrants.png": lambda: png(quadrant_patterns(recording)),
-        "first_three.png": lambda: png(draw_paper_views(started_alike, n_first)),
-        "equal_readings.png": lambda: png(draw_paper_views(started_alike, [len(started_alike[-1].run.steps)])),
-        "progress.png": lambda: png(draw_widths_and_information(searches)),
+        name: partial(lambda draw: png(draw()), draw) for name, draw in drawings.items()
     }
-
-
-def doubt_figure_drawers(doubt: Sequence[RobotSearch]) -> dict[str, Callable[[], bytes]]:
-    """List the figures on a trusting and a doubting robot by file name, as functions that draw PNGs."""
-    return {
-        "doubt.png": lambda: png(draw_final_posteriors(doubt)),
-        "belief.png": lambda: png(draw_effect_probabilities(doubt[-1].run)),
-    }
-
-
-def diagnosis_figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
-    """List the figures of the demo's section on the diagnosis by file name, as functions that draw PNGs."""
-    likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
-    labels = [h.label.replace("+", " + ") for h in likely]
-    recording, before, after = diagnosis.recording, diagnosis.repair.before.readings, diagnosis.repair.after.readings
-    drawers: dict[str, Callable[[], bytes]] = {
-        "explanations.png": lambda: png(hypothesis_probabilities(labels, [h.probability for h in likely])),
-        "scans.png": lambda: png(residuals_by_scan(recording, before, after)),
-    }
-    best = _part_with_largest_gain(diagnosis)
-    if best is not None:
-        name, gain, rows = best
-        title = f"{name}: {gain:+.2f} nats per reading when it was held out"
-        drawers["before_after.png"] = lambda: png(
-            readings_before_and_after_repair(recording, rows, before, after, name=title)
-        )
-    return drawers
-
-
-def _part_with_largest_gain(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
-    """Return the held-out part with the largest gain: name, gain in nats per reading, row numbers, (n_rows,).
-
-    None if the repair changes no prediction, or nothing could be held out.
-    """
-    gains = diagnosis.improvement.heldout_by_scan
-    if not diagnosis.repair.changes_predictions or not gains:
-        return None
-    name, gain = max(gains, key=lambda pair: pair[1])
-    part, names = held_out_parts(diagnosis.recording)
-    rows = np.flatnonzero(diagnosis.recording.usable)[part == names.index(name)]
-    return name, gain, rows
 
 
 def page_html(
@@ -174,79 +133,62 @@ def page_html(
 ) -> str:
     """Return the HTML of the demo's page, of what `figure_drawers` takes and more.
 
-    `frames` has a PNG of each step of each search; `doubt` the search of the robot that trusts its sensor model, and of
-    the one that doubts it; `drawn` all figures by name; `concealed` names the effect that the simulated world concealed
-    in the second recording, whose `diagnosis` this is.
+    `frames` has a PNG of each step of each search; `drawn` all figures by name; `concealed` names the effect that the
+    simulated world concealed in the second recording, whose `diagnosis` this is.
     """
+    run = {
+        "seed": str(seed),
+        "time": f"{number_text(seconds, 0)} s",
+        "recordings": "the two that ship with the package, both simulated by a world that shares no code with "
+        "the models",
+        "version": f"probewise {calibration.sensor.version}",
+    }
     sections = [
         _sensor_section(calibration, recording, prediction, drawn, seed),
         _search_section(searches, started_alike, frames, drawn),
         _diagnosis_section(diagnosis, drawn, concealed),
         doubt_section(doubt, drawn),
-        html.Section(
-            "This run",
-            (
-                html.definition_list(
-                    (
-                        ("seed", str(seed)),
-                        ("time", f"{number_text(seconds, 0)} s"),
-                        (
-                            "recordings",
-                            "the two that ship with the package, both simulated by a world that shares no code with "
-                            "the models",
-                        ),
-                        ("version", f"probewise {calibration.sensor.version}"),
-                    )
-                ),
-            ),
-        ),
+        Section("This run", (run,)),
     ]
     caption = (
         f"{sds_after_equal_readings_text(started_alike)} Left the naive model, right the SSF model. "
-        "Blue: 50 circles drawn from the posterior. Copper: entropy of the readings that these circles predict; "
+        "Blue: 50 circles drawn from the posterior; where errors of centre and radius add up, their edges spread over "
+        "several sds. Copper: entropy of the readings that these circles predict; "
         "brighter places promise more information. Squares: readings by their brightness. Green: the next place. "
         "Dashed white: the hidden circle."
     )
-    return html.page(
+    return page(
         "Modeling a sensor to improve its efficacy",
         answer=summary_sentence(started_alike),
-        key_figure=html.figure(drawn["equal_readings.png"], caption),
+        key_figure=figure(drawn["equal_readings.png"], caption),
         sections=sections,
     )
 
 
 def _sensor_section(
     calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], seed: int
-) -> html.Section:
+) -> Section:
     shown = calibration_report.sections(calibration.sensor, recording, prediction, drawn, seed=seed)
-    apparatus = html.Section(
-        "The arm and its sensor",
-        (
-            html.figure(
-                drawn["arm.png"],
-                "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the "
-                "links, and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light "
-                "from the photodiode.",
-            ),
-        ),
+    arm = (
+        "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the links, "
+        "and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light from the "
+        "photodiode."
     )
-    taken = html.Section(
-        "How the recording was taken",
-        (
-            html.figure(
-                drawn["orientations.png"],
-                "The sensor in its four orientations, seen from above through its package, and the symbols of their "
-                "readings below (paper, figure 3). It crosses the edge between black and white in steps of 1 mm.",
-            ),
-            html.figure(
-                drawn["quadrants.png"],
-                "Four patterns that tell the SSF from its mirror images (paper, figure 4): one reading each at the "
-                "cross, with the sensor at 0°. The number in the white part is the reading.",
-            ),
-        ),
+    orientations = (
+        "The sensor in its four orientations, seen from above through its package, and the symbols of their "
+        "readings below (paper, figure 3). It crosses the edge between black and white in steps of 1 mm."
     )
-    said = calibration_report.summary_sentence(calibration.sensor)
-    return html.Section("The sensor", (html.paragraph(_SENSOR), html.paragraph(said)), (apparatus, taken, *shown[:-1]))
+    quadrants = (
+        "Four patterns that tell the SSF from its mirror images (paper, figure 4): one reading each at the "
+        "cross, with the sensor at 0°. The number in the white part is the reading."
+    )
+    taken = (figure(drawn["orientations.png"], orientations), figure(drawn["quadrants.png"], quadrants))
+    parts = (
+        Section("The arm and its sensor", (figure(drawn["arm.png"], arm),)),
+        Section("How the recording was taken", taken),
+        *shown[:-1],
+    )
+    return Section("The sensor", (_SENSOR, calibration_report.summary_sentence(calibration.sensor)), parts)
 
 
 def _search_section(
@@ -254,100 +196,85 @@ def _search_section(
     started_alike: Sequence[RobotSearch],
     frames: Sequence[Sequence[bytes]],
     drawn: Mapping[str, bytes],
-) -> html.Section:
+) -> Section:
     naive, ssf = searches
-    introduction = html.paragraph(
+    introduction = (
         "A white circle lies somewhere on the black field. The naive robot believes that its sensor sees a point, "
         "black or white. The other predicts each reading with the calibrated SSF. Both choose their own readings and "
         "stop when centre and radius are known to 4 mm each."
     )
-    panels = html.Section(
-        "As in the paper: the first three readings",
-        (
-            html.figure(
-                drawn["first_three.png"],
-                "Both robots start with the same reading on white, then follow the paper's rule: read where the "
-                "entropy is highest (paper, figures 2 and 8). With the naive model (left) the circles cut the field "
-                "into cells of uniform entropy, at most 1 bit. With the SSF model (right) the circles' edges are "
-                "bright: a reading there also measures how much white the sensor sees. The inference differs from the "
-                "paper's: posterior samples are reweighted after each reading. The paper's own, a new nested sampling "
-                "run after each reading, is "
-                "probewise explore --method paper.",
-            ),
-            search_comparison_table(started_alike),
-        ),
+    first = (
+        "Both robots start with the same reading on white, then follow the paper's rule: read where the "
+        "entropy is highest (paper, figures 2 and 8). With the naive model (left) the circles cut the field "
+        "into cells of uniform entropy, at most 1 bit. With the SSF model (right) the circles' edges are "
+        "bright: a reading there also measures how much white the sensor sees. The inference differs from the "
+        "paper's: posterior samples are reweighted after each reading. The paper's own, a new nested sampling "
+        "run after each reading, is probewise explore --method paper."
     )
-    n_slides = max(len(s.run.steps) for s in searches)
+    panels = (figure(drawn["first_three.png"], first), search_comparison_table(started_alike))
     texts = [
         "; ".join(
             f"{s.model} model, {count_with_noun(k := s.step_number_after(n), 'reading')}: "
             f"{number_text(s.run.steps[k - 1].largest_sd_mm, 1)} mm" + (" (ended)" if n > len(s.run.steps) else "")
             for s in searches
         )
-        for n in range(1, n_slides + 1)
+        for n in range(1, max(len(s.run.steps) for s in searches) + 1)
     ]
-    whole = html.Section(
-        "A whole search, step by step",
+    whole = (
+        f"From an empty field, finding the circle at all takes luck, whatever the model: the naive robot met "
+        f"it at reading {naive.readings_until_first_white} of {len(naive.run.steps)}, the SSF robot at "
+        f"reading {ssf.readings_until_first_white} of {len(ssf.run.steps)}. These robots choose by "
+        f"the default rule: the expected information of a reading or, near the end, the probability that it "
+        f"ends the run. The colour bar names the one shown.",
+        slideshow(
+            list(zip(join_side_by_side(*frames), texts, strict=True)),
+            "Each step of both searches; the length below the picture is the widest posterior sd.",
+        ),
+        figure(
+            drawn["progress.png"],
+            "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the circle.",
+        ),
+        search_comparison_table(searches, "From an empty field; columns as in the table above."),
+    )
+    return Section(
+        "The search",
+        (introduction,),
         (
-            html.paragraph(
-                f"From an empty field, finding the circle at all takes luck, whatever the model: the naive robot met "
-                f"it at reading {naive.readings_until_first_white} of {len(naive.run.steps)}, the SSF robot at "
-                f"reading {ssf.readings_until_first_white} of {len(ssf.run.steps)}. These robots choose by "
-                f"the default rule: the expected information of a reading or, near the end, the probability that it "
-                f"ends the run. The colour bar names the one shown."
-            ),
-            html.slideshow(
-                list(zip(join_side_by_side(*frames), texts, strict=True)),
-                "Each step of both searches; the length below the picture is the widest posterior sd.",
-            ),
-            html.figure(
-                drawn["progress.png"],
-                "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the "
-                "circle.",
-            ),
-            search_comparison_table(searches, "From an empty field; columns as in the table above."),
+            Section("As in the paper: the first three readings", panels),
+            Section("A whole search, step by step", whole),
         ),
     )
-    return html.Section("The search", (introduction,), (panels, whole))
 
 
-def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> html.Section:
-    said = (
-        html.paragraph(diagnosis_report.summary_sentence(diagnosis)),
-        html.paragraph(
-            f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
-            "not know that."
-        ),
-    )
-    explanations = html.Section(
-        "What it could be",
-        (html.figure(drawn["explanations.png"], "Probability of each explanation; they sum to one."),),
-    )
+def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> Section:
     gain = diagnosis.improvement
-    repair = [
-        html.figure(
-            drawn["scans.png"],
-            "Residuals (recorded minus predicted) along the scans that the repair changes most: each reading, and "
-            "running means. Orange: the calibrated model. Blue: the repaired model.",
-        )
-    ]
-    if "before_after.png" in drawn:
-        caption = (
-            "The held-out scan on which the repair gains most: readings and both models, fitted to the whole "
-            "recording; "
-            "below, the residuals."
-        )
-        held = (
-            f"On scans that were held out of the fit, the repaired model gains "
-            f"{number_text(gain.heldout_log_density_per_reading, 3)} ± {number_text(gain.heldout_sd, 3)} "
-            "nats per reading. (A nat is a unit of log probability: "
-            "one nat more makes a reading e = 2.7 times as probable.)"
-        )
-        repair = [html.figure(drawn["before_after.png"], caption), html.paragraph(held), *repair]
-    link = html.element("a", "the full report of the diagnosis", href="diagnosis/report.html")
-    more = html.paragraph("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
-    return html.Section(
-        "A mismatch, found and repaired", said, (explanations, html.Section("The repair", (*repair, more)))
+    held = (
+        f"On scans that were held out of the fit, the repaired model gains "
+        f"{number_text(gain.heldout_log_density_per_reading, 3)} ± {number_text(gain.heldout_sd, 3)} "
+        "nats per reading. (A nat is a unit of log probability: "
+        "one nat more makes a reading e = 2.7 times as probable.)"
+    )
+    scans = (
+        "Residuals (recorded minus predicted) along the scans that the repair changes most: each reading, and "
+        "running means. Orange: the calibrated model. Blue: the repaired model."
+    )
+    link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
+    more = fragment("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
+    repair = (
+        figure(drawn["before_after.png"], diagnosis_report.before_and_after_caption(diagnosis)),
+        *((held,) if diagnosis.repair.changes_predictions and gain.heldout_by_scan else ()),
+        figure(drawn["scans.png"], scans),
+        paragraph(more),
+    )
+    said = (
+        f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
+        "not know that."
+    )
+    explanations = figure(drawn["explanations.png"], "Probability of each explanation; they sum to one.")
+    return Section(
+        "A mismatch, found and repaired",
+        (diagnosis_report.summary_sentence(diagnosis), said),
+        (Section("What it could be", (explanations,)), Section("The repair", repair)),
     )
 
 
@@ -361,18 +288,18 @@ def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
 
 
-def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> html.Section:
-    """Build the demo's section from both searches, the trusting robot's first, and from `doubt_figure_drawers`."""
+def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
+    """Build the demo's section from both searches, the trusting robot's first, and from `figure_drawers`."""
     doubting = searches[-1].run
     missing = left_out_after_step(doubting.last, doubting.experiment.trust)
-    introduction = html.paragraph(
+    introduction = (
         f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
         f"{number_text(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. "
         f"The other expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; "
         "it compares the plain model with each effect that could act, and chooses its readings and its end under all "
         "of them."
     )
-    rows = html.table(
+    rows = table(
         ("robot", "readings", "largest error", "widest posterior sd", "stopped because"),
         (
             (
@@ -387,18 +314,22 @@ def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -
         caption="Both robots look for the circle of the searches above, from the same first reading on it. One run "
         "each; probewise study --concealed repeats it for many circles and effects.",
     )
-    fields = html.figure(
-        drawn["doubt.png"],
+    fields = (
         "The posterior of each robot at its end: left the trusting robot, right the doubting one. Blue: 50 circles "
-        "drawn from the posterior. Dashed white: the hidden circle.",
+        "drawn from the posterior. Dashed white: the hidden circle."
     )
-    belief = html.figure(
-        drawn["belief.png"],
+    belief = (
         "What the doubting robot believes about its sensor after each reading. A dashed line marks a reading that "
-        "changed the most probable effect.",
+        "changed the most probable effect."
     )
-    found = html.paragraph(f"At its end the doubting robot reports: {missing.sentence}")
-    return html.Section(
+    return Section(
         "A robot that doubts its sensor",
-        (introduction, html.paragraph(doubt_sentence(searches)), fields, rows, belief, found),
+        (
+            introduction,
+            doubt_sentence(searches),
+            figure(drawn["doubt.png"], fields),
+            rows,
+            figure(drawn["belief.png"], belief),
+            f"At its end the doubting robot reports: {missing.sentence}",
+        ),
     )

@@ -74,15 +74,12 @@ _NOISE_CAPTIONS = {
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Section]:
     """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `figure_drawers`."""
+    repair = diagnosis.repair
+    changed = f"Before and after: as calibrated, {repair.after_in_words}" if repair.changes_predictions else "The model"
     return [
         html.Section("What it could be", _explanation_elements(diagnosis)),
         html.Section("Where it shows", _place_elements(diagnosis, drawn)),
-        html.Section(
-            f"Before and after: as calibrated, {diagnosis.repair.after_in_words}"
-            if diagnosis.repair.changes_predictions
-            else "The model",
-            _before_and_after_elements(diagnosis, drawn),
-        ),
+        html.Section(changed, _before_and_after_elements(diagnosis, drawn)),
         html.Section("Does the repaired model predict held-out readings?", _heldout_gain_elements(diagnosis, drawn)),
         html.Section("Aliased effects, and what would separate them", _alias_elements(diagnosis)),
         html.Section("Noise", _noise_elements(diagnosis, drawn)),
@@ -93,30 +90,17 @@ def page_html(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
     """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`, `audit` that of its plan, if any."""
-    run = html.Section(
-        "This run",
-        (
-            html.definition_list(
-                (
-                    ("recordings", source),
-                    ("readings", f"{_n_readings_used(diagnosis)} used of {len(diagnosis.recording)}"),
-                    ("seed", str(seed)),
-                    *diagnosis.apparatus.words.facts,
-                )
-            ),
-            *html.note_paragraphs((*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
-        ),
-    )
+    readings = f"{_n_readings_used(diagnosis)} used of {len(diagnosis.recording)}"
+    facts = {"recordings": source, "readings": readings, "seed": str(seed), **dict(diagnosis.apparatus.words.facts)}
+    notes = html.notes_in_words((*diagnosis.recording.notes, *notes_on_calls(diagnosis)))
     design = () if audit is None else (html.Section("What these readings could have shown", _audit_elements(audit)),)
-    first = html.fragment(
-        html.figure(drawn["first.svg"], _first_figure_caption(diagnosis)),
-        html.definition_list(_questions_and_answers(diagnosis)),
-    )
+    shown = html.figure(drawn["first.svg"], _first_figure_caption(diagnosis))
+    first = html.fragment(shown, html.definition_list(_questions_and_answers(diagnosis)))
     return html.page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
         key_figure=first,
-        sections=[*sections(diagnosis, drawn), *design, run],
+        sections=[*sections(diagnosis, drawn), *design, html.Section("This run", (facts, *notes))],
         terms_in=f"{diagnosis.verdict} {first}",
     )
 
@@ -151,38 +135,41 @@ def _walk_note(diagnosis: Diagnosis) -> str:
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
-    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
-    after = diagnosis.repair.after_in_words
+    gain, repair, report = diagnosis.improvement, diagnosis.repair, diagnosis.report
+    changes, found = repair.changes_predictions, diagnosis.reason.partition(TO_SEPARATE)[0]
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
-        ("What was found", _as_sentence(diagnosis, diagnosis.reason.partition(TO_SEPARATE)[0])),
+        ("What was found", _as_sentence(diagnosis, found)),
     ]
-    if diagnosis.report.formula is not None:
-        facts.append(("As a formula", _formula_in_words(diagnosis.report.formula)))
-    if diagnosis.report.remainder is not None:
-        facts.append(("Beside that", _as_sentence(diagnosis, diagnosis.report.remainder.sentence)))
+    if report.formula is not None:
+        facts.append(("As a formula", _formula_in_words(report.formula)))
+    if report.remainder is not None:
+        facts.append(("Beside that", _as_sentence(diagnosis, report.remainder.sentence)))
     if not diagnosis.judged.too_little:
         facts.append(("Could it be chance?", _could_be_chance_in_words(diagnosis)))
-    if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
-        facts.append(
-            ("Does the repair predict?", _heldout_gain_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd))
-        )
-    if diagnosis.repair.changes_predictions:
-        beside = " (beside the random walk of the zero)" if diagnosis.repair.after.has_walk else ""
-        beside = f"{diagnosis.recording.weighting_in_words}{beside}"
-        left = f"rms {gain.rms_before:.3g} {unit} as calibrated, {gain.rms_after:.3g} {unit} {after}{beside}"
-        if diagnosis.repair.by_rows:
-            lacking = diagnosis.repair.not_in_model(diagnosis.apparatus.words.model)
+    if gain.heldout_by_scan and changes:
+        predicts = _heldout_gain_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd)
+        facts.append(("Does the repair predict?", predicts))
+    if changes:
+        beside = " (beside the random walk of the zero)" if repair.after.has_walk else ""
+        left = f"{_rms_in_words(diagnosis)}{diagnosis.recording.weighting_in_words}{beside}"
+        if repair.by_rows:
+            lacking = repair.not_in_model(diagnosis.apparatus.words.model)
             left += f". The unknown part is corrected in these readings only: {lacking}"
-        facts.append(("Residuals", f"{left}."))
-    if diagnosis.repair.combination_shares:
-        facts.append(
-            (
-                "In the repaired model",
-                f"Posterior samples in {diagnosis.apparatus.words.model} contain {diagnosis.repair.shares_in_words}.",
-            )
-        )
+        facts.append(("Residuals", f"rms {left}."))
+    if repair.combination_shares:
+        samples = f"Posterior samples in {diagnosis.apparatus.words.model} contain {repair.shares_in_words}."
+        facts.append(("In the repaired model", samples))
     return facts
+
+
+def _rms_in_words(diagnosis: Diagnosis, weighting: str = "") -> str:
+    """Write the rms of the residuals as calibrated, and after a repair that changes them."""
+    gain, unit = diagnosis.improvement, f"{diagnosis.recording.plan.instrumentation.unit_after_number}{weighting}"
+    before = f"{gain.rms_before:.3g} {unit}"
+    if not diagnosis.repair.changes_predictions:
+        return before
+    return f"{before} as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
 
 
 def _formula_in_words(formula: Formula) -> str:
@@ -247,91 +234,70 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     return f"{said[:1].upper()}{said[1:]} Expected to separate {separated} by {nats} nats."
 
 
-def _explanation_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
+def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
     credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.judged.credible]
+    likely = [e for e in diagnosis.effects if e.probability > _LIKELY]
+    told = [f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}" for e in likely]
+    listed = [h for h in diagnosis.hypotheses[:8] if h.probability > 1e-3]
+    probabilities = ((hypothesis_in_words(h.effects), probability_text(h.probability)) for h in listed)
     return (
-        *(
-            html.paragraph(
-                _as_sentence(diagnosis, f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}")
-            )
-            for e in diagnosis.effects
-            if e.probability > _LIKELY
+        *(_as_sentence(diagnosis, said) for said in told),
+        html.table(("explanation", "probability"), probabilities),
+        _credible_set(credible),
+        *_unknown_effect_candidates(diagnosis),
+        *(  # effects in the repaired model's samples that are not among the diagnosis's
+            _as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}")
+            for _, share, sentence in diagnosis.unstated_effects
         ),
-        html.table(
-            ("explanation", "probability"),
-            (
-                (hypothesis_in_words(h.effects), probability_text(h.probability))
-                for h in diagnosis.hypotheses[:8]
-                if h.probability > 1e-3
-            ),
-        ),
-        *_credible_set_elements(credible),
-        *_unknown_effect_elements(diagnosis),
-        *_unstated_effect_elements(diagnosis),
         *_laplace_and_nested_table(diagnosis),
         *_effect_elements(diagnosis),
     )
 
 
-def _credible_set_elements(names: Sequence[str]) -> tuple[html.Markup, ...]:
+def _credible_set(names: Sequence[str]) -> str:
+    listed = "; ".join(names)
     if len(names) <= _MOST_CREDIBLE:
-        return (html.paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
-    return (html.details(f"95 % credible set: {len(names)} explanations", html.paragraph(f"{'; '.join(names)}.")),)
+        return f"95 % credible set (the fewest explanations that hold 0.95): {listed}."
+    return html.details(f"95 % credible set: {len(names)} explanations", html.paragraph(f"{listed}."))
 
 
-def _unknown_effect_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
-    """Build the paragraph on the likely candidates for an unknown effect; empty if none is likely."""
-    likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
-    if not likely:
-        return ()
+def _unknown_effect_candidates(diagnosis: Diagnosis) -> Sequence[str]:
+    """Write a sentence on the likely candidates for an unknown effect; empty if none is likely."""
     candidates = ", ".join(
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
-        for name, p in likely
+        for name, p in diagnosis.judged.unknown_candidates
+        if p > _LIKELY
     )
-    return (
-        html.paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {candidates}."),
-    )
+    opening = "Candidates for the unknown effect (a covariate that it depends on, or a form)"
+    return (f"{opening}: {candidates}.",) if candidates else ()
 
 
-def _unstated_effect_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
-    """Build a paragraph for each effect in the repaired model's samples that is not among the diagnosis's `effects`."""
-    return tuple(
-        html.paragraph(_as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}"))
-        for _, share, sentence in diagnosis.unstated_effects
-    )
-
-
-def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
+def _laplace_and_nested_table(diagnosis: Diagnosis) -> Sequence[str]:
     """Build the table of the explanations whose evidence was computed twice; empty if none was."""
-    if not diagnosis.report.weighings:
-        return ()
-    return (
-        html.table(
-            ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat plus the error"),
-            (
-                (
-                    hypothesis_in_words(w.effects),
-                    str(w.n_gaussians or "–"),
-                    number_text(w.laplace, 2),
-                    typeset_numbers(value_with_sd(w.nested, w.error)),
-                    ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
-                )
-                for w in diagnosis.report.weighings
-            ),
-            caption="Log evidence ln Z (nats) by the Laplace approximation and by nested sampling.",
-        ),
-    )
+    rows = [
+        (
+            hypothesis_in_words(w.effects),
+            str(w.n_gaussians or "–"),
+            number_text(w.laplace, 2),
+            typeset_numbers(value_with_sd(w.nested, w.error)),
+            ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
+        )
+        for w in diagnosis.report.weighings
+    ]
+    header = ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat plus the error")
+    caption = "Log evidence ln Z (nats) by the Laplace approximation and by nested sampling."
+    return (html.table(header, rows, caption=caption),) if rows else ()
 
 
-def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
+def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
     """Build the figures of the places with significant residuals; all but the first three are folded away."""
     if not diagnosis.where:
-        return (html.paragraph("No residual is larger than noise explains."),)
+        return ("No residual is larger than noise explains.",)
     shown = [
         html.figure(drawn[place.figure_name], _place_caption(diagnosis, place, seen=seen))
         for place, seen in ranked_places_with_visibility(diagnosis, ResidualNoise.of_diagnosis(diagnosis))
     ]
-    opening = html.paragraph(
+    opening = (
         "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
         "first, then the most visible. Each dot is a reading; by chance alone, 95 % of the means would lie in the grey "
         f"band.{_walk_note(diagnosis)}"
@@ -340,57 +306,53 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[h
     return (opening, *first, *((html.details(f"{len(rest)} more", *rest),) if rest else ()))
 
 
-def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
+def before_and_after_caption(diagnosis: Diagnosis) -> str:
+    """Return the caption of the figure of one scan: readings and predictions before and after the repair."""
     run = diagnosis.apparatus.words.run
     which, colours = f"One {run}", "orange"
     if diagnosis.repair.changes_predictions:
         which = f"The {run} that changes most"
         colours = f"orange as calibrated, blue {diagnosis.repair.after_in_words}"
     walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
+    shown = f"readings (black) and predictions ({colours}{walk})"
+    return f"{which}: {shown}, and below the residuals with their running means."
+
+
+def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
+    against = f"All residuals against time and against predicted reading, with running means.{_walk_note(diagnosis)}"
+    curves = [effect for effect in diagnosis.effects if figure_name_of(effect.name) in drawn]
     return (
-        html.figure(
-            drawn["before_after.svg"],
-            f"{which}: readings (black) and predictions ({colours}{walk}), and below the residuals with their running "
-            "means.",
-        ),
-        html.figure(
-            drawn["residuals.svg"],
-            f"All residuals against time and against predicted reading, with running means.{_walk_note(diagnosis)}",
-        ),
+        html.figure(drawn["before_after.svg"], before_and_after_caption(diagnosis)),
+        html.figure(drawn["residuals.svg"], against),
         *(
             html.figure(drawn[figure_name_of(e.name)], _as_sentence(diagnosis, f"With the 95 % band: {e.sentence}"))
-            for e in diagnosis.effects
-            if figure_name_of(e.name) in drawn
+            for e in curves
         ),
     )
 
 
-def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
+def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str | Mapping[str, str]]:
     gain, changes = diagnosis.improvement, diagnosis.repair.changes_predictions
+    shown = diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED
     if "gain.svg" in drawn:
-        shown = html.figure(
-            drawn["gain.svg"],
+        caption = (
             f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "
             "fitted to the others: blue where the repaired model predicts better, orange where worse. Grey: mean "
-            "over all, with standard error.",
+            "over all, with standard error."
         )
-    else:
-        shown = html.paragraph(diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED)
-    unit = f"{diagnosis.recording.plan.instrumentation.unit_after_number}{diagnosis.recording.weighting_in_words}"
-    facts = []
+        shown = html.figure(drawn["gain.svg"], caption)
+    facts = {}
     if gain.heldout_by_scan:
         per_reading = _signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)
-        facts.append(("gain on held-out readings", f"{per_reading} per reading"))
-    rms = f"{gain.rms_before:.3g} {unit}"
+        facts["gain on held-out readings"] = f"{per_reading} per reading"
     if changes:
-        facts.append(("log evidence gained", f"{number_text(gain.log_evidence, 1)} nats"))
-        rms += f" as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
-    facts.append(("rms of the residuals", rms))
-    facts.append(("test for further missing effects", typeset_numbers(p_in_words(gain.p_value_after))))
-    return shown, html.definition_list(facts)
+        facts["log evidence gained"] = f"{number_text(gain.log_evidence, 1)} nats"
+    facts["rms of the residuals"] = _rms_in_words(diagnosis, diagnosis.recording.weighting_in_words)
+    facts["test for further missing effects"] = typeset_numbers(p_in_words(gain.p_value_after))
+    return shown, facts
 
 
-def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[html.Markup, ...]:
+def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
     noise = diagnosis.report.noise
     names = [] if noise.model == "white" else noise.model.split("+")
     model = join_names([effect_in_words(name) for name in names]) if names else "white: independent, with one sd"
@@ -399,38 +361,33 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[h
         (p.name.replace("_", " "), unit_after_number(p.unit), *_value_and_interval_texts(p)) for p in noise.parameters
     ]
     beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
-    return (
-        html.paragraph(typeset_numbers(test)),
-        *((html.table(("parameter", "unit", "value", "95 % interval"), rows),) if rows else ()),
-        html.figure(
-            drawn["noise.svg"],
-            f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
-            f"Middle: scatter by predicted reading{beside}. Below: histogram on a logarithmic scale{beside}.",
-        ),
+    caption = (
+        f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
+        f"Middle: scatter by predicted reading{beside}. Below: histogram on a logarithmic scale{beside}."
     )
+    found = (html.table(("parameter", "unit", "value", "95 % interval"), rows),) if rows else ()
+    return (typeset_numbers(test), *found, html.figure(drawn["noise.svg"], caption))
 
 
-def _effect_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
+def _effect_elements(diagnosis: Diagnosis) -> Sequence[str]:
     likely = [effect for effect in diagnosis.effects if effect.probability > _LIKELY]
     rest = [effect for effect in diagnosis.effects if effect.probability <= _LIKELY]
-    shown = (_effect_table(likely),) if likely else ()
-    if not rest:
-        return shown
-    return (*shown, html.details(f"{len(rest)} less likely effects", _effect_table(rest)))
+    shown = [_effect_table(likely)] if likely else []
+    return [*shown, *([html.details(f"{len(rest)} less likely effects", _effect_table(rest))] if rest else [])]
 
 
 def _effect_table(effects: Sequence[EffectFound]) -> html.Markup:
-    rows = [
-        (
-            _effect_words_and_name(effect.name) if k == 0 else "",
-            probability_text(effect.probability) if k == 0 else "",
-            number_text(effect.size_lambda, 1) if k == 0 else "",
-            parameter_in_words(effect.name, p.name, p.unit),
-            *(_value_and_interval_texts(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
+    rows = []
+    for effect in effects:
+        said = (
+            _effect_words_and_name(effect.name),
+            probability_text(effect.probability),
+            number_text(effect.size_lambda, 1),
         )
-        for effect in effects
-        for k, p in enumerate(effect.parameters)
-    ]
+        for p in effect.parameters:
+            values = (", ".join(effect.scans), "") if p.name == "scans" else _value_and_interval_texts(p, unit=True)
+            rows.append((*said, parameter_in_words(effect.name, p.name, p.unit), *values))
+            said = ("", "", "")
     return html.table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
 
 
@@ -448,54 +405,48 @@ def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> t
     return typeset_numbers(written), typeset_numbers(range_text(low, high))
 
 
-def _alias_elements(diagnosis: Diagnosis) -> tuple[html.Markup, ...]:
+def _alias_elements(diagnosis: Diagnosis) -> Sequence[str]:
     """List the aliased pairs, those with effects of the credible set first; all but the first eight are folded away."""
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
-        return (html.paragraph("None: these readings tell apart all effects of the vocabulary that they can detect."),)
+        return ("None: these readings tell apart all effects of the vocabulary that they can detect.",)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
-    more = (html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
-    return (_alias_table(first), *more)
+    return (_alias_table(first), *((html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()))
 
 
 def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
-    return html.table(
-        ("aliased in these readings", "cosine", "what would separate them", "readings needed"),
+    def readings_needed(n: int) -> str:
+        return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
+
+    rows = (
         (
-            (
-                " and ".join(map(effect_in_words, a.effects)),
-                number_text(a.cosine, 3),
-                typeset_numbers(a.settle_by),
-                _readings_needed_text(a.readings),
-            )
-            for a in aliases
-        ),
+            " and ".join(map(effect_in_words, a.effects)),
+            number_text(a.cosine, 3),
+            typeset_numbers(a.settle_by),
+            readings_needed(a.readings),
+        )
+        for a in aliases
     )
+    header = ("aliased in these readings", "cosine", "what would separate them", "readings needed")
+    return html.table(header, rows)
 
 
-def _readings_needed_text(n: int) -> str:
-    """Write the number of readings that would separate a pair: a dash for 0, "102 or more" from the largest plan on."""
-    return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
-
-
-def _audit_elements(audit: PlanAudit) -> tuple[html.Markup, ...]:
+def _audit_elements(audit: PlanAudit) -> Sequence[str | Mapping[str, str]]:
     meaning: dict[Literal["fine", "aliased", "invisible"], str] = {
         "fine": "detected, and told from every other",
         "aliased": "detected, but another effect can imitate it",
         "invisible": "not detected",
     }
-    pairs = []
-    for detectability, words in meaning.items():
-        names = [
-            f"{e.name} (with {e.alike[0][0]})" if detectability == "aliased" else e.name
-            for e in audit.effects_with_detectability(detectability)
-        ]
-        pairs.append((f"{detectability} ({words})", ", ".join(names).replace("_", " ") or "none"))
+    listed = {}
+    for kind, words in meaning.items():
+        effects = audit.effects_with_detectability(kind)
+        names = [f"{e.name} (with {e.alike[0][0]})" if kind == "aliased" else e.name for e in effects]
+        listed[f"{kind} ({words})"] = ", ".join(names).replace("_", " ") or "none"
     return (
-        html.definition_list(pairs),
+        listed,
         html.details("every effect, with numbers", audit_table(audit.effects)),
-        html.paragraph("probewise audit PLAN.csv lists the readings that would help, before any are taken."),
+        "probewise audit PLAN.csv lists the readings that would help, before any are taken.",
     )
 
 

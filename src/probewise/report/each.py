@@ -10,7 +10,7 @@ from urllib.parse import quote
 from probewise._words import count_with_noun
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.recordings.table import number_text
-from probewise.report.html import Section, definition_list, element, figure, page, table
+from probewise.report.html import Section, element, figure, page, table
 from probewise.report.plots.canvas import BLUE, stack_of_axes, svg
 
 _ORDER = ("named", "unknown", "cannot_tell", "noise", "clean", "refused")
@@ -98,6 +98,6 @@ def page_html(rows: Sequence[DeviceRow], drawn: Mapping[str, bytes], *, seed: in
         key_figure=figure(drawn["counts.svg"], "Number of recordings by what ails them."),
         sections=[
             Section("Each recording", (table(header, map(cells, in_order(rows))),)),
-            Section("This run", (definition_list((("recordings", str(len(rows))), ("seed", str(seed)))),)),
+            Section("This run", ({"recordings": str(len(rows)), "seed": str(seed)},)),
         ],
     )

@@ -134,21 +134,14 @@ def _fault_section(steps: Sequence[Step], trust: float, draw: html.Draw) -> html
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
     changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
     dashed = " A dashed line marks a change of the most probable one." if changed else ""
-    named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN]
-    return html.Section(
-        "What the sensor model leaves out",
-        (
-            html.paragraph(doubted.sentence),
-            html.figure(
-                draw("probabilities of faults", lambda: png(effect_probabilities_by_reading(beliefs))),
-                f"Probabilities of the sensor's possible faults after each reading.{dashed}",
-            ),
-            html.table(
-                ("left out", "probability"),
-                (("nothing" if n == CLEAN else spoken_name(n), probability_text(p)) for n, p in named[:_MOST_SHOWN]),
-            ),
-        ),
+    shown = html.figure(
+        draw("probabilities of faults", lambda: png(effect_probabilities_by_reading(beliefs))),
+        f"Probabilities of the sensor's possible faults after each reading.{dashed}",
     )
+    named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN][:_MOST_SHOWN]
+    rows = (("nothing" if n == CLEAN else spoken_name(n), probability_text(p)) for n, p in named)
+    listed = html.table(("left out", "probability"), rows)
+    return html.Section("What the sensor model leaves out", (doubted.sentence, shown, listed))
 
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
@@ -247,10 +240,10 @@ def page_html(
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
     last, trust = run.last, run.experiment.trust
-    shape: list[html.Markup] = [shape_table(run, truth)]
+    shape: list[str | Mapping[str, str]] = [shape_table(run, truth)]
     if last.shapes:
         shape.append(html.table(("shape", "probability"), ((n, probability_text(p)) for n, p in last.shapes.items())))
-    shape.append(html.definition_list(_facts(run, MODEL_NAMES.get(model, model), truth, seed)))
+    shape.append(_facts(run, MODEL_NAMES.get(model, model), truth, seed))
     if last.sensor:
         sensor = [
             (words_without_unit(name), unit_of_name(name), *value_with_error(mean, sd).partition(" ± ")[::2])
@@ -275,9 +268,7 @@ def page_html(
         (picture, f"Reading {s.number}: {s.reading.value:g}.") for s, picture in zip(run.steps, frames, strict=True)
     ]
     sections = [
-        html.Section(
-            "The shape and what it cost", (*shape, *(html.paragraph(f"Doubtful: {note}.") for note in run.notes))
-        ),
+        html.Section("The shape and what it cost", (*shape, *(f"Doubtful: {note}." for note in run.notes))),
         *((_fault_section(run.steps, trust, draw),) if trust < 1 else ()),
         html.Section("How fast", how_fast),
         html.Section("Every step", (html.slideshow(slides, "The robot's view after each reading."),)),
@@ -298,23 +289,23 @@ def page_html(
     )
 
 
-def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed: int) -> list[tuple[str, str]]:
-    """List what a run is and cost, in words, by name."""
+def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed: int) -> dict[str, str]:
+    """Return what a run is and cost, in words, by name."""
     p_value = run.last.p_value
     fits = "not tested: the most probable noise is not the declared one"
     if p_value is not None:
         fits = f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
-    paper = f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"
+    paper = number_text(run.paper_bits_per_reading, 2)
     off = probability_text(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
-    return [
-        ("sensor model", model),
-        ("inference", run.experiment.inference_method.label),
-        *([("error against the truth, ± posterior sd", errors_text(run, truth))] if truth else []),
-        ("stopped because", run.stop_reason),
-        ("cost", f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time"),
-        ("information", f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading"),
-        ("the paper's count", paper),
-        (f"probability that a length is off by over {OFF_MM:g} mm", off),
-        ("fit of the best hypothesis", fits),
-        ("seed", str(seed)),
-    ]
+    return {
+        "sensor model": model,
+        "inference": run.experiment.inference_method.label,
+        **({"error against the truth, ± posterior sd": errors_text(run, truth)} if truth else {}),
+        "stopped because": run.stop_reason,
+        "cost": f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time",
+        "information": f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading",
+        "the paper's count": f"{paper} bits per reading (25 bits over the readings)",
+        f"probability that a length is off by over {OFF_MM:g} mm": off,
+        "fit of the best hypothesis": fits,
+        "seed": str(seed),
+    }

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray
 from probewise._words import unit_after_number
 from probewise.diagnosis import SystemFit
-from probewise.report.html import Section, definition_list, figure, note_paragraphs, page, paragraph, table
+from probewise.report.html import Section, definition_list, figure, notes_in_words, page, table
 from probewise.report.plots.canvas import svg
 from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
 from probewise.report.words import digits_of_range, typeset_numbers
@@ -70,13 +70,14 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
         (name, *(typeset_numbers(text) for text in (f"{value:.{digits[name]}g}", ends[name], f"{mode[name]:.8g}")))
         for name, value in zip(own.names, median, strict=True)
     ]
-    run = (
-        ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
-        ("simulator", own.simulator.source or "given in Python"),
-        ("noise sd of a reading", f"{np.median(own.noise_sd):.4g} {unit_after_number(own.simulator.unit)}"),
-        *(("log evidence", typeset_numbers(each.in_words)) for each in (fit.evidence, fit.nested) if each is not None),
-        ("seed", str(seed)),
-    )
+    run = {
+        "readings": f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}",
+        "simulator": own.simulator.source or "given in Python",
+        "noise sd of a reading": f"{np.median(own.noise_sd):.4g} {unit_after_number(own.simulator.unit)}",
+    }
+    evidences = [typeset_numbers(each.in_words) for each in (fit.evidence, fit.nested) if each is not None]
+    facts = [*run.items(), *(("log evidence", said) for said in evidences), ("seed", str(seed))]
+    residuals = figure(drawn["residuals.svg"], "Recorded minus predicted reading, with running means.")
     return page(
         f"Fit of {own.source}",
         answer=summary_sentence(fit),
@@ -85,11 +86,8 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
             Section("Posterior", (table(("parameter", "median", "95 % interval", "mode"), rows),)),
             Section(
                 "Residuals",
-                (
-                    figure(drawn["residuals.svg"], "Recorded minus predicted reading, with running means."),
-                    paragraph("probewise diagnose tests them and names the physics that would explain them."),
-                ),
+                (residuals, "probewise diagnose tests them and names the physics that would explain them."),
             ),
-            Section("This run", (definition_list(run), *note_paragraphs(fit.recording.notes))),
+            Section("This run", (definition_list(facts), *notes_in_words(fit.recording.notes))),
         ],
     )

@@ -26,11 +26,25 @@ class Markup(str):
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a page under its own heading; `parts` follow its body under headings a level lower."""
+    """One part of a page under its own heading; `parts` follow its body under headings a level lower.
+
+    Of the body, text that is no HTML yet becomes a paragraph, and a mapping a list of terms with their values.
+    """
 
     heading: str
-    body: tuple[Markup, ...]
-    parts: tuple[Section, ...] = ()
+    body: Sequence[str | Mapping[str, str]]
+    parts: Sequence[Section] = ()
+
+    @property
+    def elements(self) -> tuple[Markup, ...]:
+        """The body as HTML."""
+        return tuple(map(_as_element, self.body))
+
+
+def _as_element(part: str | Mapping[str, str]) -> Markup:
+    if isinstance(part, Markup):
+        return part
+    return paragraph(part) if isinstance(part, str) else definition_list(part.items())
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
@@ -76,9 +90,9 @@ def details(summary: str, *content: Markup) -> Markup:
     return element("details", element("summary", summary), *content)
 
 
-def note_paragraphs(notes: Iterable[str]) -> tuple[Markup, ...]:
-    """Build a paragraph for each note on a run."""
-    return tuple(paragraph(f"Note: {note}.") for note in notes)
+def notes_in_words(notes: Iterable[str]) -> tuple[str, ...]:
+    """Write a sentence for each note on a run."""
+    return tuple(f"Note: {note}." for note in notes)
 
 
 def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
@@ -143,7 +157,7 @@ def page(
         known: set[str] = set()
         key_figure = fragment(key_figure, *_explain_new_terms(terms_in, known))
         sections = [
-            replace(s, body=(*s.body, *_explain_new_terms(" ".join((s.heading, *s.body)), known))) for s in sections
+            replace(s, body=(*s.body, *_explain_new_terms(" ".join((s.heading, *s.elements)), known))) for s in sections
         ]
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
@@ -179,7 +193,7 @@ def _explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
 def _section_element(section: Section, number: str, level: int) -> Markup:
     parts = (_section_element(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
     heading = element(f"h{level}", section.heading)
-    return element("section", heading, *section.body, *parts, id=_section_id(number))
+    return element("section", heading, *section.elements, *parts, id=_section_id(number))
 
 
 def _table_of_contents(sections: Sequence[Section]) -> tuple[Markup, ...]:

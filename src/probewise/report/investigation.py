@@ -11,7 +11,7 @@ from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.headline import headline
-from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
+from probewise.report.html import Markup, Section, figure, page, table
 from probewise.report.plots.canvas import png
 from probewise.report.plots.probabilities import probabilities_by_round
 from probewise.report.words import probability_text, typeset_numbers
@@ -50,14 +50,8 @@ def page_html(
     hidden = ", ".join(map(spoken_name, concealed or ())) or "nothing"
     bars, diagnosis = probabilities_figure_html(drawn["by_round.png"]), found.last.diagnosis
     n_readings, rounds = sum(len(each.recording) for each in found.rounds), count_with_noun(len(found.rounds), "round")
-    run = definition_list(
-        (
-            ("arm", source),
-            ("readings", f"{n_readings} in {rounds}"),
-            ("seed", str(seed)),
-            *((("the world concealed", hidden),) if concealed is not None else ()),
-        )
-    )
+    run = {"arm": source, "readings": f"{n_readings} in {rounds}", "seed": str(seed)}
+    run |= {} if concealed is None else {"the world concealed": hidden}
     sections = [
         Section("How it came to that", (), tuple(_round_section(each) for each in found.rounds)),
         Section("The diagnosis of all readings", (), tuple(diagnosis_report.sections(diagnosis, drawn))),
@@ -100,14 +94,13 @@ def _round_section(each: Round) -> Section:
         then = ""
     else:
         then = f"Next readings: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
-    said: tuple[Markup, ...] = (
-        paragraph(
-            typeset_numbers(f"{count_with_noun(len(each.recording), 'reading').capitalize()} were taken, {why}.")
-        ),
-        paragraph(
-            typeset_numbers(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}.")
-        ),
+    taken = count_with_noun(len(each.recording), "reading").capitalize()
+    test = f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}."
+    said = (
+        typeset_numbers(f"{taken} were taken, {why}."),
+        typeset_numbers(test),
         table(("explanation", "probability"), ((name, probability_text(p)) for name, p in likely)),
-        paragraph(typeset_numbers(then)),
+        typeset_numbers(then),
     )
-    return Section(_round_title(each)[:1].upper() + _round_title(each)[1:], said)
+    title = _round_title(each)
+    return Section(title[:1].upper() + title[1:], said)

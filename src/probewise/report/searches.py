@@ -155,7 +155,7 @@ def paper_view(search: RobotSearch, number: int, *, window_mm: tuple[float, floa
     `number` is that of the reading, from 1; `window_mm` are the limits shown: left, right, lower, upper.
     """
     run, step = search.run, search.run.steps[number - 1]
-    known = f"known to {number_text(step.largest_sd_mm, 1)} mm"
+    known = f"sd up to {number_text(step.largest_sd_mm, 1)} mm"
     ax = draw_robot_view(
         step,
         run.experiment,

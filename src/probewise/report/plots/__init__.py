@@ -19,8 +19,8 @@ _FILES = {
     "noise": "lost_readings_against_predicted readings_modulo_step residual_autocorrelation residual_histogram "
     "spread_by_level",
     "probabilities": "audit_matrix effect_probabilities_by_reading hypothesis_probabilities probabilities_by_round",
-    "readings": "predicted_and_recorded_by_scan quadrant_patterns readings_before_and_after_repair "
-    "readings_by_orientation residuals_by_scan sensor_orientations standardised_residuals",
+    "readings": "predicted_and_recorded_by_scan quadrant_patterns readings_by_orientation residuals_by_scan "
+    "sensor_orientations standardised_residuals",
     "residuals": "heldout_gain_by_scan mean_residuals_along readings_in_order recorded_against_predicted "
     "residuals_against_covariates scan_with_residuals",
     "search": "draw_field_legend information_gained playing_field posterior_widths",

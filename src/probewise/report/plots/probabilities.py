@@ -21,7 +21,6 @@ _AXES_SHARE = 0.775  # of a figure's width: its axes before the layout, which wi
 _EFFECT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")  # of the likeliest effects by reading
 _CLEAN, _REST = "#D9D9D9", "#7F7F7F"
 _DETECTABILITY = {"fine": canvas.BLUE, "aliased": canvas.ORANGE, "invisible": canvas.GREY}
-_NOT_COMPARED = "#e8e8e8"
 _MOST_NAMES = 36  # columns of the matrix labelled with names; if there are more, they are numbered
 
 
@@ -169,15 +168,19 @@ def audit_matrix(
 
 
 def _draw_matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) -> None:
+    """Draw the cosines of the effects that were compared; rows of the others are blank, and they have no column."""
     shown = np.where(np.eye(len(labels), dtype=np.bool_), np.nan, cosines)
-    alone = ~(np.nan_to_num(shown).any(axis=0) | np.nan_to_num(shown).any(axis=1))
-    shown[alone, :] = shown[:, alone] = np.nan
-    ax.set_facecolor(_NOT_COMPARED)
-    image = ax.imshow(shown, cmap=canvas.COPPER, vmin=0, vmax=1, aspect="auto")
-    rows, columns = np.nonzero(np.nan_to_num(shown) >= alias)
-    ax.plot(columns, rows, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
-    ax.set_xticks(np.arange(len(labels)), labels, rotation=0 if labels[0] == "" else 90, fontsize=canvas.SMALL_PT)
+    compared = np.nan_to_num(shown).any(axis=0) | np.nan_to_num(shown).any(axis=1)
+    shown[~compared, :] = np.nan
+    columns = np.flatnonzero(compared if compared.any() else ~compared)
+    image = ax.imshow(shown[:, columns], cmap=canvas.COPPER, vmin=0, vmax=1, aspect="auto")
+    at_row, at_column = np.nonzero(np.nan_to_num(shown[:, columns]) >= alias)
+    ax.plot(at_column, at_row, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")
+    turned = 0 if labels[0] == "" else 90
+    ax.set_xticks(np.arange(len(columns)), [labels[k] for k in columns], rotation=turned, fontsize=canvas.SMALL_PT)
     ax.tick_params(left=False)
+    ax.spines["left"].set_visible(False)
     bar = ax.figure.colorbar(image, ax=ax, label="cosine (no unit); circles from the line on", shrink=0.7)
     bar.ax.axhline(alias, color="black", linewidth=1.2)
-    canvas.label_axes(ax, x="effect it may be mistaken for", y="", title="row: the effect present; grey: not compared")
+    title = "row: the effect present; blank: not compared"
+    canvas.label_axes(ax, x="effect it may be mistaken for", y="", title=title)

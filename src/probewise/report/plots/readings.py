@@ -26,8 +26,6 @@ _MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 _MOST_NAMED = 8  # tracks in the legend, panels, and names of single readings; with more there is none
 _SD_95 = 1.96
 _MOST_GROUPS, _LEAST_ROWS = 18, 5  # of neighbours in a running mean
-_VISIBLE_CHANGE = 0.3  # share of the repair's largest change: the figure shows where the change exceeds it
-_BEFORE, _AFTER = "calibrated model", "repaired model"
 _ALONG_EDGE, _ALONG_SCAN = "distance from the edge{} (mm)", "place along the scan (mm)"
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
 _AROUND_MM = 16.0  # half width of the drawing of a quadrant
@@ -280,91 +278,35 @@ def residuals_by_scan(
 ) -> canvas.AxesGrid:
     """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each, on one scale.
 
-    `before` and `after` are predictions, (n_points,). Return the axes, (n_rows, columns).
+    Each usable residual, and running means; `before` and `after` are predictions, (n_points,). Return the axes,
+    (n_rows, columns).
     """
     require_recording(recording)
     tracks, _ = tracks_and_single_rows(recording.plan)
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in tracks]
     shown = [tracks[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // columns), 1)
-    axes = canvas.grid_of_axes(n_rows, columns, size_in=(3.2 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
+    size = (3.2 * columns, 1.75 * n_rows + 0.7)
+    axes = canvas.grid_of_axes(n_rows, columns, size_in=size, sharex=True, sharey=True)
+    models = {"calibrated model": (before, canvas.VERMILLION), "repaired model": (after, canvas.BLUE)}
     for ax, track in zip(axes.flat, shown, strict=False):
-        _draw_residuals_of_both(ax, recording, [track], before, after, markersize=2.2, alpha=0.4)
+        ok = recording.usable[track.rows]
+        rows, along = track.rows[ok], track.along_mm[ok]
+        for predicted, colour in models.values():
+            residual = recording.readings[rows] - predicted[rows]
+            ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
+            ax.plot(*_running_mean_by_position(along, residual), color=colour, linewidth=1.8)
+        ax.axhline(0.0, color=canvas.BLACK, linewidth=0.7)
         scan = recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])]
         canvas.label_axes(ax, x="", y="", title=scan.replace("_", " "))
     canvas.hide_unused(axes, len(shown))
     sheet, edge = canvas.figure_of(axes), _along_label([])
     sheet.supxlabel(edge if _along_label(shown) == edge else f"{edge}, or {_ALONG_SCAN}", fontsize=10)
     sheet.supylabel(f"recorded − predicted ({recording.plan.instrumentation.unit_after_number})", fontsize=10)
-    lines = [Line2D([], [], color=colour, linewidth=1.8) for colour in (canvas.VERMILLION, canvas.BLUE)]
-    sheet.legend(lines, [_BEFORE, _AFTER], loc="outside upper left", ncols=2, frameon=False, fontsize=canvas.SMALL_PT)
+    lines = [Line2D([], [], color=colour, linewidth=1.8) for _, colour in models.values()]
+    style = {"ncols": 2, "frameon": False, "fontsize": canvas.SMALL_PT}
+    sheet.legend(lines, list(models), loc="outside upper left", **style)
     return axes
-
-
-def readings_before_and_after_repair(
-    recording: Recording, rows: IntArray, before: FloatArray, after: FloatArray, *, name: str = ""
-) -> canvas.AxesGrid:
-    """Draw readings with the curves of two models, and below them the residuals, around where the models differ.
-
-    `rows` are those of one scan, or of several over one pattern in one orientation; `before` and `after` are
-    predictions, (n_points,). Return the axes, (2, 1). ParameterError if no three of the readings lie along a line.
-    """
-    require_recording(recording)
-    tracks, _ = tracks_and_single_rows(recording.plan.take(rows))
-    if not tracks:
-        raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
-    tracks = [replace(track, rows=rows[track.rows]) for track in tracks]
-    axes = canvas.grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
-    above, below = axes[:, 0]
-    for k, track in enumerate(tracks):
-        order = np.argsort(track.along_mm, kind="stable")
-        at, along = track.rows[order], track.along_mm[order]
-        ok = recording.usable[at]
-        above.plot(
-            along[ok], recording.readings[at][ok], ".", color=canvas.BLACK, markersize=4, label="" if k else "recorded"
-        )
-        for predicted, colour, model in ((before, canvas.VERMILLION, _BEFORE), (after, canvas.BLUE, _AFTER)):
-            above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else model)
-    limits = _limits_around_change(tracks, np.abs(after - before))
-    _draw_residuals_of_both(below, recording, tracks, before, after, markersize=4, alpha=0.5, limits=limits)
-    below.set_xlim(limits)
-    unit = recording.plan.instrumentation.unit_after_number
-    above.legend(frameon=False, fontsize=canvas.SMALL_PT)
-    canvas.label_axes(above, x="", y=f"reading ({unit})", title=name)
-    canvas.label_axes(below, x=_along_label(tracks), y=f"recorded − predicted\n({unit})")
-    return axes
-
-
-def _limits_around_change(tracks: Sequence[Track], change: FloatArray) -> tuple[float, float]:
-    """Return limits of the x axis (mm): where models differ by 30 % of the most or more, with as wide a margin."""
-    along = np.concatenate([track.along_mm for track in tracks])
-    by_place = np.concatenate([change[track.rows] for track in tracks])
-    differs = along[by_place >= _VISIBLE_CHANGE * max(float(by_place.max()), 1e-300)]
-    margin = float(np.ptp(differs)) + 1.0
-    low, high = float(differs.min()) - margin, float(differs.max()) + margin
-    return max(float(along.min()), low), min(float(along.max()), high)
-
-
-def _draw_residuals_of_both(
-    ax: Axes,
-    recording: Recording,
-    tracks: Sequence[Track],
-    before: FloatArray,
-    after: FloatArray,
-    *,
-    markersize: float,
-    alpha: float,
-    limits: tuple[float, float] = (-np.inf, np.inf),
-) -> None:
-    """Draw each usable residual of both models along tracks, within the limits, and running means."""
-    rows, along = (np.concatenate(parts) for parts in zip(*((t.rows, t.along_mm) for t in tracks), strict=True))
-    ok = recording.usable[rows] & (along >= limits[0]) & (along <= limits[1])
-    rows, along = rows[ok], along[ok]
-    for predicted, colour in ((before, canvas.VERMILLION), (after, canvas.BLUE)):
-        residual = recording.readings[rows] - predicted[rows]
-        ax.plot(along, residual, ".", color=colour, markersize=markersize, alpha=alpha)
-        ax.plot(*_running_mean_by_position(along, residual), color=colour, linewidth=1.8)
-    ax.axhline(0.0, color=canvas.BLACK, linewidth=0.7)
 
 
 def _running_mean_by_position(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -152,8 +152,8 @@ def test_a_missing_journal_is_an_error_of_files(tmp_path):
 
 def test_a_new_journal_never_overwrites_a_file(tmp_path):
     (tmp_path / "j").write_text("precious")
-    with pytest.raises(FileError, match="exists"):
-        JournalWriter.begin(tmp_path / "j", SETTINGS)
+    with pytest.raises(FileError, match="exists"), JournalWriter.begin(tmp_path / "j", SETTINGS):
+        pass
     assert (tmp_path / "j").read_text() == "precious"
 
 
@@ -234,7 +234,8 @@ def test_a_digest_tells_effects_by_name_origin_and_values_whatever_their_classes
 
 def test_a_journal_whose_digest_is_of_the_classes_of_effects_goes_on_with_the_same_sensor(tmp_path):
     sensor, kept = value_digest(Known(EFFECTS["gain_drift"](), (0.02, 60.0))), {**SETTINGS, "sensor_sha256": "a" * 64}
-    JournalWriter.begin(tmp_path / "j", {**kept, "sensor": "b" * 64}).close()
+    with JournalWriter.begin(tmp_path / "j", {**kept, "sensor": "b" * 64}):
+        pass
     require_same_settings(read_journal(tmp_path / "j"), {**kept, "sensor": sensor})
     with pytest.raises(FileError, match="sensor_sha256"):
         require_same_settings(read_journal(tmp_path / "j"), {**kept, "sensor": sensor, "sensor_sha256": "c" * 64})

@@ -22,12 +22,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from io import FileIO
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
 from probewise._writing import hold_lock, write_and_sync, write_text_atomically
 from probewise.arm.instrument import Pose, Reading
@@ -110,29 +108,25 @@ def recording_of(
     names = sorted({name for known in covariates for name in known})
     zeros = np.zeros(len(readings), dtype=np.int64)
     plan = Plan(
-        x_mm=_column([reading.pose.x_mm for reading in readings]),
-        y_mm=_column([reading.pose.y_mm for reading in readings]),
-        orientation_rad=_column([reading.pose.orientation_rad for reading in readings]),
-        time_s=_column([reading.time_s for reading in readings]),
+        x_mm=np.array([reading.pose.x_mm for reading in readings]),
+        y_mm=np.array([reading.pose.y_mm for reading in readings]),
+        orientation_rad=np.array([reading.pose.orientation_rad for reading in readings]),
+        time_s=np.array([reading.time_s for reading in readings]),
         scan=zeros,
         scan_names=(PATTERN,),
         pattern=zeros,
         pattern_names=(PATTERN,),
         patterns={} if patterns is None else patterns,
-        covariates={name: _column([known.get(name, math.nan) for known in covariates]) for name in names},
+        covariates={name: np.array([known.get(name, math.nan) for known in covariates]) for name in names},
         instrumentation=Instrumentation() if instrumentation is None else instrumentation,
     )
-    return Recording(plan, _column([reading.value for reading in readings]), source)
+    return Recording(plan, np.array([reading.value for reading in readings]), source)
 
 
 def covariates_with_height(reading: Reading) -> Mapping[str, float]:
     """Return a reading's covariates; `height_mm` is the pose's, if the pose has one and the covariates have none."""
     height_mm = reading.pose.height_mm
     return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}
-
-
-def _column(values: list[float]) -> FloatArray:
-    return np.array(values, dtype=np.float64)
 
 
 def read_journal(path: str | Path) -> Journal:
@@ -286,63 +280,53 @@ def _flattened_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(eq=False)
 class JournalWriter:
-    """Writer that appends to a journal, a context manager; every call returns when the text is on disk.
+    """Writer that appends to a journal; every call returns when the text is on disk.
 
-    While it is open, no other process can write to the journal.
+    `begin` and `resume` are context managers, in which no other process can write to the journal.
     """
 
     path: Path
     _file: FileIO = field(repr=False)
-    _open: contextlib.ExitStack = field(repr=False)
 
     @classmethod
-    def begin(cls, path: str | Path, settings: Mapping[str, Any]) -> JournalWriter:
+    @contextlib.contextmanager
+    def begin(cls, path: str | Path, settings: Mapping[str, Any]) -> Iterator[JournalWriter]:
         """Begin a new journal with these settings; missing directories are created.
 
-        Raises
-        ------
-        FileError
-            If the file exists already, cannot be written, or another process writes to it.
+        FileError if the file exists already, cannot be written, or another process writes to it.
         """
         path = Path(path)
-        if path.exists():
-            raise _error_of_existing_file(path)
+        _require_new_file(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FileError(path.parent, f"cannot be made ({error.strerror})", "a folder you may write to") from error
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(hold_lock(path))
-            if path.exists():
-                raise _error_of_existing_file(path)
+        with hold_lock(path):
+            _require_new_file(path)
             write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
-            file = stack.enter_context(open(path, "ab", buffering=0))
-            return cls(path, file, stack.pop_all())
+            with open(path, "ab", buffering=0) as file:
+                yield cls(path, file)
 
     @classmethod
-    def resume(cls, journal: Journal) -> JournalWriter:
+    @contextlib.contextmanager
+    def resume(cls, journal: Journal) -> Iterator[JournalWriter]:
         """Continue after the last whole line of a journal, or the reading of a truncated one, and remove the rest.
 
-        After such a reading, `write_summary` completes the line.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written, or another process writes to it or has changed it since it was read.
+        After such a reading, `write_summary` completes the line. FileError if the file cannot be written, or another
+        process writes to it or has changed it since it was read.
         """
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(hold_lock(journal.path))
+        with hold_lock(journal.path):
             try:
-                file = stack.enter_context(open(journal.path, "r+b", buffering=0))
+                file = FileIO(journal.path, "r+b")
             except OSError as error:
-                raise FileError(
-                    journal.path, f"cannot be written ({error.strerror})", "a file you may write to"
-                ) from error
-            if file.seek(0, os.SEEK_END) != journal.n_bytes + journal.n_torn:
-                raise FileError(journal.path, "another process has written to it", "to resume it once more")
-            file.truncate(journal.n_bytes)
-            file.seek(0, os.SEEK_END)
-            return cls(Path(journal.path), file, stack.pop_all())
+                told = f"cannot be written ({error.strerror})"
+                raise FileError(journal.path, told, "a file you may write to") from error
+            with file:
+                if file.seek(0, os.SEEK_END) != journal.n_bytes + journal.n_torn:
+                    raise FileError(journal.path, "another process has written to it", "to resume it once more")
+                file.truncate(journal.n_bytes)
+                file.seek(0, os.SEEK_END)
+                yield cls(Path(journal.path), file)
 
     def write_reading(self, index: int, reading: Reading) -> None:
         """Write a reading, the first part of its line."""
@@ -365,21 +349,10 @@ class JournalWriter:
         }
         write_and_sync(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
 
-    def close(self) -> None:
-        """Close the file and let other processes write to it."""
-        self._open.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-def _error_of_existing_file(path: Path) -> FileError:
-    return FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")
+def _require_new_file(path: Path) -> None:
+    if path.exists():
+        raise FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")
 
 
 def value_digest(value: object) -> str:

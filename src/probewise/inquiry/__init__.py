@@ -21,7 +21,6 @@ from probewise.inquiry.readout import (
     capacity_bits,
     entropy_bits,
     fewest_readings,
-    neighbour_entropy,
     prior_entropy,
     target_entropy,
 )
@@ -82,7 +81,6 @@ __all__ = [
     "fewest_readings",
     "forecast_of",
     "label_entropy",
-    "neighbour_entropy",
     "prior_entropy",
     "reachable_rows",
     "target_entropy",

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.spatial import cKDTree
-from scipy.special import digamma, gammaln, ndtr
+from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
@@ -156,28 +155,6 @@ def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20
     """Return the differential entropy of a prior in bits: minus the mean log2 density of `n_samples` draws."""
     theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
     return -float(np.mean(prior.log_prob(theta))) / math.log(2)
-
-
-def neighbour_entropy(theta: FloatArray, *, neighbour: int = 4) -> float:
-    """Return the differential entropy in bits from distances to the k-th neighbour, theta (n_samples, n_params).
-
-    Kozachenko and Leonenko's estimate (k, `neighbour`, as in Kraskov et al. 2004): psi(n) - psi(k) + ln V_d + d mean(ln
-    r_k). The columns are scaled to unit sd first, and the scale is added back, since the estimate assumes a density
-    that is even over the distance r_k. ParameterError if more than k samples coincide, for a constant
-    column, or for a k that is not below the number of samples.
-    """
-    n_samples, n_params = theta.shape
-    if not 1 <= neighbour < n_samples:
-        raise ParameterError("neighbour", neighbour, f"1 to {n_samples - 1}, fewer than the samples")
-    scale = theta.std(axis=0)
-    if np.any(scale <= 0):
-        raise ParameterError("theta", "a constant column", "samples that vary in every parameter")
-    distance = np.asarray(cKDTree(theta / scale).query(theta / scale, k=[neighbour + 1])[0])
-    if np.any(distance <= 0):
-        raise ParameterError("theta", "repeated samples", f"samples of which no {neighbour + 1} coincide")
-    log_ball = 0.5 * n_params * math.log(math.pi) - float(gammaln(0.5 * n_params + 1))
-    nats = float(digamma(n_samples)) - float(digamma(neighbour)) + log_ball + n_params * float(np.log(distance).mean())
-    return float(nats + np.log(scale).sum()) / math.log(2)
 
 
 @dataclass(frozen=True)

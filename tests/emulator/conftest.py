@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from probewise.emulator import Brick, EmptyPort, LightSensor, VirtualClock, ultrasonic_sensor
+from probewise.emulator import Brick, EmptyPort, LightSensor, VirtualClock
 
 
 @pytest.fixture
@@ -22,9 +22,9 @@ def clock() -> VirtualClock:
 
 @pytest.fixture
 def brick(clock: VirtualClock) -> Brick:
-    """A light sensor at port 2 over something that reads 57.5 %, an ultrasonic sensor at port 4."""
-    sensors = [EmptyPort(), LightSensor(lambda lit: 57.5 if lit else 28.75, clock), EmptyPort(), ultrasonic_sensor(42)]
-    return Brick(clock, sensors=sensors, name="ARM1", files={"arm.rxe": b""})
+    """A light sensor at port 2 over something that reads 57.5 %."""
+    sensors = [EmptyPort(), LightSensor(lambda lit: 57.5 if lit else 28.75, clock), EmptyPort(), EmptyPort()]
+    return Brick(clock, sensors=sensors, name="ARM1", programs=("arm.rxe",))
 
 
 @pytest.fixture

@@ -65,22 +65,6 @@ def test_clients_come_and_go_and_ctrl_c_ends_it(emulator: Emulator, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_all_byte_values_pass_unchanged(emulator: Emulator) -> None:
-    """A cooked terminal would eat 0x03, 0x11 and 0x13, and turn 0x0D into 0x0A."""
-    text = bytes(range(0x01, 0x1F))
-    with emulator() as running:
-        name = b"all.dat".ljust(20, b"\0")
-        opened = exchanged(running.device, bytes.fromhex("1A 00 01 81") + name + len(text).to_bytes(4, "little"), 6)
-        assert opened == bytes.fromhex("04 00 02 81 00 00")
-        written = exchanged(running.device, bytes((len(text) + 3, 0)) + b"\x01\x83\x00" + text, 8)
-        assert written[4] == 0
-        exchanged(running.device, bytes.fromhex("03 00 01 84 00"), 6)
-        exchanged(running.device, bytes.fromhex("16 00 01 80") + name, 10)
-        read = exchanged(running.device, bytes.fromhex("05 00 01 82 00") + len(text).to_bytes(2, "little"), 38)
-        assert read[8:] == text
-
-
-@pytest.mark.slow
 def test_a_person_changes_the_scene_by_typing(emulator: Emulator) -> None:
     with emulator() as running:
         running.process.stdin.write(b"uniform:0.5\ngremlins\n")

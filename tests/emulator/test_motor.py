@@ -166,50 +166,6 @@ def test_braking_is_shorter_than_coasting() -> None:
     assert ends[0] < ends[1] / 2
 
 
-def test_a_ramp_down_ends_with_less_overshoot_than_a_plain_run(ask, clock, brick) -> None:
-    turn(ask, 75, 0)
-    while brick.outputs.ports[0].tacho_count < 500:
-        wait(clock, brick, 0.01)
-    goal = brick.outputs.ports[0].tacho_count + 400
-    turn(ask, 0, 400, how="03 00 00 40")
-    port = wait(clock, brick, 6.0)
-    assert port.run_state == RunState.IDLE
-    assert goal <= port.tacho_count <= goal + 15
-
-
-def test_a_ramp_up_gets_faster_until_its_limit(ask, clock, brick) -> None:
-    turn(ask, 75, 720, how="03 00 00 10")
-    powers = []
-    while (port := wait(clock, brick, 0.05)).run_state == RunState.RAMP_UP:
-        powers.append(port.power)
-    assert powers == sorted(powers)
-    assert powers[0] == 10
-    assert powers[-1] >= 65
-    assert port.tacho_count >= 720
-
-
-def test_motors_in_step_stay_together_though_one_has_more_friction(clock: VirtualClock) -> None:
-    heavy = Motor(MotorParameters(friction_deg_s2=2400))
-    brick = Brick(clock, motors=[Motor(), heavy, Motor()])
-    for port in ("00", "01"):
-        brick.answer(bytes.fromhex(f"80 04 {port} 32 07 02 00 20 00 00 00 00"))
-    clock.sleep(4.0)
-    brick.advance()
-    one, two, _ = (port.block_count for port in brick.outputs.ports)
-    assert one > 1000
-    assert abs(one - two) <= 10
-
-
-def test_a_turn_ratio_slows_the_inner_motor(clock: VirtualClock) -> None:
-    brick = Brick(clock)
-    for port in ("00", "01"):
-        brick.answer(bytes.fromhex(f"80 04 {port} 32 07 02 32 20 00 00 00 00"))
-    clock.sleep(4.0)
-    brick.advance()
-    one, two, _ = (port.block_count for port in brick.outputs.ports)
-    assert abs(one) < 0.6 * abs(two) or abs(two) < 0.6 * abs(one)
-
-
 def test_a_motor_stands_still_at_its_stop() -> None:
     motor = Motor(MotorParameters(stops_deg=(-50.0, 100.0)))
     for _ in range(1000):

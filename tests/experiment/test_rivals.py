@@ -14,7 +14,7 @@ from scipy.stats import norm
 from probewise import scene
 from probewise.arm import Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import FITTED, Accuracy
-from probewise.calibration import FittedSensor, posterior_mean_ssf_field, predict
+from probewise.calibration import FittedSensor, posterior_mean_ssf_field, predict, read_sensor, write_sensor
 from probewise.effects import Origin
 from probewise.errors import ParameterError
 from probewise.experiment import (
@@ -685,6 +685,27 @@ def test_play_of_each_axis_stays_on_the_side_that_the_axis_last_moved_to(doubtin
     right = doubting.kinds[0].model.predict(circle, doubting.problem(short).recording.plan)
     found = kind.model.predict(np.append(circle, [[6.0]], axis=1), doubting.problem(taken).recording.plan)
     np.testing.assert_allclose(found, right, atol=1e-6)
+
+
+def test_play_of_each_axis_is_so_after_the_file_of_the_repaired_sensor_too(doubting, sensor, stepped, tmp_path):
+    """By hand: after a diagonal move each axis rests half the play short, not its share of the motion's direction."""
+    of_axes = [kind.left_out for kind in doubting.kinds].index("backlash") + 2
+    info = leading(stepped[-1], "backlash")
+    kept = np.array([kind.left_out != "backlash" or k == of_axes for k, kind in enumerate(doubting.kinds)])
+    particles = tuple(
+        replace(p, weighted=replace(p.weighted, log_z=p.weighted.log_z if keep else -40.0))
+        for p, keep in zip(info.kinds.particles, kept, strict=True)
+    )
+    info = replace(info, kinds=replace(info.kinds, particles=particles))
+    write_sensor(repaired_sensor(sensor, info, rng=np.random.default_rng(1)), tmp_path / "sensor.json")
+    read = read_sensor(tmp_path / "sensor.json")
+    plan = Plan.from_arrays(x_mm=[0.0, 3.0], y_mm=[0.0, 4.0], patterns=Uniform(0.5), unit="LEGO")
+    theta = read.samples_for_new_scans[:1]
+    there = read.chain(scene.KnownScene(plan.patterns)).poses(theta, plan)
+    short = theta[0, -1] / 2
+    assert short > 0
+    np.testing.assert_allclose([there.x_mm[0], there.y_mm[0]], [[-short, 3.0 - short], [-short, 4.0 - short]])
+    assert json.loads((tmp_path / "sensor.json").read_text())["effects"] == ["backlash"]
 
 
 def test_what_changed_since_the_calibration_is_in_the_levels_of_the_repaired_sensor(sensor, stepped):

@@ -48,9 +48,8 @@ class Joint:
                 "-360 to 360, the low one below the high",
             )
         if not self.low_rad <= self.home_rad <= self.high_rad:
-            allowed = "an angle between low_deg and high_deg, {:g} to {:g}".format(
-                *_rounded_degrees(self.low_rad, self.high_rad)
-            )
+            low, high = _rounded_degrees(self.low_rad, self.high_rad)
+            allowed = f"an angle between low_deg and high_deg, {low:g} to {high:g}"
             raise ParameterError("home_deg", math.degrees(self.home_rad), allowed)
         if not 0 <= self.play_rad < self.high_rad - self.low_rad:
             raise ParameterError("play_deg", math.degrees(self.play_rad), "0 or more, less than the joint's range")
@@ -132,56 +131,25 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Geometry:
-    """All dimensions of the arm; `read_geometry` reads them from a file.
+    """All dimensions of the arm; `read_geometry` reads them from a file. Pairs of a place are x and y, lab frame."""
 
-    Parameters
-    ----------
-    field_mm
-        Width and height of the field, whose lower left corner is the lab frame's origin.
-    axis_mm
-        Place (x, y) of the base's vertical axis.
-    shoulder_mm
-        Distance forward from the base's axis to the shoulder's axis, and the shoulder's height above the surface.
-    links_mm
-        Lengths of the upper link, shoulder to elbow, and of the lower link, elbow to wrist.
-    elbow_is_relative
-        Whether the elbow's angle is measured from the direction of the upper link; otherwise, from the horizontal.
-    sensor_port
-        0 to 3, for inputs 1 to 4.
-    sensor_mm
-        Distance from the wrist forward to the sensor's origin, and down to its face.
-    mounting_rad
-        The sensor's orientation is this plus the base's angle minus a right angle.
-    read_height_mm, travel_height_mm, lowest_mm
-        Height of the sensor's face above the surface: when reading, when moving, and the lowest allowed.
-    base, shoulder, elbow
-        The joints.
-    whole_percent
-        Whether readings are truncated to whole percent, as the brick shows them.
-    accuracy
-        Accuracy of a geometry fitted to marks; None: not fitted.
-    light_per_mm
-        Relative decrease of a reading over white per mm of height, measured by the command `arm heights`; None: light
-        falls with the square of the height.
-    """
-
-    field_mm: tuple[float, float]
-    axis_mm: tuple[float, float]
-    shoulder_mm: tuple[float, float]
-    links_mm: tuple[float, float]
-    elbow_is_relative: bool
-    sensor_port: int
-    sensor_mm: tuple[float, float]
-    mounting_rad: float
-    read_height_mm: float
-    travel_height_mm: float
-    lowest_mm: float
+    field_mm: tuple[float, float]  # width and height of the field; its lower left corner is the lab frame's origin
+    axis_mm: tuple[float, float]  # place of the base's vertical axis
+    shoulder_mm: tuple[float, float]  # of the shoulder's axis: forward of the base's axis, and above the surface
+    links_mm: tuple[float, float]  # upper link, shoulder to elbow, and lower link, elbow to wrist
+    elbow_is_relative: bool  # whether the elbow's angle counts from the upper link; otherwise, from the horizontal
+    sensor_port: int  # 0 to 3, for inputs 1 to 4
+    sensor_mm: tuple[float, float]  # from the wrist forward to the sensor's origin, and down to its face
+    mounting_rad: float  # the sensor's orientation is this plus the base's angle minus a right angle
+    read_height_mm: float  # heights of the sensor's face above the surface: when reading, ...
+    travel_height_mm: float  # ... when moving,
+    lowest_mm: float  # ... and the lowest allowed
     base: Joint
     shoulder: Joint
     elbow: Joint
-    whole_percent: bool = True
-    accuracy: Accuracy | None = None
-    light_per_mm: float | None = None
+    whole_percent: bool = True  # whether readings are truncated to whole percent, as the brick shows them
+    accuracy: Accuracy | None = None  # of a geometry fitted to marks
+    light_per_mm: float | None = None  # fall of readings over white per mm of height; None: with the height's square
 
     def __post_init__(self) -> None:
         finite = (*self.field_mm, *self.axis_mm, *self.shoulder_mm, *self.links_mm, *self.sensor_mm, self.mounting_rad)
@@ -217,16 +185,6 @@ class Geometry:
     def joints(self) -> tuple[Joint, Joint, Joint]:
         """Base, shoulder and elbow."""
         return self.base, self.shoulder, self.elbow
-
-    @property
-    def nearest_mm(self) -> float:
-        """Smallest distance from the axis at which the sensor can read, in whole mm; NaN if there is none."""
-        return float(self._radii_with_room_mm()[0])
-
-    @property
-    def farthest_mm(self) -> float:
-        """Largest distance from the axis at which the sensor can read, in whole mm; NaN if there is none."""
-        return float(self._radii_with_room_mm()[1])
 
     @property
     def rest_mm(self) -> tuple[float, float]:
@@ -321,10 +279,10 @@ class Geometry:
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""
-        (width, height), (x_mm, y_mm) = self.field_mm, self.axis_mm
+        (width, height), (x_mm, y_mm), (nearest, farthest) = self.field_mm, self.axis_mm, self.radii_in_reach_mm()
         return (
-            f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {self.nearest_mm:.0f} to "
-            f"{self.farthest_mm:.0f} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm, within its joints' limits"
+            f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {nearest:.0f} to "
+            f"{farthest:.0f} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm, within its joints' limits"
         )
 
     def _room_to_approach_mask(self, places_mm: FloatArray) -> BoolArray:
@@ -334,8 +292,8 @@ class Geometry:
         roomy = [self.are_within_joint_limits(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
         return np.asarray(np.all(roomy, axis=0))
 
-    def _radii_with_room_mm(self) -> tuple[float, float]:
-        """Return least and greatest distance in reach, in whole mm, with the base in mid-range; NaN: none."""
+    def radii_in_reach_mm(self) -> tuple[float, float]:
+        """Return the least and the greatest distance from the axis in reach, in whole mm; NaN: none is."""
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]

@@ -192,14 +192,9 @@ class Reach:
     Raises ParameterError if a length is negative or not finite, or `nearest_mm` is not below `farthest_mm`; ReachError
     if no place on the field is within reach.
 
-    Parameters
-    ----------
-    field_mm
-        Width and height of the field; its lower left corner is the lab frame's origin.
-    axis_beyond_mm
-        Distance of the axis from the field.
-    nearest_mm, farthest_mm
-        Smallest and largest distance of the sensor from the axis.
+    `field_mm`: width and height of the field; its lower left corner is the lab frame's origin; `axis_beyond_mm`:
+    distance of the axis from the field; `nearest_mm`, `farthest_mm`: smallest and largest distance of the sensor from
+    the axis.
     """
 
     field_mm: tuple[float, float] = FIELD_MM

@@ -52,16 +52,8 @@ def percent_to_lego_units(percent: float, geometry: Geometry) -> float:
 class LegoArm:
     """An instrument: an arm of two links on a turning base, with its sensor looking straight down.
 
-    Parameters
-    ----------
-    machine
-        The machine that moves it; entered and exited with the arm.
-    geometry
-        Dimensions of the arm.
-    clock
-        Clock for the times of readings.
-    start_s
-        Time at the start, for resuming an earlier run.
+    `machine`: the machine that moves it; entered and exited with the arm; `geometry`: dimensions of the arm; `clock`:
+    clock for the times of readings; `start_s`: time at the start, for resuming an earlier run.
 
     Attributes
     ----------

@@ -30,6 +30,7 @@ from probewise.recordings.io import run_python_file
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
 _TAKEN = (*KNOWN, SESSION)
+_RETURNED, _OR_NAN = " of what measure returned", "a finite number, or nan where it is missing"
 
 
 class Measures(Protocol):
@@ -126,21 +127,23 @@ class OwnInstrument:
     @property
     def turns(self) -> bool:
         """Whether the object turns its sensor to `pose.orientation_rad`: its attribute `turns`, by default False."""
-        with self._errors_located("turns"):
-            return bool(getattr(self._own, "turns", False))
+        return bool(self._attribute("turns", False))
 
     @property
     def lifts(self) -> bool:
         """Whether the object reads at a given `pose.height_mm`: its attribute `lifts`, by default False."""
-        with self._errors_located("lifts"):
-            return bool(getattr(self._own, "lifts", False))
+        return bool(self._attribute("lifts", False))
 
     @property
     def read_height_mm(self) -> float | None:
         """Height above the surface at which the object reads: its attribute `read_height_mm`; None: not known."""
+        height_mm = self._attribute("read_height_mm", None)
         with self._errors_located("read_height_mm"):
-            height_mm = getattr(self._own, "read_height_mm", None)
             return None if height_mm is None else checked_finite_number("read_height_mm of the instrument", height_mm)
+
+    def _attribute(self, name: str, usual: Any) -> Any:
+        with self._errors_located(name):
+            return getattr(self._own, name, usual)
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""
@@ -195,22 +198,27 @@ class OwnInstrument:
 
     def _as_reading(self, found: object, pose: Pose) -> Reading:
         if isinstance(found, Reading):
-            return _checked_reading(found)
-        now_s = self._clock.monotonic() - self._zero_s
-        if not isinstance(found, Mapping):
-            return Reading(_checked_value("what measure returned", found), pose, now_s)
-        if "value" not in found:
-            raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
-        own = {"time_s": now_s} | {name: getattr(pose, name) for name in _OF_THE_POSE}
-        known = {
-            name: _checked_covariate(name, number) for name, number in found.items() if name not in (*own, "value")
-        }
-        own = {name: _checked_covariate_value(name, found.get(name, usual)) for name, usual in own.items()}
+            if math.isinf(found.value):
+                raise ParameterError(f"value{_RETURNED}", found.value, _OR_NAN)
+            own = {"time_s": found.time_s} | {name: getattr(found.pose, name) for name in _OF_THE_POSE}
+            known = {name: _checked_covariate(name, number) for name, number in found.covariates.items()}
+            reading = dataclasses.replace(found, covariates=known) if known else found
+        else:
+            own = {"time_s": self._clock.monotonic() - self._zero_s}
+            own |= {name: getattr(pose, name) for name in _OF_THE_POSE}
+            if not isinstance(found, Mapping):
+                return Reading(_checked_value("what measure returned", found), pose, own["time_s"])
+            if "value" not in found:
+                raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
+            known = {
+                name: _checked_covariate(name, number) for name, number in found.items() if name not in (*own, "value")
+            }
+            own = {name: _float_or_nan(name, found.get(name, usual)) for name, usual in own.items()}
+            there = Pose(*(own[name] for name in _OF_THE_POSE), height_mm=pose.height_mm)
+            reading = Reading(_checked_value(f"value{_RETURNED}", found["value"]), there, own["time_s"], known)
         for name, number in own.items():
-            checked_finite_number(f"{name} of what measure returned", number)
-        time_s = own.pop("time_s")
-        value = _checked_value("value of what measure returned", found["value"])
-        return Reading(value, Pose(**own, height_mm=pose.height_mm), time_s, known)
+            checked_finite_number(f"{name}{_RETURNED}", number)
+        return reading
 
     @contextlib.contextmanager
     def _errors_located(self, what: str) -> Iterator[None]:
@@ -275,24 +283,16 @@ def require_measures(name: str, own: object) -> None:
     require_callable(f"measure of {name}", getattr(own, "measure", None), "a method measure(pose)")
 
 
+def _item(found: object) -> object:
+    """Return a NumPy scalar or array without dimensions as Python's own number, anything else unchanged."""
+    return found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
+
+
 def _checked_value(name: str, found: object) -> float:
-    """Return a reading as a float; NumPy scalars and arrays without dimensions are accepted."""
-    number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
+    number = _item(found)
     if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
         raise ParameterError(name, found, _A_READING)
     return float(number)
-
-
-def _checked_reading(found: Reading) -> Reading:
-    """Return an instrument's own Reading, whose value may be NaN (missing), with its covariates as floats."""
-    if math.isinf(found.value):
-        raise ParameterError(
-            "value of what measure returned", found.value, "a finite number, or nan where it is missing"
-        )
-    for name, number in (("time_s", found.time_s), *((name, getattr(found.pose, name)) for name in _OF_THE_POSE)):
-        checked_finite_number(f"{name} of what measure returned", number)
-    known = {name: _checked_covariate(name, number) for name, number in found.covariates.items()}
-    return dataclasses.replace(found, covariates=known) if known else found
 
 
 def _checked_covariate(name: object, number: object) -> float:
@@ -305,14 +305,13 @@ def _checked_covariate(name: object, number: object) -> float:
         raise ParameterError("a name in what measure returned", name, allowed)
     if not isinstance(name, str) or not name.isprintable() or name != name.strip() or not name:
         raise ParameterError("a name in what measure returned", name, "a printable text without blanks around it")
-    return _checked_covariate_value(name, number)
+    return _float_or_nan(name, number)
 
 
-def _checked_covariate_value(name: str, number: object) -> float:
-    """Return a number beside a reading as a float, NaN if missing."""
-    number = number.item() if isinstance(number, np.generic | np.ndarray) and np.ndim(number) == 0 else number
+def _float_or_nan(name: str, number: object) -> float:
+    number = _item(number)
     if not isinstance(number, Real) or math.isinf(number):
-        raise ParameterError(f"{name} of what measure returned", number, "a finite number, or nan where it is missing")
+        raise ParameterError(f"{name}{_RETURNED}", number, _OR_NAN)
     return float(number)
 
 

@@ -26,7 +26,7 @@ from probewise.calibration.fields import posterior_mean_ssf_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
-from probewise.effects import EFFECTS, Extent, LightEffect, Origin
+from probewise.effects import EFFECTS, OTHER_FORMS, Extent, LightEffect, Origin
 from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
 from probewise.effects.reference import ZERO
 from probewise.errors import FileError, ParameterError, ProbewiseError, printable, shown
@@ -100,6 +100,8 @@ class FittedSensor(NamedSamples):
         The instrument: unit, range and step of the readings, sensor, controls.
     effects
         Names of the effects in the model, in the order of their columns.
+    forms
+        By effect, which of its formulas it has (`OTHER_FORMS`); others have the vocabulary's.
     patterns
         By effect, the names of the patterns to which it is restricted; other effects act on all patterns.
     absent
@@ -129,6 +131,7 @@ class FittedSensor(NamedSamples):
     field: SSFField
     instrumentation: Instrumentation
     effects: tuple[str, ...] = ()
+    forms: Mapping[str, str] = dataclasses.field(default_factory=dict)
     patterns: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     absent: Mapping[str, BoolArray] = dataclasses.field(default_factory=dict)
     origins: Mapping[str, Origin] = dataclasses.field(default_factory=dict)
@@ -145,6 +148,9 @@ class FittedSensor(NamedSamples):
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
+        unknown = [both for both in self.forms.items() if both[0] not in self.effects or both not in OTHER_FORMS]
+        if unknown:
+            raise ParameterError("forms", unknown[0], f"effects of the model among {sorted(OTHER_FORMS)}")
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
@@ -179,7 +185,7 @@ class FittedSensor(NamedSamples):
     def _build_effect(self, name: str) -> AnyEffect:
         if name in self.patterns:
             return edge_shadow_of_patterns(edge_shadow, Extent.usual(ZERO), self.patterns[name])
-        kind = EFFECTS[name]
+        kind = OTHER_FORMS[name, self.forms[name]] if name in self.forms else EFFECTS[name]
         return kind(self.origins.get(name, ZERO)) if isinstance(kind, LightEffect) else kind()
 
     @property
@@ -238,6 +244,7 @@ class FittedSensor(NamedSamples):
             noise_sd=self.noise_sd[rows],
             field=posterior_mean_ssf_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
             effects=tuple(name for name in self.effects if name not in left_out),
+            forms={name: own for name, own in self.forms.items() if name not in left_out},
             patterns={name: own for name, own in self.patterns.items() if name not in left_out},
             origins={name: own for name, own in self.origins.items() if name not in left_out},
             absent={},
@@ -303,6 +310,7 @@ class FittedSensor(NamedSamples):
             "ssf": [asdict(quantity) for quantity in self.ssf_quantities()],
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
+            **({"forms": dict(self.forms)} if self.forms else {}),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
             "origins": {name: asdict(origin) for name, origin in self.origins.items()},
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
@@ -363,6 +371,7 @@ class FittedSensor(NamedSamples):
                 ),
                 instrumentation=_read_instrumentation(read),
                 effects=tuple(read.texts("effects")),
+                forms={name: read.text("forms", name) for name in document.get("forms", {})},
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
                 absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
                 origins={

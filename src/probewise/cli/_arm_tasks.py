@@ -138,13 +138,14 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
         raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
     say(f"reach        {geometry.sentence()}")
     say(f"field        {reached.mean():.1%} of it within reach")
+    _, farthest_mm = geometry.radii_in_reach_mm()
     for name, joint in zip(JOINTS, geometry.joints, strict=True):
-        count_mm = geometry.farthest_mm / abs(joint.counts_per_rad)
+        count_mm = farthest_mm / abs(joint.counts_per_rad)
         low, high = math.degrees(joint.low_rad), math.degrees(joint.high_rad)
         say(
             f"{name:<12} motor {'ABC'[joint.port]}, {low:g} to {high:g} degrees; "
-            f"at {geometry.farthest_mm:.0f} mm one count is {count_mm:.2f} mm, "
-            f"its play {joint.play_rad * geometry.farthest_mm:.1f} mm"
+            f"at {farthest_mm:.0f} mm one count is {count_mm:.2f} mm, "
+            f"its play {joint.play_rad * farthest_mm:.1f} mm"
         )
     if geometry.accuracy is None:
         known = "not fitted to marks: with home 2 degrees off on both links the sensor hangs up to"

@@ -79,6 +79,9 @@ form of the unknown.
 EFFECTS: Mapping[str, EffectKind] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
+OTHER_FORMS: Mapping[tuple[str, str], LightEffect] = MappingProxyType({("backlash", "of each axis"): pose.play_of_axes})
+"""Other formulas of effects in the vocabulary, by name and `Effect.form`."""
+
 PROPOSAL = "formula:"
 """Prefix of the names of formulas that are proposed for a residual which no named effect explains."""
 
@@ -111,6 +114,7 @@ __all__ = [
     "AGAIN",
     "EFFECTS",
     "NUISANCES",
+    "OTHER_FORMS",
     "PROPOSAL",
     "RARE_EFFECTS",
     "VOCABULARY",

@@ -207,6 +207,8 @@ class Effect(NamedEffect[Any]):
         Whether it looks back to earlier times of a run, which time must then not fall within.
     where
         Of a light sensor's effect: origin, scans, patterns.
+    form
+        Which of several formulas of this name it has; "" for the vocabulary's.
     source
         Function that builds one with the same `act` and `says`, by which a pickled effect finds them again.
     """
@@ -226,6 +228,7 @@ class Effect(NamedEffect[Any]):
     expression: str = ""
     needs_rising_time: bool = False
     where: Where = EVERYWHERE
+    form: str = ""
     source: Callable[[], Effect] | None = None
 
     def __reduce__(self) -> tuple[Callable[..., Effect], tuple[Any, ...]]:

@@ -30,6 +30,10 @@ class WrappedEffect(Effect[V]):
         return self.effect.stage
 
     @property
+    def form(self) -> str:
+        return getattr(self.effect, "form", "")
+
+    @property
     def prior(self) -> Prior:
         return self.effect.prior
 

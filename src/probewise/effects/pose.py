@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Poses, Stage
 
+_STILL_MM = 1e-6  # a smaller step of an axis is rounding
 _TURN_DEG = 3.0  # of a mount set by eye
 _LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
 _UNIT_MM = 10.0
@@ -63,6 +65,30 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
         ),
         positive=True,
     )
+
+
+@light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
+def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
+    """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
+
+    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
+        x, y = (theta[:, :1] / 2 * side for side in _side_of_each_axis(plan))
+        return replace(value, x_mm=value.x_mm - x, y_mm=value.y_mm - y)
+
+    return replace(cast(Effect, backlash.build(kind, of)), act=act, form="of each axis")
+
+
+def _side_of_each_axis(plan: Plan) -> FloatArray:
+    """Return the sign of each axis' last motion within the scan, (2, n_points); before the first, that of the first."""
+    sides = np.zeros((2, len(plan)))
+    for rows in plan.rows_by_scan():
+        for side, place in zip(sides, (plan.x_mm[rows], plan.y_mm[rows]), strict=True):
+            signs = np.sign(np.where(np.abs(np.diff(place)) > _STILL_MM, np.diff(place), 0.0))
+            moved = np.flatnonzero(signs)
+            if moved.size:
+                last = np.searchsorted(moved, np.arange(-1, len(signs)), side="right") - 1
+                side[rows] = signs[moved[np.maximum(last, 0)]]
+    return sides
 
 
 @light_effect("position_scale", Stage.POSE, "a wrong scale of the positions", ("place", "slope"), counts="place")

@@ -15,17 +15,15 @@ from probewise.emulator.arm import (
 )
 from probewise.emulator.bench import EmulatedBench, LightModel, Tabletop, parse_scene, set_up_bench
 from probewise.emulator.brick import Battery, Brick
-from probewise.emulator.inputs import AnalogSensor, DigitalSensor, EmptyPort, LightSensor, ultrasonic_sensor
+from probewise.emulator.inputs import EmptyPort, LightSensor, Sensor
 from probewise.emulator.motors import Motor, MotorParameters
 from probewise.emulator.protocol import Clock, VirtualClock
 from probewise.emulator.radio import Faults, Radio, Trace, VirtualLine
 
 __all__ = [
-    "AnalogSensor",
     "Battery",
     "Brick",
     "Clock",
-    "DigitalSensor",
     "EmptyPort",
     "EmulatedArm",
     "EmulatedBench",
@@ -38,6 +36,7 @@ __all__ = [
     "Motor",
     "MotorParameters",
     "Radio",
+    "Sensor",
     "SensorPose",
     "Tabletop",
     "Trace",
@@ -47,5 +46,4 @@ __all__ = [
     "read_geometry",
     "set_up_bench",
     "shipped_geometry_path",
-    "ultrasonic_sensor",
 ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise.emulator.arm import EmulatedArm, Geometry, SensorPose
 from probewise.emulator.brick import Battery, Brick
-from probewise.emulator.inputs import EmptyPort, LightSensor, Sensor, ultrasonic_sensor
+from probewise.emulator.inputs import EmptyPort, LightSensor, Sensor
 from probewise.emulator.protocol import Clock
 from probewise.emulator.radio import Faults, Radio, Trace, ignore_trace
 from probewise.errors import ParameterError
@@ -64,42 +64,25 @@ def _parse_finite(text: str) -> float:
     return value
 
 
-def _require(holds: bool) -> None:
-    if not holds:
-        raise ValueError
-
-
-def _circle(x_mm: float, y_mm: float, radius_mm: float) -> Disc:
-    _require(radius_mm > 0)
-    return Disc((x_mm, y_mm), radius_mm)
-
-
 def _ellipse(x_mm: float, y_mm: float, a_mm: float, b_mm: float, angle_deg: float) -> Oval:
-    _require(min(a_mm, b_mm) > 0)
+    if min(a_mm, b_mm) <= 0:
+        raise ValueError
     return Oval((x_mm, y_mm), (a_mm, b_mm), math.radians(angle_deg))
 
 
-def _polygon(*numbers: float) -> Polygon:
-    _require(len(numbers) >= 6)
-    return Polygon(tuple(zip(numbers[::2], numbers[1::2], strict=True)))
-
-
-def _corner(x_mm: float, y_mm: float, dx: float, dy: float) -> Quadrant:
-    _require({abs(dx), abs(dy)} == {1.0})
-    return Quadrant((x_mm, y_mm), (int(dx), int(dy)))
-
-
 def _uniform(albedo: float) -> Uniform:
-    _require(0 <= albedo <= 1)
+    if not 0 <= albedo <= 1:
+        raise ValueError
     return Uniform(albedo)
 
 
+# A pattern refuses numbers that describe none.
 _MAKERS: Mapping[str, Callable[..., Surface]] = {
-    "circle": _circle,
+    "circle": lambda x_mm, y_mm, radius_mm: Disc((x_mm, y_mm), radius_mm),
     "ellipse": _ellipse,
-    "polygon": _polygon,
+    "polygon": lambda *numbers: Polygon(tuple(zip(numbers[::2], numbers[1::2], strict=True))),
     "edge": lambda angle_deg, offset_mm: HalfPlane(math.radians(angle_deg), offset_mm),
-    "corner": _corner,
+    "corner": lambda x_mm, y_mm, dx, dy: Quadrant((x_mm, y_mm), (dx, dy)),
     "uniform": _uniform,
 }
 
@@ -178,9 +161,6 @@ def _led_brightness_at_height(height_mm: float) -> float:
     return steps * math.exp(1 - steps)
 
 
-_WALL_CM = 42
-
-
 @dataclass(frozen=True)
 class EmulatedBench:
     """The emulated bench; `arm` and `radio.brick` give access to its state."""
@@ -213,9 +193,7 @@ def set_up_bench(
     table = Tabletop(surface)
     light = LightModel(world, table, arm.sensor_pose, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
     sensors: list[Sensor] = [EmptyPort() for _ in range(4)]
-    at = geometry.sensor_port - 1
-    sensors[at] = LightSensor(light, clock)
-    sensors[0 if at == 3 else 3] = ultrasonic_sensor(_WALL_CM)
+    sensors[geometry.sensor_port - 1] = LightSensor(light, clock)
     brick = Brick(
         clock,
         motors=arm.motors(),

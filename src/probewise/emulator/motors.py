@@ -1,4 +1,4 @@
-"""Motors and the firmware's output ports, simulated in steps of a millisecond: limits, ramps, regulation, counters.
+"""Motors and the firmware's output ports, simulated in steps of a millisecond: limits, regulation, counters.
 
 The behaviour is that of LEGO's firmware 1.28 to 1.31. Important for a host:
 
@@ -69,19 +69,16 @@ class Motor:
 
 
 _ON, _BRAKE, _REGULATED = 0x01, 0x02, 0x04  # bits of the mode byte
-_SPEED, _SYNC = 0x01, 0x02  # bits of the regulation byte
+_SPEED = 0x01  # bit of the regulation byte
 _REGULATION_MS = 100
-_LEAST_RAMP_POWER = 10
 _GAIN_P, _GAIN_I, _GAIN_D = 3, 1, 1
 
 
 class RunState(IntEnum):
-    """Run state of a port."""
+    """Run state of a port; ramps, which the firmware knows too, run at once at full power here."""
 
     IDLE = 0x00
-    RAMP_UP = 0x10
     RUNNING = 0x20
-    RAMP_DOWN = 0x40
 
 
 @dataclass(frozen=True)
@@ -102,25 +99,22 @@ class OutputPort:
 
     motor: Motor = field(default_factory=Motor)
     setting: OutputSetting = field(default_factory=OutputSetting)
-    run_state: int = RunState.IDLE
+    run_state: RunState = RunState.IDLE
     tacho_count: int = 0
     block_count: int = 0
     rotation_count: int = 0
 
-    set_power: int = 0  # commanded power, the end of a ramp
-    target_power: int = 0  # current point of a ramp, the set point of the speed regulation
+    set_power: int = 0  # commanded power
+    target_power: int = 0  # the set point of the speed regulation
     power: int = 0  # power applied to the motor
     _brake: bool = False
-    _regulation: int = 0
+    _regulated: bool = False
     _goal: int = 0
     _endless: bool = True
     _clock_ms: int = 0
     _moved: int = 0  # counts since the last regulation
     _error: int = 0
     _error_sum: int = 0
-    _ramp_counts: int = 0  # counts between two steps of a ramp; 0: not computed yet
-    _ramp_from: int = 0
-    _ramp_last: int = 0
     _seen_deg: int = 0
     _settled: bool = False
 
@@ -131,14 +125,11 @@ class OutputPort:
         """Apply a command in the firmware's sequence: speed, then regulation, then limit."""
         self.setting, self._settled = setting, False
         self._brake = bool(setting.mode & _BRAKE)
-        if setting.mode & _ON:
-            self._change_run_state(setting.run_state, setting.power)
-            self._regulation = setting.regulation if setting.mode & _REGULATED else 0
-            if self._regulation & _SPEED and not self.set_power and self.run_state != RunState.RAMP_DOWN:
-                self._error = self._error_sum = 0
-        else:
-            self._change_run_state(RunState.IDLE, 0)
-            self._regulation = 0
+        on = bool(setting.mode & _ON)
+        self._change_run_state(RunState.RUNNING if on and setting.run_state else RunState.IDLE, setting.power * on)
+        self._regulated = bool(on and setting.mode & _REGULATED and setting.regulation & _SPEED)
+        if self._regulated and not self.set_power:
+            self._error = self._error_sum = 0
         self._endless = not setting.tacho_limit
         forward = (self.set_power or self.target_power) > 0
         self._goal += setting.tacho_limit if forward else -setting.tacho_limit
@@ -150,7 +141,7 @@ class OutputPort:
         return (*asked, self.tacho_count, self.block_count, self.rotation_count)
 
     def simulate_millisecond(self, battery_mv: float) -> None:
-        """Simulate a millisecond of motor and firmware, without regulation and synchronisation."""
+        """Simulate a millisecond of motor and firmware."""
         self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
         seen = self._encoder_deg
         turned, self._seen_deg = seen - self._seen_deg, seen
@@ -159,43 +150,19 @@ class OutputPort:
         self.rotation_count += turned
         self._moved += turned
         self._clock_ms += 1
-        if self.run_state == RunState.RAMP_UP:
-            self._ramp_up()
-        if self.run_state == RunState.RAMP_DOWN:
-            self._ramp_down()
         if self.run_state == RunState.RUNNING:
             self._stop_at_limit()
         if self.run_state == RunState.IDLE:
             self._fade_power()
-
-    def regulate_if_due(self) -> bool:
-        """Regulate the speed if that is due, every 101 ms; return whether it was due."""
-        if self._clock_ms <= _REGULATION_MS:
-            return False
-        if self._regulation & _SPEED:
-            before = (self.power, self._error, self._error_sum)
-            self.power = self._regulated_power(self._error - self._moved + self.target_power)
-            # A remaining error too small to overcome friction: the motor stays.
-            self._settled = not self._moved and before == (self.power, self._error, self._error_sum)
-        self._clock_ms = self._moved = 0
-        return True
+        if self._clock_ms > _REGULATION_MS:
+            self._regulate()
 
     @property
     def is_at_rest(self) -> bool:
         """Whether nothing will change without a command or a hand that turns the motor."""
         if self.motor.speed_deg_s or self.target_power or self.set_power or self._seen_deg != self._encoder_deg:
             return False
-        return self._settled and not self._moved if self._regulation else not self.power
-
-    @property
-    def is_at_limit(self) -> bool:
-        """Whether a limited run has reached its limit."""
-        return not self._endless and self.set_power != 0 and (self.tacho_count - self._goal) * self.set_power >= 0
-
-    @property
-    def is_synchronised(self) -> bool:
-        """Whether the port is set to be synchronised with another one."""
-        return self._regulation & (_SYNC | _SPEED) == _SYNC
+        return self._settled and not self._moved if self._regulated else not self.power
 
     @property
     def _encoder_deg(self) -> int:
@@ -204,90 +171,47 @@ class OutputPort:
         # degree larger on average, and every place would be off accordingly.
         return math.floor(self.motor.angle_deg + 0.5)
 
-    def _change_run_state(self, run_state: int, power: int) -> None:
+    def _change_run_state(self, run_state: RunState, power: int) -> None:
         """Enter a run state with a power; a run that already has both goes on unchanged."""
         if run_state == self.run_state != RunState.IDLE and power == self.set_power:
             return
         if not self.target_power:
             self._error = self._error_sum = self._clock_ms = self._moved = 0
-        if run_state == RunState.IDLE:
-            self._regulation = 0
-        elif run_state == RunState.RUNNING:
+        if run_state == RunState.RUNNING:
             self.set_power = self.target_power = power
             if not power:  # hold the present position
                 self.power = self._clock_ms = self._moved = 0
-        elif self._is_ramp_complete(run_state, power):
-            run_state = RunState.RUNNING
-        else:
-            self.set_power, self._ramp_counts, self._ramp_from = power, 0, self.tacho_count
         self.run_state = run_state
-
-    def _is_ramp_complete(self, ramp: int, power: int) -> bool:
-        """Return whether the port has already reached the power at the end of this ramp, up or down."""
-        if ramp == RunState.RAMP_UP:
-            return self.set_power != 0 and (self.set_power >= power if power > 0 else self.set_power <= power)
-        return self.set_power <= power if self.target_power >= 0 else self.set_power >= power
-
-    def _ramp_up(self) -> None:
-        """Raise the power in steps of 1 so that the set power is reached at the limit."""
-        sign = 1 if self.set_power > 0 else -1
-        if not self.target_power:
-            self.target_power = sign * _LEAST_RAMP_POWER
-        elif self.target_power != self.set_power:
-            if not self._ramp_counts:
-                to_go = sign * (self._goal - self._ramp_from)
-                self._ramp_counts = max(to_go // abs(self.set_power - self.target_power), 1)
-                self._ramp_last = self.tacho_count
-            if sign * (self.tacho_count - self._ramp_last) > self._ramp_counts:
-                self.target_power += sign
-                self._ramp_last = self.tacho_count
-        if sign * (self.tacho_count - self._goal) >= 0:
-            self.target_power = self.set_power
-            self.run_state = RunState.IDLE
-        self._set_unregulated_power()
-
-    def _ramp_down(self) -> None:
-        """Lower the power in steps of 1, not below 10, until the limit."""
-        sign = 1 if self.target_power > 0 else -1
-        if not self._ramp_counts:
-            steps = abs(self.target_power - self.set_power) - (0 if self.set_power else _LEAST_RAMP_POWER)
-            self._ramp_counts = max(sign * (self._goal - self.tacho_count) // max(steps, 1), 1)
-            self._ramp_last = self.tacho_count
-        if sign * (self.tacho_count - self._ramp_last) > self._ramp_counts:
-            self.target_power = sign * max(abs(self.target_power) - 1, _LEAST_RAMP_POWER)
-            self._ramp_last = self.tacho_count
-        if sign * (self.tacho_count - self._goal) >= 0:
-            if not self.set_power:
-                self.target_power = self.power = 0
-            self.run_state, self._regulation = RunState.IDLE, 0
-        self._set_unregulated_power()
 
     def _stop_at_limit(self) -> None:
         """Become idle at the limit; without a limit, let the goal follow the motor."""
         if self._endless:
             if self.target_power:
                 self._goal = self.tacho_count
-        elif self.is_at_limit and not self.is_synchronised:
-            self.run_state, self._regulation = RunState.IDLE, 0
-        self._set_unregulated_power()
-
-    def _set_unregulated_power(self) -> None:
-        if not self._regulation:
+        elif self.set_power and (self.tacho_count - self._goal) * self.set_power >= 0:
+            self.run_state, self._regulated = RunState.IDLE, False
+        if not self._regulated:
             self.power = clipped(self.target_power, 100)
 
     def _fade_power(self) -> None:
         """Reduce the power by 1 per millisecond after a limit: a host sees IDLE well before the motor rests."""
         self._brake = False
-        self.power -= _sign(self.power)
-        self.target_power -= _sign(self.target_power)
-        self.set_power -= _sign(self.set_power)
+        self.power, self.target_power, self.set_power = (
+            power - (power > 0) + (power < 0) for power in (self.power, self.target_power, self.set_power)
+        )
 
-    def _regulated_power(self, error: int) -> int:
-        """Return the power of the firmware's PID regulator for a position error in counts."""
-        steepness, self._error = error - self._error, error
-        self._error_sum = clipped(quotient_towards_zero(3 * self._error_sum + error, 4), 800)
-        wanted = clipped(_GAIN_P * error, 100) + clipped(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness
-        return clipped(quotient_towards_zero(wanted, 2), 100)
+    def _regulate(self) -> None:
+        """Set the power by the firmware's PID regulator, which acts every 101 ms."""
+        if self._regulated:
+            before = (self.power, self._error, self._error_sum)
+            error = self._error - self._moved + self.target_power
+            steepness, self._error = error - self._error, error
+            self._error_sum = clipped(quotient_towards_zero(3 * self._error_sum + error, 4), 800)
+            wanted = clipped(_GAIN_P * error, 100) + clipped(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness
+            self.power = clipped(quotient_towards_zero(wanted, 2), 100)
+            # A remaining error too small to overcome friction: the motor stays.
+            self._settled = not self._moved and before == (self.power, self._error, self._error_sum)
+        self._clock_ms = self._moved = 0
 
 
 def clipped(value: int, limit: int) -> int:
@@ -300,33 +224,9 @@ def quotient_towards_zero(value: int, by: int) -> int:
     return value // by if value >= 0 else -(-value // by)
 
 
-def _sign(value: int) -> int:
-    return (value > 0) - (value < 0)
-
-
 _ALL = 0xFF
 _TICK_S = 1e-3
 _WATCHED_TICKS = 10
-
-
-@dataclass
-class _Synchronisation:
-    """The firmware's state of a synchronised pair of motors."""
-
-    lead: int = 0  # counts by which the first is ahead of the position given by the turn ratio
-    lead_sum: int = 0
-    turn: int = 0  # difference in counts demanded by the turn ratio so far
-
-    def correct_powers(self, one: OutputPort, two: OutputPort) -> None:
-        """Slow the motor that leads and speed up the one that lags (PID gains 3, 1, 1, over 4)."""
-        inner = two if (one.setting.turn_ratio > 0) == (one.target_power >= 0) else one
-        self.turn += 2 * quotient_towards_zero(inner.setting.turn_ratio * abs(inner.target_power), 100)
-        lead = clipped(one.block_count - two.block_count + self.turn, 500)
-        self.lead_sum = clipped(self.lead_sum + lead, 900)
-        wanted = quotient_towards_zero(3 * lead + self.lead_sum + (lead - self.lead), 4)
-        self.lead = lead
-        for port, target in ((one, one.target_power - wanted), (two, two.target_power + wanted)):
-            port.power = clipped(target, abs(port.target_power) if one.setting.turn_ratio else 100)
 
 
 class OutputPorts:
@@ -339,10 +239,9 @@ class OutputPorts:
         self._watch = watch
         self.ports = tuple(OutputPort(motor) for motor in motors)
         self._ticked_s = now_s
-        self._synchronisation = _Synchronisation()
         self.commands: Mapping[int, Callable[..., bytes]] = {
             0x04: self._set_state,
-            0x06: self._get_state,
+            0x06: lambda port: struct.pack("<BbBBbBIiii", port, *self._checked_port(port).reply_fields()),
             0x0A: self._reset_counter,
         }
 
@@ -354,7 +253,8 @@ class OutputPorts:
         for number in range(n_ticks):
             if not moving:
                 return
-            self._simulate_millisecond(moving, battery_mv)
+            for port in moving:
+                port.simulate_millisecond(battery_mv)
             if number % _WATCHED_TICKS == 0:
                 self._watch()
             moving = [port for port in moving if not port.is_at_rest]  # one at rest stays there without a command
@@ -364,30 +264,10 @@ class OutputPorts:
         for port in self.ports:
             port.apply_setting(OutputSetting())
 
-    def _simulate_millisecond(self, moving: Sequence[OutputPort], battery_mv: float) -> None:
-        """Simulate a millisecond of the moving ports; a synchronised pair stops when one of them reaches its limit."""
-        for port in moving:
-            port.simulate_millisecond(battery_mv)
-        pair = [port for port in moving if port.is_synchronised][:2]
-        if len(pair) == 2 and any(port.is_at_limit for port in pair):
-            for port in pair:
-                port.run_state = RunState.IDLE
-        regulated = [port for port in moving if port.regulate_if_due()]
-        if len(pair) == 2 and pair[0] in regulated:
-            self._synchronisation.correct_powers(*pair)
-
-    def _set_state(
-        self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
-    ) -> bytes:
-        setting = OutputSetting(power, mode, regulation, turn_ratio, run_state, tacho_limit)
+    def _set_state(self, port: int, *setting: int) -> bytes:
         for output in self.ports if port == _ALL else (self._checked_port(port),):
-            output.apply_setting(setting)
-            if output.is_synchronised:
-                self._synchronisation = _Synchronisation()
+            output.apply_setting(OutputSetting(*setting))
         return b""
-
-    def _get_state(self, port: int) -> bytes:
-        return struct.pack("<BbBBbBIiii", port, *self._checked_port(port).reply_fields())
 
     def _reset_counter(self, port: int, relative: int) -> bytes:
         setattr(self._checked_port(port), "block_count" if relative else "rotation_count", 0)  # neither moves the goal

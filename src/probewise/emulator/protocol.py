@@ -45,36 +45,19 @@ class Status(IntEnum):
     """Status bytes of this brick's replies."""
 
     OK = 0x00
-    BUS_PENDING = 0x20
-    MAILBOX_EMPTY = 0x40
-    NO_MORE_HANDLES = 0x81
-    NO_SPACE = 0x82
-    END_OF_FILE = 0x85
-    FILE_NOT_FOUND = 0x87
-    HANDLE_CLOSED = 0x88
     UNDEFINED_ERROR = 0x8A
-    FILE_BUSY = 0x8B
-    FILE_FULL = 0x8E
-    FILE_EXISTS = 0x8F
-    MODULE_NOT_FOUND = 0x90
-    ILLEGAL_FILE_NAME = 0x92
-    ILLEGAL_HANDLE = 0x93
     UNKNOWN_COMMAND = 0xBE
     MALFORMED = 0xBF
     OUT_OF_RANGE = 0xC0
-    BUS_ERROR = 0xDD
     NO_ROOM = 0xDE
-    CHANNEL_NOT_READY = 0xE0
     NO_PROGRAM = 0xEC
-    ILLEGAL_SIZE = 0xED
-    ILLEGAL_MAILBOX = 0xEE
 
 
 class RefusedError(Exception):
-    """Raised to refuse a command; `payload` follows the status (None: as many zeros as the firmware sends)."""
+    """Raised to refuse a command; after the status follow as many zeros as the firmware sends."""
 
-    def __init__(self, status: Status, payload: bytes | None = None) -> None:
-        self.status, self.payload = status, payload
+    def __init__(self, status: Status) -> None:
+        self.status = status
         super().__init__(status.name)
 
 
@@ -103,47 +86,18 @@ class CommandLayout:
 COMMANDS: dict[int, CommandLayout] = {
     0x00: CommandLayout("STARTPROGRAM", "20s"),
     0x01: CommandLayout("STOPPROGRAM"),
-    0x02: CommandLayout("PLAYSOUNDFILE", "B20s"),
     0x03: CommandLayout("PLAYTONE", "HH"),
     0x04: CommandLayout("SETOUTPUTSTATE", "BbBBbBI"),
     0x05: CommandLayout("SETINPUTMODE", "BBB"),
     0x06: CommandLayout("GETOUTPUTSTATE", "B", 22),
     0x07: CommandLayout("GETINPUTVALUES", "B", 13),
-    0x08: CommandLayout("RESETINPUTSCALEDVALUE", "B"),
-    0x09: CommandLayout("MESSAGEWRITE", "BB", more=True),
     0x0A: CommandLayout("RESETMOTORPOSITION", "BB"),
     0x0B: CommandLayout("GETBATTERYLEVEL"),
-    0x0C: CommandLayout("STOPSOUNDPLAYBACK"),
     0x0D: CommandLayout("KEEPALIVE"),
-    0x0E: CommandLayout("LSGETSTATUS", "B"),
-    0x0F: CommandLayout("LSWRITE", "BBB", more=True),
-    0x10: CommandLayout("LSREAD", "B"),
     0x11: CommandLayout("GETCURRENTPROGRAMNAME", "", 20),
-    0x13: CommandLayout("MESSAGEREAD", "BBB", 61),
-    0x80: CommandLayout("OPENREAD", "20s", 5),
-    0x81: CommandLayout("OPENWRITE", "20sI", 1),
-    0x82: CommandLayout("READ", "BH", 3),
-    0x83: CommandLayout("WRITE", "B", 3, more=True),
-    0x84: CommandLayout("CLOSE", "B", 1),
-    0x85: CommandLayout("DELETE", "20s", 20),
-    0x86: CommandLayout("FINDFIRST", "20s", 25),
-    0x87: CommandLayout("FINDNEXT", "B", 25),
     0x88: CommandLayout("GETFIRMWAREVERSION"),
-    0x89: CommandLayout("OPENWRITELINEAR", "20sI", 1),
-    0x8B: CommandLayout("OPENWRITEDATA", "20sI", 1),
-    0x8C: CommandLayout("OPENAPPENDDATA", "20s", 5),
-    0x90: CommandLayout("FINDFIRSTMODULE", "20s", 31),
-    0x91: CommandLayout("FINDNEXTMODULE", "B", 31),
-    0x92: CommandLayout("CLOSEMODULE", "B", 1),
-    0x94: CommandLayout("READIOMAP", "IHH", 6),
-    0x95: CommandLayout("WRITEIOMAP", "IHH", 6, more=True),
-    0x97: CommandLayout("BOOT", "19s", 4),
-    0x98: CommandLayout("SETBRICKNAME", "", more=True),
+    0x98: CommandLayout("SETBRICKNAME", more=True),
     0x9B: CommandLayout("GETDEVICEINFO"),
-    0xA0: CommandLayout("DELETEUSERFLASH"),
-    0xA1: CommandLayout("POLLLENGTH", "B"),
-    0xA2: CommandLayout("POLL", "BB", 2),
-    0xA4: CommandLayout("BLUETOOTHFACTORYRESET"),
 }
 
 

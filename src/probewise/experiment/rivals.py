@@ -31,7 +31,7 @@ from probewise.effects import (
 )
 from probewise.effects.known import WrappedEffect
 from probewise.effects.optics import PatchPrior
-from probewise.effects.pose import backlash
+from probewise.effects.pose import play_of_axes
 from probewise.effects.reading import gain_drift
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
@@ -81,7 +81,6 @@ _POWERS_OF_S = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 _SCALE_SAYS = (
     "the arm moves {} % too far along {}, or as much too short along {}: the shape is in the arm's own lengths"
 )
-_STILL_MM = 1e-6  # a smaller step of an axis is rounding
 _CHANGE_POINT = LogUniform(0.5 * EACH_S, 100.0 * EACH_S)
 
 
@@ -233,30 +232,6 @@ SINCE_CALIBRATION = (dark_level, gain)
 
 ONLY_IN_RUNS = (*SINCE_CALIBRATION, scale_of_x, scale_of_y)
 """Effects that only a run without cards has as rivals, besides those in `ON_FIELD`."""
-
-
-@light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
-def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
-    """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
-
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        x, y = (theta[:, :1] / 2 * side for side in _side_of_each_axis(plan))
-        return replace(value, x_mm=value.x_mm - x, y_mm=value.y_mm - y)
-
-    return replace(cast(Effect, backlash.build(kind, of)), act=act)
-
-
-def _side_of_each_axis(plan: Plan) -> FloatArray:
-    """Return the sign of each axis' last motion within the scan, (2, n_points); before the first, that of the first."""
-    sides = np.zeros((2, len(plan)))
-    for rows in plan.rows_by_scan():
-        for side, place in zip(sides, (plan.x_mm[rows], plan.y_mm[rows]), strict=True):
-            signs = np.sign(np.where(np.abs(np.diff(place)) > _STILL_MM, np.diff(place), 0.0))
-            moved = np.flatnonzero(signs)
-            if moved.size:
-                last = np.searchsorted(moved, np.arange(-1, len(signs)), side="right") - 1
-                side[rows] = signs[moved[np.maximum(last, 0)]]
-    return sides
 
 
 class DescribedEffect(AnyEffect, Protocol):

@@ -66,14 +66,8 @@ def parse_json_file_text(
 
     Raises FileError if it is not strict JSON; see `parse_strict_json`.
 
-    Parameters
-    ----------
-    path, row
-        Its place, for messages; without `row`, the row of the error within the text.
-    text
-        The text.
-    allowed
-        What the file should contain, for messages.
+    `path`, `row`: its place, for messages; without `row`, the row of the error within the text; `text`: the text;
+    `allowed`: what the file should contain, for messages.
     """
     try:
         return parse_strict_json(text)

@@ -95,14 +95,8 @@ def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 
 
     Raises ParameterError if `share` is outside 0 to 1.
 
-    Parameters
-    ----------
-    plan
-        A plan in order of time.
-    rng
-        Source of randomness.
-    share
-        Largest change of an interval as a share of it, 0 to 1.
+    `plan`: A plan in order of time; `rng`: source of randomness; `share`: largest change of an interval as a share of
+    it, 0 to 1.
     """
     if not 0 <= share <= 1:
         raise ParameterError("share", share, "0 to 1")

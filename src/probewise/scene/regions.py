@@ -113,14 +113,8 @@ def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixe
 
     Returns share, 0 to 1: the cumulative of the square's projection on the normal, a trapezium.
 
-    Parameters
-    ----------
-    distance_mm
-        Signed distance of the pixel's centre from the edge, positive inside.
-    angle_rad
-        Angle between the edge's normal and a side of the square; broadcasts with the distance.
-    pixel_mm
-        Side of the square.
+    `distance_mm`: signed distance of the pixel's centre from the edge, positive inside; `angle_rad`: angle between the
+    edge's normal and a side of the square; broadcasts with the distance; `pixel_mm`: side of the square.
     """
     cosine, sine = np.abs(np.cos(angle_rad)), np.abs(np.sin(angle_rad))
     wide = 0.5 * pixel_mm * np.maximum(cosine, sine)
@@ -146,16 +140,8 @@ def share_inside_polygon(
 
     Returns share, shape (n_regions, n_points).
 
-    Parameters
-    ----------
-    edges_mm
-        Directed edges, shape (n_regions, n_edges, 2 ends, 2).
-    centers_mm
-        Centres of the pixels, shape (n_points, 2).
-    pixel_mm
-        Side of the square.
-    turn_rad
-        Angle by which each square is turned, shape (n_points,).
+    `edges_mm`: directed edges, shape (n_regions, n_edges, 2 ends, 2); `centers_mm`: centres of the pixels, shape
+    (n_points, 2); `pixel_mm`: side of the square; `turn_rad`: angle by which each square is turned, shape (n_points,).
     """
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
     total = np.zeros((len(edges_mm), len(centers_mm)))

@@ -320,15 +320,8 @@ class RegionsAndPoses:
 
     Using the layout raises ParameterError if the plan has a pattern that the regions lack.
 
-    Parameters
-    ----------
-    regions
-        Region by pattern name.
-    poses
-        True poses minus the displacement of each reading's pattern from its described place, arrays broadcasting to
-        (n_samples, n_points).
-    plan
-        Which pattern lies under each reading.
+    `regions`: region by pattern name; `poses`: true poses minus the displacement of each reading's pattern from its
+    described place, arrays broadcasting to (n_samples, n_points); `plan`: which pattern lies under each reading.
     """
 
     regions: Mapping[str, Region]
@@ -386,14 +379,8 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
 
     Returns R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
 
-    Parameters
-    ----------
-    layout
-        What lies under the sensor at each reading.
-    footprint
-        SSF in the sensor frame, arrays broadcasting to (n_samples, n_points, n_gaussians).
-    n_nodes
-        Nodes of the quadrature over curved edges.
+    `layout`: what lies under the sensor at each reading; `footprint`: SSF in the sensor frame, arrays broadcasting to
+    (n_samples, n_points, n_gaussians); `n_nodes`: nodes of the quadrature over curved edges.
     """
     out = np.zeros(
         (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
@@ -432,14 +419,8 @@ class _HypothesesByGeometry:
 
         Returns R of every hypothesis, (n_samples, n_points).
 
-        Parameters
-        ----------
-        layout
-            Layout of each geometry, repeated n_gaussians times.
-        footprint
-            Footprints of all hypotheses, with weights that are the same at every reading.
-        n_nodes
-            Nodes of the quadrature over curved edges.
+        `layout`: layout of each geometry, repeated n_gaussians times; `footprint`: footprints of all hypotheses, with
+        weights that are the same at every reading; `n_nodes`: nodes of the quadrature over curved edges.
         """
         n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
 

@@ -24,14 +24,9 @@ def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> Floa
     Returns response R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses. Raises
     ShapeError if poses and region hold different numbers of hypotheses, neither of them 1.
 
-    Parameters
-    ----------
-    region
-        Albedo field of each hypothesis (n_regions of them, n_samples or 1).
-    field
-        The discrete SSF in the sensor frame; its pixels turn with the sensor.
-    poses
-        Where the sensor stands; arrays broadcast to (n_samples, n_points).
+    `region`: albedo field of each hypothesis (n_regions of them, n_samples or 1); `field`: the discrete SSF in the
+    sensor frame; its pixels turn with the sensor; `poses`: where the sensor stands; arrays broadcast to (n_samples,
+    n_points).
     """
     x, y, turn = np.broadcast_arrays(poses.x_mm, poses.y_mm, poses.orientation_rad)
     n_poses, n_points = x.shape

@@ -100,16 +100,9 @@ def mean_albedo_under_gaussians(
 
     Returns mean albedo, shape (n_samples, n_points, n_gaussians).
 
-    Parameters
-    ----------
-    region
-        Albedo field of each hypothesis (n_regions of them, n_samples or 1).
-    x_mm, y_mm
-        Centres of the Gaussians, lab frame, broadcasting to (n_samples, n_points, n_gaussians).
-    var_x, var_y, cov_xy
-        Their covariances in the lab frame, mm^2, broadcasting likewise.
-    n_nodes
-        Nodes of the quadrature over curved edges.
+    `region`: albedo field of each hypothesis (n_regions of them, n_samples or 1); `x_mm`, `y_mm`: centres of the
+    Gaussians, lab frame, broadcasting to (n_samples, n_points, n_gaussians); `var_x`, `var_y`, `cov_xy`: their
+    covariances in the lab frame, mm^2, broadcasting likewise; `n_nodes`: nodes of the quadrature over curved edges.
     """
     arrays = np.broadcast_arrays(x_mm, y_mm, var_x, var_y, cov_xy)
     zero = np.zeros((1, 1))

@@ -215,14 +215,9 @@ def mean_ssf_field(
     Returns the mean field (paper, "logWt-weighted average of the sampled SSF fields"). Raises ShapeError if an axis has
     fewer than two pixels; ParameterError if the pixels are not evenly spaced, with one spacing for both axes.
 
-    Parameters
-    ----------
-    footprint
-        Mixtures with arrays (n_samples, 1, n_gaussians).
-    u_mm, v_mm
-        Evenly spaced pixel centres with one spacing for both axes, (n_x,) and (n_y,).
-    weights
-        Weight of each sample in the mean, (n_samples,); equal when None.
+    `footprint`: mixtures with arrays (n_samples, 1, n_gaussians); `u_mm`, `v_mm`: evenly spaced pixel centres with one
+    spacing for both axes, (n_x,) and (n_y,); `weights`: weight of each sample in the mean, (n_samples,); equal when
+    None.
     """
     if len(u_mm) < 2 or len(v_mm) < 2:
         raise ShapeError(f"u_mm has {len(u_mm)} pixels, v_mm {len(v_mm)}; allowed: 2 or more each")

@@ -31,16 +31,9 @@ _SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # smaller differences of angles (radians) 
 class StraightEdges:
     """Half-planes under the readings `rows`; each field is (n_rows,) unless stated otherwise.
 
-    Parameters
-    ----------
-    rows
-        Row indices of the readings.
-    turn_rad
-        Angle of the edge's normal in the sensor frame.
-    distance_mm
-        Signed distance of the sensor from the edge, positive inside, (1 or n_samples, n_rows).
-    inside, outside
-        Albedo on either side.
+    `rows`: row indices of the readings; `turn_rad`: angle of the edge's normal in the sensor frame; `distance_mm`:
+    signed distance of the sensor from the edge, positive inside, (1 or n_samples, n_rows); `inside`, `outside`: albedo
+    on either side.
     """
 
     rows: IntArray

@@ -20,7 +20,6 @@ from probewise.arm.nxt.motor import DriveParameters, Guard, Motor
 from probewise.arm.nxt.telegram import (
     ALL_OUTPUTS,
     BrickError,
-    Done,
     FirmwareVersion,
     GetBatteryLevel,
     GetCurrentProgramName,
@@ -93,7 +92,7 @@ class Brick:
             If the voltage is below 6 V.
         """
         for _ in range(N_ASKED):
-            before, self._last_mv = self._last_mv, self.link.ask(GetBatteryLevel()).millivolt
+            before, self._last_mv = self._last_mv, self.link.ask(GetBatteryLevel())
             if before is not None and abs(self._last_mv - before) <= STEP_MV:
                 break
         else:
@@ -112,7 +111,7 @@ class Brick:
 
     def name(self) -> str:
         """Return the brick's name."""
-        return self.link.ask(GetDeviceInfo()).brick_name
+        return self.link.ask(GetDeviceInfo())
 
     def version(self) -> FirmwareVersion:
         """Return the versions of the brick's firmware and protocol."""
@@ -121,7 +120,7 @@ class Brick:
     def running_program(self) -> str | None:
         """Return the file name of the program running on the brick, which could drive motors and sensors, or None."""
         try:
-            return self.link.ask(GetCurrentProgramName()).file
+            return self.link.ask(GetCurrentProgramName())
         except BrickError as error:
             if error.status == NO_PROGRAM:
                 return None
@@ -132,7 +131,7 @@ class Brick:
 
         First send all commands without asking for answers, which may be missing or late; then send them with answers.
         """
-        commands: list[Request[Done]] = [
+        commands: list[Request[None]] = [
             SetOutputState(ALL_OUTPUTS),
             *(light.off_command for light in self._lights.values()),
         ]

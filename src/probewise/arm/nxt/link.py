@@ -14,12 +14,11 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 from probewise.arm.instrument import Clock
 from probewise.arm.nxt.telegram import (
     LONGEST,
-    Body,
     BrickError,
     GetBatteryLevel,
     GetFirmwareVersion,
@@ -37,9 +36,9 @@ if TYPE_CHECKING:
     import serial
 
 
-A = TypeVar("A", bound=Body)
+A = TypeVar("A")
 
-FENCES: tuple[Request[Body], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
+FENCES: tuple[Request[Any], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
 UNKNOWN = -1  # a question sent by another program before this one began
 
 
@@ -158,7 +157,7 @@ class Link:
             return
         # Set first: `ask` calls this method.
         self._awake_until = self._clock.monotonic() + self._timing.keep_awake_s
-        limit_s = self.ask(KeepAlive()).limit_ms / 1000
+        limit_s = self.ask(KeepAlive()) / 1000
         if limit_s > 0:
             self._awake_until = self._clock.monotonic() + min(self._timing.keep_awake_s, limit_s / 3)
 

@@ -1,7 +1,7 @@
 """Encoding and decoding of the brick's telegrams: pure functions without input or output.
 
 A telegram is a type byte, an opcode and a body, on Bluetooth preceded by its length (`framed`). One class per command
-holds the body's fields in the order of the bytes; its `REPLY` is the class of a successful answer. Construction raises
+holds the body's fields in the order of the bytes; its `ANSWER` says what a successful answer holds. Construction raises
 ParameterError for values out of bounds, and decoding TelegramError for bytes that are not an answer. Only the commands
 that the arm needs are here.
 """
@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from types import MappingProxyType
-from typing import ClassVar, Generic, Self, TypeVar, cast
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from probewise.errors import LinkError, ParameterError
 
@@ -32,16 +32,6 @@ class Body:
     def pack(self) -> bytes:
         """Encode the fields, whole numbers."""
         return struct.pack("<" + self.LAYOUT, *(getattr(self, field.name) for field in dataclasses.fields(self)))
-
-    @classmethod
-    def unpack(cls, raw: bytes) -> Self:
-        """Decode the fields; a text ends at its first NUL and is Latin-1. TelegramError for a wrong number of bytes."""
-        try:
-            values = struct.unpack("<" + cls.LAYOUT, raw)
-        except struct.error as error:
-            size = struct.calcsize("<" + cls.LAYOUT)
-            raise TelegramError(f"{cls.__name__} has {size} bytes; there are {len(raw)}: {in_hex(raw)}") from error
-        return cls(*(v.partition(b"\0")[0].decode("latin-1") if isinstance(v, bytes) else v for v in values))
 
 
 def in_hex(raw: bytes) -> str:
@@ -83,7 +73,7 @@ class BrickError(LinkError):
         return type(self), (self.command, self.status)
 
 
-A_co = TypeVar("A_co", bound=Body, covariant=True)
+A_co = TypeVar("A_co", covariant=True)
 
 SYSTEM, REPLY, NO_REPLY = 0x01, 0x02, 0x80
 FIRST_SYSTEM_OPCODE = 0x80
@@ -132,16 +122,11 @@ class RunState(IntEnum):
 
 
 @dataclass(frozen=True)
-class Done(Body):
-    """Confirmation of a command, without content."""
-
-
-@dataclass(frozen=True)
 class Request(Body, Generic[A_co]):
-    """A command, generic in the type of a successful answer, `REPLY`."""
+    """A command, generic in the type of a successful answer: a body, the only value of `ANSWER`'s layout, or None."""
 
     OPCODE: ClassVar[int]
-    REPLY: ClassVar[type[Body]] = Done
+    ANSWER: ClassVar[type[Body] | str] = ""
     BOUNDS: ClassVar[Mapping[str, tuple[int, ...]]] = {}
     """Least and greatest value of each field, and others that are allowed: a wrong power or port moves an arm."""
 
@@ -174,14 +159,26 @@ class Request(Body, Generic[A_co]):
         # A refusal is padded with zeros, or empty: only its status matters.
         if reply.status != OK:
             raise BrickError(self.name, reply.status)
-        said = self.REPLY.unpack(reply.body)
+        layout = "<" + (self.ANSWER if isinstance(self.ANSWER, str) else self.ANSWER.LAYOUT)
+        if len(reply.body) != (size := struct.calcsize(layout)):
+            raise TelegramError(
+                f"the answer to {self.name} has {size} bytes; there are {len(reply.body)}: {in_hex(reply.body)}"
+            )
+        # A text ends at its first NUL and is Latin-1.
+        values = [
+            value.partition(b"\0")[0].decode("latin-1") if isinstance(value, bytes) else value
+            for value in struct.unpack(layout, reply.body)
+        ]
+        if isinstance(self.ANSWER, str):
+            return cast(A_co, values[0] if values else None)
+        said = self.ANSWER(*values)
         if isinstance(said, OutputState | InputValues) and said.port != getattr(self, "port", None):
             raise TelegramError(f"an answer about port {said.port} came for {self}")
         return cast(A_co, said)
 
 
 @dataclass(frozen=True)
-class SetOutputState(Request[Done]):
+class SetOutputState(Request[None]):
     """Drive a motor, or all with port 255; `limit_counts` 0 is no limit. The defaults release the motor."""
 
     OPCODE = 0x04
@@ -212,7 +209,7 @@ class SetOutputState(Request[Done]):
 
 
 @dataclass(frozen=True)
-class SetInputMode(Request[Done]):
+class SetInputMode(Request[None]):
     """Set the sensor type and the reading mode of an input."""
 
     OPCODE = 0x05
@@ -245,7 +242,7 @@ class GetOutputState(Request[OutputState]):
     """Read the state of a motor."""
 
     OPCODE = 0x06
-    REPLY = OutputState
+    ANSWER = OutputState
     LAYOUT = "B"
     BOUNDS = MappingProxyType({"port": (0, 2)})
     port: int
@@ -272,14 +269,14 @@ class GetInputValues(Request[InputValues]):
     """Read the values of an input."""
 
     OPCODE = 0x07
-    REPLY = InputValues
+    ANSWER = InputValues
     LAYOUT = "B"
     BOUNDS = MappingProxyType({"port": (0, 3)})
     port: int
 
 
 @dataclass(frozen=True)
-class ResetMotorPosition(Request[Done]):
+class ResetMotorPosition(Request[None]):
     """Set the block counter (`relative` 1) or the rotation counter (0) of a motor to 0."""
 
     OPCODE = 0x0A
@@ -290,51 +287,27 @@ class ResetMotorPosition(Request[Done]):
 
 
 @dataclass(frozen=True)
-class BatteryLevel(Body):
-    """The battery's voltage, in mV."""
-
-    LAYOUT = "H"
-    millivolt: int
-
-
-@dataclass(frozen=True)
-class GetBatteryLevel(Request[BatteryLevel]):
-    """Read the battery's voltage."""
+class GetBatteryLevel(Request[int]):
+    """Read the battery's voltage, in mV."""
 
     OPCODE = 0x0B
-    REPLY = BatteryLevel
+    ANSWER = "H"
 
 
 @dataclass(frozen=True)
-class SleepLimit(Body):
-    """Time in ms without keys or keep-alives after which the brick switches itself off; 0: never."""
-
-    LAYOUT = "I"
-    limit_ms: int
-
-
-@dataclass(frozen=True)
-class KeepAlive(Request[SleepLimit]):
-    """Reset the brick's sleep timer, which no other command does."""
+class KeepAlive(Request[int]):
+    """Reset the brick's sleep timer, which no other command does; the answer is its limit in ms, 0: never."""
 
     OPCODE = 0x0D
-    REPLY = SleepLimit
+    ANSWER = "I"
 
 
 @dataclass(frozen=True)
-class ProgramName(Body):
-    """File name of the running program."""
-
-    LAYOUT = "20s"
-    file: str
-
-
-@dataclass(frozen=True)
-class GetCurrentProgramName(Request[ProgramName]):
-    """Read the name of the running program."""
+class GetCurrentProgramName(Request[str]):
+    """Read the file name of the running program."""
 
     OPCODE = 0x11
-    REPLY = ProgramName
+    ANSWER = "20s"
 
 
 @dataclass(frozen=True)
@@ -353,23 +326,15 @@ class GetFirmwareVersion(Request[FirmwareVersion]):
     """Read the versions of protocol and firmware."""
 
     OPCODE = 0x88
-    REPLY = FirmwareVersion
+    ANSWER = FirmwareVersion
 
 
 @dataclass(frozen=True)
-class DeviceInfo(Body):
-    """Name of the brick."""
-
-    LAYOUT = "15s15x"
-    brick_name: str
-
-
-@dataclass(frozen=True)
-class GetDeviceInfo(Request[DeviceInfo]):
+class GetDeviceInfo(Request[str]):
     """Read the name of the brick."""
 
     OPCODE = 0x9B
-    REPLY = DeviceInfo
+    ANSWER = "15s15x"
 
 
 @dataclass(frozen=True)
@@ -381,7 +346,7 @@ class Reply:
     body: bytes
 
 
-def encode(request: Request[Body], *, wants_reply: bool = True) -> bytes:
+def encode(request: Request[Any], *, wants_reply: bool = True) -> bytes:
     """Encode a command as a telegram, without its length."""
     first = SYSTEM if request.OPCODE >= FIRST_SYSTEM_OPCODE else 0
     return bytes([first if wants_reply else first | NO_REPLY, request.OPCODE]) + request.pack()

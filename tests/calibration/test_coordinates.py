@@ -76,17 +76,6 @@ def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(
         assert log_density[0] == pytest.approx(expected, abs=1e-6)
 
 
-def test_nothing_is_dense_where_no_prior_is() -> None:
-    belief = prior(2, by_mass=False)
-    inside = belief.coordinates.enter(belief.from_unit_cube(np.full((1, 14), 0.4)))
-    for column, value in ((0, 1.0), (1, 50.0), (3, 12.0), (3, 1e6), (5, 9.0), (6, 0.5), (13, 100.0)):
-        outside = inside.copy()
-        outside[0, column] = value
-        theta, log_density = belief.coordinates.leave(outside)
-        assert log_density[0] == -np.inf, (column, value)
-        assert np.isfinite(theta).all() or not np.isfinite(log_density[0])
-
-
 @WHOLE
 def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole: bool) -> None:
     belief = prior(3, by_mass=True)

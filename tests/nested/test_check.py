@@ -12,8 +12,8 @@ import pytest
 from nested_sampling import hard, problems
 from scipy.special import logsumexp
 
-from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested import Check, NestedResult, SliceMove, merge, refine, run
+from probewise.errors import DoubtfulResultWarning
+from probewise.nested import Check, NestedResult, SliceMove, merge, run
 from probewise.nested.check import check_and_repeat
 from probewise.nested.sampler import run_once
 
@@ -169,11 +169,6 @@ def test_a_checked_run_is_repeated_by_its_seed_and_saved_whole(tmp_path: Path) -
     assert NestedResult.load(tmp_path / "result.npz").check == first.check
 
 
-def test_a_cost_below_the_search_itself_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"max_cost is 0\.5; allowed: 1 \(no check\) or more"):
-        quiet(problems.plateau(), max_cost=0.5)
-
-
 @pytest.mark.slow
 def test_a_bias_that_all_runs_share_is_found_when_they_are_merged() -> None:
     """Each of eight runs is off by 1.5 errors, which its own check lets pass; together they are off by four."""
@@ -201,16 +196,3 @@ def test_a_bias_that_all_runs_share_is_found_when_they_are_merged() -> None:
     without = merge([dataclasses.replace(r, check=None) for r in runs], rng=rng())
     assert without.check is None
     assert not without.warnings
-
-
-@pytest.mark.slow
-def test_a_refinement_inherits_what_speaks_against_its_run() -> None:
-    known = problems.problem("Gaussian 2-D")
-    sound = quiet(known)
-    assert refine(sound, known, rng=rng(), n_draws=1000).sound
-    doubted = dataclasses.replace(sound, warnings=("chains are too short",))
-    assert refine(doubted, known, rng=rng(), n_draws=1000).doubts == ("chains are too short",)
-    apart = dataclasses.replace(sound, log_z=sound.log_z + 6 * sound.log_z_error)
-    found = refine(apart, known, rng=rng(), n_draws=1000)
-    assert not found.sound
-    assert found.doubts[0].startswith("the run gives log Z = ")

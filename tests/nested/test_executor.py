@@ -6,7 +6,6 @@ import dataclasses
 import importlib
 import multiprocessing
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -22,7 +21,7 @@ import numpy as np
 import pytest
 from nested_sampling import problems
 
-from probewise.errors import FileError, NotConvergedError, ParameterError, ReachError
+from probewise.errors import NotConvergedError
 from probewise.nested import Evaluator, KernelMove, NestedResult, RoundSummary, SliceMove, run
 from probewise.priors import Product, Uniform
 
@@ -260,29 +259,6 @@ def test_a_problem_that_cannot_be_sent_is_told_how_to(processes: Executor) -> No
     problem = problems.Known(problems.box(2, 0, 1), lambda t: t[:, 0], 0.0)
     with pytest.raises(NotConvergedError, match=r"cannot be sent to the executor's workers .*without lambdas; or take"):
         run(problem, rng=rng(), n_live=50, executor=processes, n_workers=2)
-
-
-def test_n_workers_is_checked() -> None:
-    with pytest.raises(ParameterError, match="n_workers is 0; allowed: a whole number, 1 or more"):
-        run(problems.plateau(), rng=rng(), n_live=50, executor=AtOnce(), n_workers=0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "error",
-    [
-        ParameterError("x", 3.0, "less"),
-        ReachError("x_mm", 3.0, "less"),
-        FileError("a.csv", "nothing", "a number", row=3, column="reading"),
-        NotConvergedError("too slow", partial=3.0),
-    ],
-)
-def test_errors_come_back_from_another_process_as_they_were(error: Exception) -> None:
-    """An error that cannot be unpickled breaks a pool of processes instead of telling what happened."""
-    again = pickle.loads(pickle.dumps(error))
-    assert type(again) is type(error)
-    assert str(again) == str(error)
-    assert vars(again) == vars(error)
 
 
 INTERRUPTED = """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,9 @@ from scipy import stats
 from scipy.special import i0e
 
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
-from probewise.nested import NestedResult, SliceMove, make_problem, refine, run
+from probewise.nested import NestedResult, SliceMove, make_problem, run
 from probewise.nested.problem import Bound, Evaluator
-from probewise.priors import Joint, Normal, Product, Uniform
+from probewise.priors import Joint, Product, Uniform
 
 SD = 0.3
 LOG_Z = 2 * math.log(1 / 4)  # a unit of likelihood in a square of side 4
@@ -87,20 +86,6 @@ def test_the_evidence_under_a_normal_prior_of_scipy_is_the_convolution() -> None
     truth = stats.norm(0, math.hypot(1, SD)).logpdf(0) + stats.norm(0.5, math.hypot(2, SD)).logpdf(0)
     assert result.names == ("p0", "p1")
     assert abs(result.log_z - truth) < 3.9 * result.log_z_error
-
-
-def test_a_posed_problem_can_be_checked_and_refined() -> None:
-    problem = make_problem(many_points, {"x": stats.norm(0, 1), "y": Normal(0.0, 1.0)}, vectorized=True)
-    result = run(problem, rng=rng(), n_live=100)
-    assert result.check is not None
-    found = refine(result, problem, rng=rng(), n_draws=1000)
-    truth = 2 * stats.norm(0, math.hypot(1, SD)).logpdf(0)
-    assert abs(found.log_z - truth) < 3.9 * found.log_z_error + 1e-3
-
-
-def test_a_plain_function_is_evaluated_on_an_executor_with_the_same_result() -> None:
-    with ThreadPoolExecutor(2) as pool:
-        assert quiet(one_point, SQUARE, executor=pool, n_workers=2).log_z == quiet(one_point, SQUARE).log_z
 
 
 @pytest.mark.parametrize("kappa", [4.0, 40.0])

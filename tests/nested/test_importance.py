@@ -118,21 +118,6 @@ def test_joined_proposals_get_their_shares_of_the_draws_and_of_the_density() -> 
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
-def test_eighteen_modes_of_few_live_points_are_not_claimed() -> None:
-    """Of eggbox's modes 100 live points lose some: refined evidences either keep to their error or are doubted."""
-    known = problem("eggbox")
-    doubted = 0
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        found = refine(run(known, rng=rng, n_live=100), known, rng=rng, n_draws=2000)
-        doubted += not found.sound
-        assert not found.sound or abs(found.log_z - known.log_z) < 4 * found.log_z_error
-        assert not found.sound or found.lost > 0.05
-    assert doubted >= 1
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "n_seeds"),
     [("eggbox", 20), ("Rosenbrock 5-D", 20), ("shells 2-D", 20), ("Gaussian 10-D", 20), ("SSF 1 Gaussian", 12)],
@@ -188,27 +173,6 @@ def _line(seed: int, n: int = 6) -> Line:
 
 
 @pytest.mark.slow
-def test_three_readings_one_by_one_keep_the_evidence() -> None:
-    """Twenty seeds, three updates each, against the closed form: scatter as claimed, far sharper than the run's."""
-    after_each, sharp, fell_back = [], [], 0
-    for seed in range(20):
-        rng, whole = np.random.default_rng(seed), _line(seed)
-        start = run(whole.first(3), rng=rng, n_live=100)
-        now: NestedResult | Weighted = start
-        for n in range(4, 7):
-            part = whole.first(n)
-            now = update(now, part, rng=rng, fall_back=partial(run, part, rng=rng, n_live=100))
-            fell_back += now.run is not None
-            after_each.append((now.log_z - part.log_z) / now.log_z_error)
-        sharp.append(now.log_z_error / start.log_z_error)
-    z = np.array(after_each)
-    assert abs(z.sum()) < norm.isf(FALSE_ALARM / 2) * np.sqrt(len(z))
-    assert np.sum(z**2) < chi2.isf(FALSE_ALARM, len(z))
-    assert np.median(sharp) < 0.3
-    assert fell_back < len(z) / 10
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("n_first", [1, 3])
 def test_the_last_of_several_updates_scatters_as_claimed(n_first: int) -> None:
     """Sixty seeds, from one reading and from three up to six: mean and sd of z within what chance allows."""
@@ -244,12 +208,3 @@ def test_a_reading_that_surprises_is_inferred_from_scratch() -> None:
     assert found.sound
     assert abs(found.log_z - odd.log_z) < 4 * found.log_z_error
     assert found.n_calls > found.run.n_calls
-
-
-def test_a_mixture_of_what_was_fitted_is_whole_however_many_forms_there_are() -> None:
-    """Few samples allow one form only; its share is then all there is."""
-    rng = np.random.default_rng(5)
-    (only,) = fit_wide_and_narrow_proposals(rng.standard_normal((30, 2)), rng=rng)
-    mixed = mixture_of_proposals((only,), [0.75])
-    assert mixed.share.sum() == pytest.approx(1.0)
-    assert mixed.draw(100, rng=rng).shape == (100, 2)

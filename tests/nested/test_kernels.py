@@ -5,7 +5,6 @@ import pytest
 from scipy.stats import kstest, multivariate_normal
 
 from probewise.errors import ParameterError
-from probewise.nested import run
 from probewise.nested.moves import KernelMove, Kernels
 from probewise.nested.problem import Bound, Evaluator
 from probewise.priors import Product, Uniform
@@ -70,26 +69,6 @@ def test_the_move_leaves_the_uniform_distribution_above_a_bound(move):
     found = np.concatenate(ends)
     for of in (lambda u: np.hypot(u[:, 0] - 0.5, u[:, 1] - 0.1), lambda u: np.arctan2(u[:, 1] - 0.1, u[:, 0] - 0.5)):
         assert kstest(of(found), of(exact.u)).pvalue > 1e-6
-
-
-@pytest.mark.slow
-def test_nested_sampling_by_kernels_finds_the_evidence_of_two_unequal_modes():
-    """Three against one, in three parameters; ln Z in closed form, within four of the run's own errors."""
-
-    class Modes:
-        prior = Product({name: Uniform(-10.0, 10.0) for name in "abc"})
-
-        def log_likelihood(self, theta):
-            one = -0.5 * (((theta - 3.0) / 0.2) ** 2).sum(axis=1) + np.log(0.75)
-            two = -0.5 * (((theta + 3.0) / 0.2) ** 2).sum(axis=1) + np.log(0.25)
-            return np.logaddexp(one, two)
-
-    result = run(Modes(), rng=np.random.default_rng(5), n_live=400, move=KernelMove())
-    exact = 3 * np.log(0.2 * np.sqrt(2 * np.pi) / 20.0)
-    assert result.log_z == pytest.approx(exact, abs=4 * result.log_z_error)
-    share = result.weight[result.theta[:, 0] > 0].sum()
-    assert share == pytest.approx(0.75, abs=0.25)
-    assert result.insertion_p_value > 1e-4
 
 
 def test_where_kernels_are_wasteful_chains_take_over():

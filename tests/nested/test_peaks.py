@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from nested_sampling import hard, problems
-from scipy.special import logsumexp
 
 from probewise.nested import NestedResult, SliceMove, refine
 from probewise.nested.check import check_and_repeat
@@ -115,12 +114,6 @@ def test_where_nothing_was_missed_nothing_is_doubted_for_a_third_of_the_cost(nam
     assert missing.n_calls < run.n_calls / 3
 
 
-def test_without_evaluations_left_nothing_is_looked_for(robbed: NestedResult) -> None:
-    missing = missing_from(robbed, Two(), 5)
-    assert not missing.lost
-    assert missing.n_calls <= 5
-
-
 @pytest.mark.slow
 def test_a_spike_that_no_live_point_met_is_found_and_doubts_the_run() -> None:
     """Nine of ten such spikes are found, so that all three seeds miss theirs once in a thousand."""
@@ -160,47 +153,15 @@ def on_an_arm() -> NestedResult:
     return run_once(Cross(0.1), rng=np.random.default_rng(1), n_live=100)
 
 
-def climbed_height(run: NestedResult, problem: problems.Known | Cross) -> tuple[float, int]:
-    evaluate = Evaluator(problem)
-    top = climb_to_top(
-        gaussian_of_last_live_points(run, evaluate), evaluate, max_calls=run.n_calls, rng=np.random.default_rng(2)
-    )
-    return top.height, evaluate.n_calls
-
-
-@pytest.mark.parametrize("name", ["Gaussian 4-D", "Rosenbrock 2-D"])
-def test_the_top_of_a_smooth_peak_is_met_to_a_hundredth_of_a_nat(name: str) -> None:
-    known = problems.problem(name)
+def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
+    known = problems.problem("Rosenbrock 2-D")
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
-    height, n_calls = climbed_height(run, known)
-    best = known.log_likelihood(np.ones((1, 2)))[0] if name == "Rosenbrock 2-D" else peak_of(known)
-    assert best - 0.01 < height <= best + 1e-9
-    assert n_calls < run.n_calls / 5
-
-
-def peak_of(known: problems.Known) -> float:
-    """Newton's step from the prior's middle: exact for a Gaussian, by finite differences of unit length."""
-    n = len(known.prior.names)
-    middle = known.prior.from_unit_cube(np.full((1, n), 0.5))[0]
-    step = 1e-2 * np.eye(n)
-
-    def height(*at: np.ndarray) -> float:
-        return float(known.log_likelihood(sum(at, middle)[None])[0])
-
-    gradient = np.array([(height(e) - height(-e)) / 2e-2 for e in step])
-    curvature = np.array(
-        [[(height(a, b) - height(a, -b) - height(-a, b) + height(-a, -b)) / 4e-4 for b in step] for a in step]
-    )
-    return height(-np.linalg.solve(curvature, gradient))
-
-
-@pytest.mark.slow
-def test_along_the_arm_of_a_heavy_tail_the_draws_reach_the_middle(on_an_arm: NestedResult) -> None:
-    """The arm is a hundred times as long as wide; at its middle the log likelihood is 0."""
-    assert on_an_arm.log_likelihood.max() < -10
-    height, n_calls = climbed_height(on_an_arm, Cross(-math.inf))
-    assert height > -0.1
-    assert n_calls < 5000
+    evaluate = Evaluator(known)
+    start = gaussian_of_last_live_points(run, evaluate)
+    top = climb_to_top(start, evaluate, max_calls=run.n_calls, rng=np.random.default_rng(2))
+    best = known.log_likelihood(np.ones((1, 2)))[0]
+    assert best - 0.01 < top.height <= best + 1e-9
+    assert evaluate.n_calls < run.n_calls / 5
 
 
 @pytest.mark.slow
@@ -238,12 +199,3 @@ def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another() -> None:
     assert tally.n_evaluated > 2000
     inside = now.u[small] - 0.75
     assert abs(inside.mean() - 0.05) < 4 * 0.1 / math.sqrt(12 * inside.size)
-
-
-def test_the_mixture_s_evidence_is_one() -> None:
-    """The other route to `Two.log_z`: midpoints on a line through both modes, times the widths across it."""
-    line = np.linspace(-1, 1, 20001)
-    each = -0.5 * ((line[:, None] - np.array([-0.4, 0.5])) / 0.02) ** 2 - math.log(0.02) - 0.5 * problems.LOG_2PI
-    mass = logsumexp(each, axis=0) + math.log(line[1] - line[0])
-    total = logsumexp(4 * mass + np.log([1 - SHARE, SHARE])) - 4 * math.log(2.0)
-    assert total == pytest.approx(Two().log_z, abs=1e-6)

@@ -108,27 +108,6 @@ def test_quantiles_of_equal_weights_are_the_plain_ones(result: NestedResult) -> 
         plain.mean(lambda t: t.sum())
 
 
-def test_a_mean_field_is_the_weighted_sum_of_fields(result: NestedResult) -> None:
-    """A bump on 20 x 30 pixels about each sample."""
-    y, x = np.mgrid[-3:3:20j, -3:3:30j]
-
-    def field(theta: np.ndarray) -> np.ndarray:
-        return np.exp(-((x - theta[:, 0, None, None]) ** 2) - (y - theta[:, 1, None, None]) ** 2)
-
-    whole = result.mean(field)
-    assert whole.shape == (20, 30)
-    by_hand = sum(w * field(t[None])[0] for w, t in zip(result.weight, result.theta, strict=True))
-    assert whole == pytest.approx(by_hand, rel=1e-9)
-
-
-def test_volumes_weights_and_likelihoods_give_the_evidence(result: NestedResult) -> None:
-    """ln Z from the stored volumes by the rectangle rule, to the accuracy of that rule."""
-    edges = np.concatenate([[1.0], np.exp(result.log_volume)])
-    z = np.sum((edges[:-1] - edges[1:]) * np.exp(result.log_likelihood))
-    assert np.log(z) == pytest.approx(result.log_z, abs=0.02)
-    assert (np.diff(result.log_volume) < 0).all()
-
-
 def test_the_cost_is_counted_for_each_live_point_and_nat(result: NestedResult) -> None:
     each = result.calls_per_live_point_and_nat
     assert each * result.n_live * result.information == pytest.approx(result.n_calls)
@@ -139,28 +118,9 @@ def test_the_cost_is_counted_for_each_live_point_and_nat(result: NestedResult) -
     assert "for each" not in nothing.summary()
 
 
-def test_a_result_names_all_that_made_it(result: NestedResult) -> None:
-    assert set(result.versions) == {"probewise", "numpy", "scipy", "python"}
-    assert f"numpy {np.__version__}" in result.summary()
-    assert json.loads(result.seed_state)["bit_generator"] == "PCG64"
-    assert "of the prior" not in result.summary()
-
-
 def test_arrays_of_other_lengths_are_refused(result: NestedResult) -> None:
     for name in ("label", "birth_label", "n_at_death", "log_weight"):
         with pytest.raises(ShapeError, match=rf"{name} has shape \(1,\).*one per row of theta"):
             dataclasses.replace(result, **{name: np.ones(1, dtype=int)})
     with pytest.raises(ShapeError, match=r"insertion_n_ranked.*one per inserted point"):
         dataclasses.replace(result, insertion_n_ranked=np.ones(1, dtype=int))
-
-
-def test_the_summary_names_what_matters(result: NestedResult) -> None:
-    text = result.summary()
-    assert f"{result.log_z:.2f} ± {result.log_z_error:.2f}" in text
-    assert "p0" in text
-    assert str(result.n_calls) in text
-
-
-def test_a_result_cannot_be_changed(result: NestedResult) -> None:
-    with pytest.raises(ValueError, match="read-only"):
-        result.theta[0, 0] = 1.0

@@ -10,7 +10,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested import RemainingEvidence, diversify, merge, refine, repartitioned, run, update
+from probewise.nested import RemainingEvidence, diversify, merge, refine, run, update
+from probewise.nested.repartition import repartitioned
 from probewise.priors import Product, Uniform
 
 SQUARE = Product({"a": Uniform(-3.0, 3.0), "b": Uniform(-3.0, 3.0)})
@@ -56,13 +57,6 @@ def test_a_likelihood_that_writes_into_its_argument_changes_nothing() -> None:
     assert clean.log_z == messy.log_z
 
 
-def test_a_repartitioned_likelihood_may_write_into_its_argument() -> None:
-    theta = seeded().normal(0.0, 0.3, (50, 2))
-    asked = seeded().normal(0.0, 0.3, (5, 2))
-    clean = repartitioned(Posed(NORMAL.logpdf), theta).log_likelihood(asked.copy())
-    assert np.array_equal(repartitioned(Posed(writes), theta).log_likelihood(asked.copy()), clean)
-
-
 def test_a_batch_of_one_may_be_answered_by_a_bare_number() -> None:
     result = run(Posed(NORMAL.logpdf), rng=seeded(), n_live=30)
     assert abs(result.log_z + np.log(36.0)) < 3.9 * result.log_z_error
@@ -87,11 +81,6 @@ def test_minus_1e100_may_stand_for_impossible_in_part_of_the_prior() -> None:
 def test_a_masked_answer_is_refused_with_the_way_out() -> None:
     with pytest.raises(NotConvergedError, match=r"masked array with \d+ of 30 values masked.*filled\(-np\.inf\)"):
         run(Posed(lambda theta: np.ma.masked_less(theta[:, 0], 0.0)), rng=seeded(), n_live=30)
-
-
-def test_a_masked_array_without_a_masked_value_is_taken() -> None:
-    result = run(Posed(lambda theta: np.ma.masked_invalid(NORMAL.logpdf(theta))), rng=seeded(), n_live=30)
-    assert np.isfinite(result.log_z)
 
 
 def test_complex_numbers_are_refused() -> None:

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_t
 
 from probewise.calibration import SSFPrior, default_prior
 from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
@@ -45,7 +44,6 @@ PRIORS = {
     "SSF of three Gaussians": paper_prior(3),
     "SSF by mass": derived_prior(2),
 }
-MOMENTS = {"one": paper_prior(1), "two": paper_prior(2), "three by mass": derived_prior(3)}
 
 
 def cube(prior, n=200, seed=0):
@@ -90,49 +88,6 @@ def test_chains_step_in_the_unit_cube_where_a_prior_has_no_better(prior):
     np.testing.assert_array_equal(theta, prior.from_unit_cube(u))
     assert (log_density == 0).all()
     np.testing.assert_allclose(space.enter(theta), u, atol=1e-7)
-
-
-@pytest.mark.parametrize("prior", MOMENTS.values(), ids=MOMENTS)
-def test_moments_give_back_the_gaussians_sorted_by_mass(prior):
-    theta = prior.from_unit_cube(cube(prior))
-    n = prior.n_gaussians
-    back, _ = prior.coordinates.leave(prior.coordinates.enter(theta))
-    g = theta[:, : 6 * n].reshape(-1, n, 6)
-    mass = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
-    sorted_g = np.take_along_axis(g, np.argsort(-mass, axis=1)[..., None], axis=1)
-    np.testing.assert_allclose(back[:, : 6 * n].reshape(-1, n, 6), sorted_g, rtol=1e-7, atol=1e-9)
-    np.testing.assert_array_equal(back[:, 6 * n :], theta[:, 6 * n :])
-
-
-@pytest.mark.parametrize("prior", MOMENTS.values(), ids=MOMENTS)
-def test_the_density_over_moments_has_the_jacobian_of_finite_differences(prior):
-    """Log density over x = log N! + log density over theta + log |d theta / d x|, by central differences."""
-    n_params, step = len(prior.names), 1e-6
-    # Away from the walls, where a difference would reach over them.
-    x = prior.coordinates.enter(prior.from_unit_cube(0.1 + 0.8 * cube(prior, 20)))
-    theta, log_density = prior.coordinates.leave(x)
-    slopes = np.empty((len(x), n_params, n_params))
-    for k in range(n_params):
-        ahead, behind = x.copy(), x.copy()
-        ahead[:, k] += step
-        behind[:, k] -= step
-        slopes[:, :, k] = (prior.coordinates.leave(ahead)[0] - prior.coordinates.leave(behind)[0]) / (2 * step)
-    jacobian = np.linalg.slogdet(slopes)[1]
-    wanted = prior.log_prob(theta) + jacobian + math.lgamma(prior.n_gaussians + 1)
-    np.testing.assert_allclose(log_density, wanted, atol=1e-4)
-
-
-@pytest.mark.parametrize("prior", [paper_prior(1), paper_prior(2), derived_prior(2)], ids=["one", "two", "two by mass"])
-def test_the_folded_density_over_moments_integrates_to_one(prior):
-    """Importance sampling from a Student-t about the prior's own draws; within five standard errors."""
-    rng = np.random.default_rng(6)
-    drawn = unbounded_space_of(prior).draw(20_000, rng=rng)
-    around = multivariate_t(drawn.mean(axis=0), np.cov(drawn, rowvar=False), df=6, seed=rng)
-    x = around.rvs(150_000)
-    ratio = np.exp(prior.coordinates.leave(x)[1] - around.logpdf(x))
-    error = ratio.std() / math.sqrt(len(x))
-    assert error < 0.05
-    assert ratio.mean() == pytest.approx(1.0, abs=5 * error)
 
 
 def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():

@@ -5,7 +5,13 @@ MoG Model Parameters" and "Light Sensor SSF MoG Model": eqs. "Evidence1" and "st
 the weighted mean of sampled SSF fields.
 """
 
-from probewise.calibration.fields import choose_pixel_mm, mixture_moments, posterior_mean_ssf_field
+from probewise.calibration.fields import (
+    QuantitySummary,
+    choose_pixel_mm,
+    mixture_moments,
+    posterior_mean_ssf_field,
+    ssf_quantities,
+)
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan
 from probewise.calibration.prediction import predict
@@ -20,7 +26,6 @@ from probewise.calibration.priors import (
 )
 from probewise.calibration.search import OrderPosterior, problem_for
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
-from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
 
 __all__ = [
     "Calibration",

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested import Weighted, pareto_k
-from probewise.nested.weights import n_effective, tempering_power
+from probewise.nested.weights import n_effective, student_t_draws, student_t_log_norm, tempering_power
 from probewise.priors import Coordinates
 
 MOST_RELABELLED = 5
@@ -107,9 +107,7 @@ class _StudentTDensity:
     root: FloatArray
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
-        white = rng.standard_normal((n, len(self.mean)))
-        white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
-        return np.asarray(self.mean + white @ self.root.T)
+        return np.asarray(self.mean + student_t_draws(n, len(self.mean), _DEGREES_OF_FREEDOM, rng=rng) @ self.root.T)
 
     def square_distance(self, y: FloatArray) -> FloatArray:
         """Squared distance from the mean in units of the root, (..., d) -> (...)."""
@@ -119,8 +117,7 @@ class _StudentTDensity:
     def log_density(self, y: FloatArray) -> FloatArray:
         """Natural log of the density, (..., d) -> (...)."""
         nu, d = _DEGREES_OF_FREEDOM, len(self.mean)
-        norm = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * d * math.log(nu * math.pi)
-        norm -= float(np.log(np.diag(self.root)).sum())
+        norm = student_t_log_norm(d, nu) - float(np.log(np.diag(self.root)).sum())
         return np.asarray(norm - 0.5 * (nu + d) * np.log1p(self.square_distance(y) / nu))
 
     def refitted(self, y: FloatArray, log_weight: FloatArray) -> _StudentTDensity:

@@ -1,12 +1,12 @@
-"""The posterior mean of the spatial sensitivity function (SSF) as a field, on a grid chosen for the footprint.
+"""What a posterior says of the spatial sensitivity function (SSF): its moments, and its mean as a field.
 
-Paper, section on MoG estimation.
+Paper, section on MoG estimation: the weighted mean of sampled SSF fields.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,32 +27,25 @@ _LEAST_SHARE = 0.05
 def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray]:
     """Compute centre, widths and correlation of the whole SSF of each sample.
 
-    Parameters
-    ----------
-    theta
-        Parameters, (n_samples, at least 6 N).
-    n_gaussians
-        Order N.
-
-    Returns
-    -------
-    A dict of arrays (n_samples,): "centre x'", "centre y'" (mm), "log width along x'", "log width along y'" (natural
-    log of the sd in mm), and "correlation of x' and y'".
+    `theta` are parameters, (n_samples, at least 6 N). Return a dict of arrays (n_samples,): "centre x'", "centre y'"
+    (mm), "log width along x'", "log width along y'" (natural log of the sd in mm), and "correlation of x' and y'".
     """
-    f = _footprint_of_samples(theta, n_gaussians)
-    u, v = (f.weight * f.u_mm).sum(axis=-1), (f.weight * f.v_mm).sum(axis=-1)
-    du, dv = f.u_mm - u[..., None], f.v_mm - v[..., None]
-    var_u = (f.weight * (f.var_u + du * du)).sum(axis=-1)
-    var_v = (f.weight * (f.var_v + dv * dv)).sum(axis=-1)
-    cov = (f.weight * (f.cov_uv + du * dv)).sum(axis=-1)
-    found = {
+    u, v, var_u, var_v, cov = _moments_of_whole_footprint(footprint_of(theta[:, : 6 * n_gaussians], n_gaussians))
+    return {
         "centre x'": u,
         "centre y'": v,
         "log width along x'": np.log(var_u) / 2,
         "log width along y'": np.log(var_v) / 2,
         "correlation of x' and y'": cov / np.sqrt(var_u * var_v),
     }
-    return {name: values[:, 0] for name, values in found.items()}
+
+
+def _moments_of_whole_footprint(f: Footprint) -> tuple[FloatArray, ...]:
+    """Compute the moments of the whole mixture, (n_samples,) each: u, v, var u, var v, covariance."""
+    u, v = ((f.weight * centre).sum(axis=-1)[:, 0] for centre in (f.u_mm, f.v_mm))
+    du, dv = f.u_mm[:, 0] - u[:, None], f.v_mm[:, 0] - v[:, None]
+    spread = ((f.var_u, du * du), (f.var_v, dv * dv), (f.cov_uv, du * dv))
+    return u, v, *((f.weight[:, 0] * (own[:, 0] + off)).sum(axis=-1) for own, off in spread)
 
 
 def gaussians_sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
@@ -61,7 +54,7 @@ def gaussians_sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
     Field and predictions do not change. The prior is exchangeable, so the labels of a posterior sample are arbitrary;
     sorted by mass, means and intervals of single columns are meaningful.
     """
-    order = np.argsort(-_footprint_of_samples(theta, n_gaussians).weight[:, 0], axis=1, kind="stable")
+    order = np.argsort(-footprint_of(theta[:, : 6 * n_gaussians], n_gaussians).weight[:, 0], axis=1, kind="stable")
     out = theta.copy()
     blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
     out[:, : 6 * n_gaussians] = np.take_along_axis(blocks, order[:, :, None], axis=1).reshape(len(theta), -1)
@@ -75,16 +68,9 @@ def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> f
     over the samples), so that the sum over pixels errs by at most a thousandth of I_max - I_min; rounded down to 1,
     0.5, 0.2 or 0.1 times a power of ten.
 
-    Parameters
-    ----------
-    theta
-        Posterior samples, (n_samples, at least 6 N).
-    n_gaussians
-        Order N.
-    step_mm
-        Scan step.
+    `theta` are posterior samples, (n_samples, at least 6 N); `step_mm` is the scan step.
     """
-    f = _footprint_of_samples(theta, n_gaussians)
+    f = footprint_of(theta[:, : 6 * n_gaussians], n_gaussians)
     # The smaller eigenvalue of the covariance, as a quotient that keeps its digits.
     middle, half = (f.var_u + f.var_v) / 2, np.hypot((f.var_u - f.var_v) / 2, f.cov_uv)
     narrow = np.sqrt((f.var_u * f.var_v - f.cov_uv**2) / (middle + half))
@@ -133,30 +119,23 @@ def posterior_mean_ssf_field(
     # The samples with the last thousandth of the weight would cost most of the time and change nothing.
     order = np.argsort(-weight)
     kept = order[: int(np.searchsorted(np.cumsum(weight[order]), 0.999)) + 1]
-    f, shares = _footprint_of_samples(theta[kept], n_gaussians), weight[kept]
+    f, shares = footprint_of(theta[kept, : 6 * n_gaussians], n_gaussians), weight[kept]
     mass = shares[:, None, None] * f.weight
-    low_u, high_u = _footprint_bounds_along_axis(f.u_mm, np.sqrt(f.var_u), mass)
-    low_v, high_v = _footprint_bounds_along_axis(f.v_mm, np.sqrt(f.var_v), mass)
-    widest = max(high_u - low_u, high_v - low_v)
+    # Five sds beyond all centres, without the outermost thousandth of the mass at each end.
+    ends = [
+        (-_mass_quantile_999(_SIGMAS * sd - centre, mass), _mass_quantile_999(centre + _SIGMAS * sd, mass))
+        for centre, sd in ((f.u_mm, np.sqrt(f.var_u)), (f.v_mm, np.sqrt(f.var_v)))
+    ]
+    widest = max(high - low for low, high in ends)
     if widest / pixel_mm > max_pixels - 2:
-        pixel_mm = _rounded_up_pixel_mm(widest / (max_pixels - 2))
-    u_mm, v_mm = _pixel_centres(low_u, high_u, pixel_mm), _pixel_centres(low_v, high_v, pixel_mm)
+        wanted = widest / (max_pixels - 2)
+        decade = 10.0 ** math.floor(math.log10(wanted))
+        pixel_mm = next(k * decade for k in (1.0, 2.0, 5.0, 10.0) if k * decade >= wanted * (1 - 1e-9))
+    u_mm, v_mm = (
+        pixel_mm * np.arange(math.floor(low / pixel_mm), math.ceil(high / pixel_mm) + 1, dtype=np.float64)
+        for low, high in ends
+    )
     return replace(mean_ssf_field(f, u_mm=u_mm, v_mm=v_mm, weights=shares), pixel_mm=pixel_mm)
-
-
-def _footprint_of_samples(theta: FloatArray, n_gaussians: int) -> Footprint:
-    return footprint_of(theta[:, : 6 * n_gaussians], n_gaussians)
-
-
-def _pixel_centres(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray:
-    """Pixel centres, multiples of the pixel size, that cover `low_mm` to `high_mm`."""
-    numbers = np.arange(math.floor(low_mm / pixel_mm), math.ceil(high_mm / pixel_mm) + 1, dtype=np.float64)
-    return pixel_mm * numbers
-
-
-def _footprint_bounds_along_axis(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
-    """Return the bounds along one axis, mm: five sds beyond all centres, without the outermost 0.001 of the mass."""
-    return -_mass_quantile_999(_SIGMAS * sd - center, mass), _mass_quantile_999(center + _SIGMAS * sd, mass)
 
 
 def _mass_quantile_999(values: FloatArray, mass: FloatArray) -> float:
@@ -167,7 +146,60 @@ def _mass_quantile_999(values: FloatArray, mass: FloatArray) -> float:
     return float(flat[order][np.searchsorted(ladder, 0.999 * ladder[-1])])
 
 
-def _rounded_up_pixel_mm(pixel_mm: float) -> float:
-    """Round up to 1, 2, 5 or 10 times a power of ten."""
-    decade = 10.0 ** math.floor(math.log10(pixel_mm))
-    return float(next(s * decade for s in (1.0, 2.0, 5.0, 10.0) if s * decade >= pixel_mm * (1 - 1e-9)))
+@dataclass(frozen=True)
+class QuantitySummary:
+    """A quantity's posterior: name (ending in the unit), unit, median and central 95 % interval."""
+
+    name: str
+    unit: str
+    median: float
+    interval95: tuple[float, float]
+
+
+def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) -> tuple[QuantitySummary, ...]:
+    """Summarise the whole SSF and, if there are several, each Gaussian: medians and 95 % intervals.
+
+    In this order: `centre_u_mm` and `centre_v_mm`; `sd_long_mm` and `sd_short_mm` along the axes of the covariance;
+    `angle_deg` of the long axis from the u axis, anticlockwise, defined up to 180 degrees, with a median within 90
+    degrees of 0. Then for each Gaussian n its share of the mass, and the same five, named as "gaussian_n.share".
+
+    Parameters
+    ----------
+    samples
+        Posterior samples of the paper's parameters, (n_samples, at least 6 N).
+    n_gaussians
+        Order N.
+    each
+        Whether to summarise each of several Gaussians too.
+    """
+    f = footprint_of(samples[:, : 6 * n_gaussians], n_gaussians)
+    found = _summaries_of_sampled_moments("", *_moments_of_whole_footprint(f))
+    if n_gaussians > 1 and each:
+        for k in range(n_gaussians):
+            prefix = f"gaussian_{k + 1}."
+            own = (f.u_mm, f.v_mm, f.var_u, f.var_v, f.cov_uv)
+            found += (_quantity_of_samples(f"{prefix}share", "1", f.weight[:, 0, k]),)
+            found += _summaries_of_sampled_moments(prefix, *(values[:, 0, k] for values in own))
+    return found
+
+
+def _summaries_of_sampled_moments(
+    prefix: str, u: FloatArray, v: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
+) -> tuple[QuantitySummary, ...]:
+    middle, half = (var_u + var_v) / 2, np.hypot((var_u - var_v) / 2, cov_uv)
+    angle = 0.5 * np.arctan2(2 * cov_uv, var_u - var_v)
+    # An axis' angle is defined up to half a turn: unwrap about the mean direction.
+    about = 0.5 * np.angle(np.exp(2j * angle).mean())
+    unwrapped = about + (angle - about + np.pi / 2) % np.pi - np.pi / 2
+    return (
+        _quantity_of_samples(f"{prefix}centre_u_mm", "mm", u),
+        _quantity_of_samples(f"{prefix}centre_v_mm", "mm", v),
+        _quantity_of_samples(f"{prefix}sd_long_mm", "mm", np.sqrt(middle + half)),
+        _quantity_of_samples(f"{prefix}sd_short_mm", "mm", np.sqrt(np.maximum(middle - half, 0.0))),
+        _quantity_of_samples(f"{prefix}angle_deg", "degree", np.degrees(unwrapped)),
+    )
+
+
+def _quantity_of_samples(name: str, unit: str, values: FloatArray) -> QuantitySummary:
+    low, median, high = (float(q) for q in np.quantile(values, [0.025, 0.5, 0.975]))
+    return QuantitySummary(name, unit, median, (low, high))

@@ -29,7 +29,7 @@ from probewise.calibration.quick import fit_orders_quickly
 from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.inference import SensorProblem, sd_ceiling, sd_floor
+from probewise.inference import sd_ceiling, sd_floor
 from probewise.nested import NestedResult, StopRule, Weighted, least_live
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_patterns_described, require_recording
@@ -246,59 +246,26 @@ def _fit_order(
     pixel_mm: float | None,
     n_samples: int,
 ) -> OrderFit:
-    """Fit one order; search its prior if it is not `found` yet, with `why` among the notes.
+    """Fit one order; search its prior if it is not `found` yet, with `why` among the notes; make a sensor of it.
 
     At module level, so that another process can run it.
     """
-    recording = problems.recording
-    geometry = scan_geometry(recording)
-    n_usable = int(recording.usable.sum())
+    recording, problem, prior = problems.recording, problems.problem(n_gaussians), problems.prior_of(n_gaussians)
+    plan, usable, n_usable = recording.plan, recording.usable, int(recording.usable.sum())
     notes: tuple[str, ...] = ()
-    if n_usable < 6 * n_gaussians + 2:
-        notes = (f"{n_usable} usable readings for {6 * n_gaussians + 2} parameters: the result depends on the prior",)
+    if n_usable < len(prior.names):
+        notes = (f"{n_usable} usable readings for {len(prior.names)} parameters: the result depends on the prior",)
         warnings.warn(notes[0], DoubtfulResultWarning, stacklevel=3)
     if found is None:
         found = search(n_gaussians, rng)
-    notes = (*notes, *why)
-    sensor = _sensor_from_posterior(
-        recording,
-        problems.problem(n_gaussians),
-        found.result,
-        n_samples=n_samples,
-        pixel_mm=pixel_mm,
-        step_mm=geometry.step_mm,
-        notes=(*notes, *found.notes),
-        doubts=found.doubts,
-        rng=rng,
-    )
-    return OrderFit(n_gaussians, problems.prior_of(n_gaussians), found, sensor)
-
-
-def _sensor_from_posterior(
-    recording: Recording,
-    problem: SensorProblem,
-    result: NestedResult | Weighted,
-    *,
-    n_samples: int,
-    pixel_mm: float | None,
-    step_mm: float,
-    notes: tuple[str, ...],
-    doubts: tuple[str, ...],
-    rng: np.random.Generator,
-) -> FittedSensor:
-    """Make a fitted sensor from a posterior: its samples, noise and mean field."""
-    prior = problem.prior
-    if not isinstance(prior, SSFPrior):
-        raise ParameterError("prior", prior, "an SSFPrior")
-    n_gaussians = prior.n_gaussians
-    plan, usable = recording.plan, recording.usable
+    notes, result = (*notes, *why, *found.notes), found.result
     samples = gaussians_sorted_by_mass(result.samples(n_samples, rng=rng), n_gaussians)
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
-    pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
+    if pixel_mm is None:
+        pixel_mm = choose_pixel_mm(samples, n_gaussians, step_mm=scan_geometry(recording).step_mm)
     theta, weight = (samples, None) if isinstance(result, Weighted) else (result.theta, result.weight)
-    blind = blind_axis_rad(recording)
-    silent = _names_of_unconstrained_moments(samples, prior, rng)
+    blind, silent = blind_axis_rad(recording), _names_of_unconstrained_moments(samples, prior, rng)
     if blind is not None:
         notes = (
             *notes,
@@ -307,15 +274,14 @@ def _sensor_from_posterior(
         )
     elif silent:
         notes = (*notes, f"the recording says little about {', '.join(silent)}: there the posterior is the prior")
-    n_left_out = len(plan) - int(usable.sum())
-    if n_left_out:
-        notes = (*notes, f"{n_left_out} of {len(plan)} readings missing or out of range, left out")
-    return FittedSensor(
+    if n_usable < len(plan):
+        notes = (*notes, f"{len(plan) - n_usable} of {len(plan)} readings missing or out of range, left out")
+    sensor = FittedSensor(
         names=prior.names,
         samples=samples,
         n_gaussians=n_gaussians,
         noise_sd=draw_pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
-        field=posterior_mean_ssf_field(theta, n_gaussians, pixel_mm=pixel, weight=weight),
+        field=posterior_mean_ssf_field(theta, n_gaussians, pixel_mm=pixel_mm, weight=weight),
         instrumentation=plan.instrumentation,
         scan_noise=noise_by_scan(
             residuals, plan.scan[usable], plan.scan_names, sd_floor=floor, sd_ceiling=ceiling, rng=rng
@@ -323,8 +289,9 @@ def _sensor_from_posterior(
         fingerprint=fingerprint(recording),
         source=PurePath(recording.source).name,
         priors=prior.table_rows(),
-        notes=(*notes, *doubts),
+        notes=(*notes, *found.doubts),
     )
+    return OrderFit(n_gaussians, prior, found, sensor)
 
 
 def _names_of_unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:

@@ -134,34 +134,23 @@ class SSFPrior:
         """Map the unit cube to parameters, both (n_samples, 6 N + 2)."""
         u = checked_columns(u, self.names)
         out = np.empty(u.shape)
-        for n in range(self.n_gaussians):
-            g, x = out[:, 6 * n : 6 * n + 6], u[:, 6 * n : 6 * n + 6]
-            g[:, 0] = self.amplitude.from_unit(x[:, 0])
-            g[:, 1] = self.offset_mm.from_unit(x[:, 1])
-            g[:, 2] = self.offset_mm.from_unit(x[:, 2])
-            g[:, 3] = self.precision.from_unit(x[:, 3])
-            g[:, 4] = self.precision.from_unit(x[:, 4])
-            g[:, 5] = self.max_correlation * (2 * x[:, 5] - 1) * np.sqrt(g[:, 3] * g[:, 4])
-            g[:, 0] *= self.amplitude_at_unit_mass(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
-        out[:, -2] = self.i_min.from_unit(u[:, -2])
-        out[:, -1] = self.i_max.from_unit(u[:, -1])
+        g, x = view_by_kind_and_gaussian(out), view_by_kind_and_gaussian(u)
+        g[1:3], g[3:5] = self.offset_mm.from_unit(x[1:3]), self.precision.from_unit(x[3:5])
+        g[5] = self.max_correlation * (2 * x[5] - 1) * np.sqrt(g[3] * g[4])
+        g[0] = self.amplitude.from_unit(x[0]) * self.amplitude_at_unit_mass(g[3] * g[4] - g[5] ** 2)
+        out[:, -2], out[:, -1] = self.i_min.from_unit(u[:, -2]), self.i_max.from_unit(u[:, -1])
         return out
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map parameters to the unit cube, both (n_samples, 6 N + 2)."""
         theta = checked_columns(theta, self.names)
         out = np.empty(theta.shape)
-        for n in range(self.n_gaussians):
-            g, x = theta[:, 6 * n : 6 * n + 6], out[:, 6 * n : 6 * n + 6]
-            product = g[:, 3] * g[:, 4]
-            x[:, 0] = self.amplitude.to_unit(g[:, 0] / self.amplitude_at_unit_mass(product - g[:, 5] ** 2))
-            x[:, 1] = self.offset_mm.to_unit(g[:, 1])
-            x[:, 2] = self.offset_mm.to_unit(g[:, 2])
-            x[:, 3] = self.precision.to_unit(g[:, 3])
-            x[:, 4] = self.precision.to_unit(g[:, 4])
-            x[:, 5] = np.clip(0.5 + 0.5 * g[:, 5] / (self.max_correlation * np.sqrt(product)), 0.0, 1.0)
-        out[:, -2] = self.i_min.to_unit(theta[:, -2])
-        out[:, -1] = self.i_max.to_unit(theta[:, -1])
+        x, g = view_by_kind_and_gaussian(out), view_by_kind_and_gaussian(theta)
+        product = g[3] * g[4]
+        x[0] = self.amplitude.to_unit(g[0] / self.amplitude_at_unit_mass(product - g[5] ** 2))
+        x[1:3], x[3:5] = self.offset_mm.to_unit(g[1:3]), self.precision.to_unit(g[3:5])
+        x[5] = np.clip(0.5 + 0.5 * g[5] / (self.max_correlation * np.sqrt(product)), 0.0, 1.0)
+        out[:, -2], out[:, -1] = self.i_min.to_unit(theta[:, -2]), self.i_max.to_unit(theta[:, -1])
         return out
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
@@ -247,10 +236,7 @@ class ScanGeometry:
 def scan_geometry(recording: Recording) -> ScanGeometry:
     """Measure a recording's `ScanGeometry` from its usable rows.
 
-    Raises
-    ------
-    ParameterError
-        If no reading is usable, all are equal, the sensor never moves, or the albedo under it never changes.
+    ParameterError if no reading is usable, all are equal, the sensor never moves, or the albedo under it never changes.
     """
     plan = recording.plan
     usable = recording.usable
@@ -298,10 +284,7 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
     half of their difference to either side. The mass of each Gaussian is uniform. In directions without information,
     such as along a single edge, the posterior equals this prior.
 
-    Raises
-    ------
-    ParameterError
-        If the recording has no contrast (see `scan_geometry`) or `n_gaussians` is below 1.
+    ParameterError if the recording has no contrast (see `scan_geometry`) or `n_gaussians` is below 1.
     """
     g = scan_geometry(recording)
     reach = g.span_mm / 4
@@ -338,16 +321,10 @@ def paper_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
 
     The paper prints no bounds. (A, B, C) is uniform over the volume where A and B are within their bounds and C leaves
     the correlation within its own.
-
-    Raises
-    ------
-    ParameterError
-        See `default_prior`.
     """
     usual = default_prior(recording, n_gaussians)
     bounds = usual.precision
-    if not isinstance(bounds, LogUniform):
-        raise TypeError("default_prior spreads the precisions evenly over orders of magnitude")
+    assert isinstance(bounds, LogUniform)
     why = "with C_n, uniform over their volume, as in the paper, which prints no bounds; these are the usual ones"
     reasons = {**dict(usual.reasons), "precision": why}
     return replace(
@@ -362,10 +339,8 @@ def blind_axis_rad(recording: Recording) -> float | None:
     frame. If the normals of all usable rows agree, the recording contains no information along the
     perpendicular axis, and the posterior equals the prior there.
 
-    Returns
-    -------
-    The axis, radians anticlockwise from x', 0 to pi; `None` if there are two directions or more, a pattern of another
-    kind (but uniform ones), or no straight pattern at all.
+    Return the axis, radians anticlockwise from x', 0 to pi; None if there are two directions or more, a pattern of
+    another kind (but uniform ones), or no straight pattern at all.
     """
     plan = recording.plan
     angles: list[FloatArray] = []

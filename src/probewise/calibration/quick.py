@@ -17,10 +17,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import cast
 
 import numpy as np
-from scipy.special import gammaln
 
 from probewise._arrays import FloatArray
 from probewise.calibration.about_peaks import MOST_RELABELLED, distinct_peaks, laplace, weigh_draws_about_peaks
@@ -31,6 +29,8 @@ from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progre
 from probewise.errors import DoubtfulResultWarning
 from probewise.inference import SensorProblem
 from probewise.nested import NestedResult, Samplable, Weighted, least_live, run
+from probewise.nested.repartition import Repartitioned
+from probewise.nested.weights import student_t_draws, student_t_log_norm
 from probewise.priors import Uniform
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
@@ -89,7 +89,7 @@ class _NearPosterior:
         g[5] = np.arctanh(-drawn[5] / np.sqrt(drawn[3] * drawn[4]))
         g[0, 0] = np.log(rng.random(n)) / n_gaussians
         g[0, 1:] = np.log(-np.sort(-rng.random((n_gaussians - 1, n)), axis=0))
-        white = rng.standard_normal((n, 7)) * np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, (n, 1)))
+        white = student_t_draws(n, 7, _DEGREES_OF_FREEDOM, rng=rng)
         x[:, _WHOLE] = self.centres[rng.integers(len(self.centres), size=n)] + white @ self.root.T
         return x
 
@@ -101,8 +101,7 @@ class _NearPosterior:
         """Natural log of the density in the coordinates, (n, 6 N + 2) -> (n,)."""
         nu, n_gaussians = _DEGREES_OF_FREEDOM, self.prior.n_gaussians
         white = (x[:, None, _WHOLE] - self.centres) @ self._inverse_root.T
-        norm = gammaln((nu + 7) / 2) - gammaln(nu / 2) - 3.5 * math.log(nu * math.pi) - math.log(len(self.centres))
-        norm -= float(np.log(np.diag(self.root)).sum())
+        norm = student_t_log_norm(7, nu) - math.log(len(self.centres)) - float(np.log(np.diag(self.root)).sum())
         near = -0.5 * (nu + 7) * np.log1p(np.einsum("npk,npk->np", white, white) / nu)
         # The heaviest one's light is the greatest of N; those of the others are uniform below it, in falling order.
         g = view_by_kind_and_gaussian(x)
@@ -125,25 +124,13 @@ class _NearPosterior:
         log_density[inside] = self.log_density(x[inside])
         return theta, log_density
 
-
-@dataclass(frozen=True, eq=False)
-class _NearbyProblem:
-    """A problem of the same evidence and posterior, with a prior near that posterior."""
-
-    problem: SensorProblem
-    prior: _NearPosterior
-
     def log_prior_ratio(self, theta: FloatArray) -> FloatArray:
         """Log of the original prior's density over this one's, (n, n_params) -> (n,)."""
-        x = self.prior.space.enter(theta)
-        return self.prior.space.leave(x)[1] - self.prior.log_density(x)
-
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood plus the log of the ratio of the priors, (n, n_params) -> (n,)."""
-        return np.asarray(self.problem.log_likelihood(theta) + self.log_prior_ratio(theta))
+        x = self.space.enter(theta)
+        return self.space.leave(x)[1] - self.log_density(x)
 
 
-def _nearby(problem: SensorProblem, alone: SensorProblem, one: FloatArray, peaks: FloatArray) -> _NearbyProblem:
+def _nearby(problem: SensorProblem, alone: SensorProblem, one: FloatArray, peaks: FloatArray) -> Repartitioned:
     """Make the density of N Gaussians from the highest peak of one Gaussian, (8,), and the `peaks` of N."""
     prior = problem.prior
     assert isinstance(prior, SSFPrior)
@@ -153,10 +140,10 @@ def _nearby(problem: SensorProblem, alone: SensorProblem, one: FloatArray, peaks
     centres = space.enter(peaks)[:, _WHOLE]
     off = centres - centres.mean(axis=0)
     root = np.linalg.cholesky(_WIDENED**2 * covariance + off.T @ off / len(off))
-    return _NearbyProblem(problem, _NearPosterior(prior, space, centres, np.asarray(root)))
+    return Repartitioned(problem, _NearPosterior(prior, space, centres, np.asarray(root)))
 
 
-def _sample(nearby: _NearbyProblem, n_live: int, rng: np.random.Generator, progress: Progress | None) -> Weighted:
+def _sample(nearby: Repartitioned, n_live: int, rng: np.random.Generator, progress: Progress | None) -> Weighted:
     """Estimate evidence and posterior by nested sampling from the density near the posterior."""
     found = _run_silently(nearby, n_live, rng, progress)
     rows = np.flatnonzero(found.log_weight > -math.inf)
@@ -164,7 +151,7 @@ def _sample(nearby: _NearbyProblem, n_live: int, rng: np.random.Generator, progr
     return Weighted(
         found.names,
         theta,
-        log_likelihood=found.log_likelihood[rows] - nearby.log_prior_ratio(theta),
+        log_likelihood=found.log_likelihood[rows] - nearby.prior.log_prior_ratio(theta),
         log_weight=found.log_weight[rows],
         log_z=found.log_z,
         log_z_error=found.log_z_error,
@@ -175,15 +162,11 @@ def _sample(nearby: _NearbyProblem, n_live: int, rng: np.random.Generator, progr
     )
 
 
-def _run_silently(
-    problem: SensorProblem | _NearbyProblem, n_live: int, rng: np.random.Generator, progress: Progress | None
-) -> NestedResult:
+def _run_silently(problem: Samplable, n_live: int, rng: np.random.Generator, progress: Progress | None) -> NestedResult:
     report = None if progress is None else partial(progress, len(problem.prior.names) // 6)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # they are in the result
-        return run(
-            cast(Samplable, problem), rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False
-        )
+        return run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
 
 
 def fit_orders_quickly(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, TypeVar, cast
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,10 +23,9 @@ from probewise._posterior_samples import (
     require_masks_of_absent_effects,
 )
 from probewise._version import __version__
-from probewise.calibration.fields import posterior_mean_ssf_field
+from probewise.calibration.fields import QuantitySummary, posterior_mean_ssf_field, ssf_quantities
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
-from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
 from probewise.effects import EFFECTS, OTHER_FORMS, Extent, LightEffect, Origin
 from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
 from probewise.effects.reference import ZERO
@@ -46,8 +46,6 @@ from probewise.sensor import (
     mixture_of_field,
     mixture_parameter_names,
 )
-
-T = TypeVar("T")
 
 FORMAT = "sensor/1"
 _ALLOWED = "a sensor.json as `probewise calibrate` writes"
@@ -356,45 +354,33 @@ class FittedSensor(NamedSamples):
             raise FileError(
                 path, f"format {shown(found)}", f"{FORMAT!r}; calibrate the recording anew with this version"
             )
-        read = _Reader(path, document)
-        samples = read.array("samples", ndim=2)
+        read = _read(path, {"forms": {}, "patterns": {}, "absent": {}, "origins": {}} | document, _FORM)
+        samples, field = read["samples"], read["field"]
         try:
-            sensor = cls(
-                names=tuple(_text_of_item(read, p, "name", "parameters") for p in read.objects("parameters")),
+            u_mm, v_mm = field["origin_mm"]
+            return cls(
+                names=tuple(each["name"] for each in read["parameters"]),
                 samples=samples,
-                n_gaussians=read.whole_number("n_gaussians"),
-                noise_sd=read.array("noise", "sd", ndim=1),
-                field=SSFField(
-                    read.array("field", "values", ndim=2),
-                    read.number("field", "pixel_mm"),
-                    _checked_pair(read.array("field", "origin_mm", ndim=1), read),
-                ),
-                instrumentation=_read_instrumentation(read),
-                effects=tuple(read.texts("effects")),
-                forms={name: read.text("forms", name) for name in document.get("forms", {})},
-                patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
-                absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
-                origins={
-                    name: Origin(**{key: read.number("origins", name, key) for key in read.value("origins", name)})
-                    for name in document.get("origins", {})
-                },
-                scan_noise=tuple(
-                    _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.objects("noise", "scans")
-                ),
-                fingerprint=read.text("recording", "fingerprint"),
-                source=read.text("recording", "source"),
-                orders=tuple(_dataclass_of_item(read, OrderEvidence, o, "orders") for o in read.objects("orders")),
-                priors=tuple(_dataclass_of_item(read, PriorRow, p, "priors") for p in read.objects("priors")),
-                notes=tuple(read.texts("notes")),
-                version=read.text("version"),
+                n_gaussians=read["n_gaussians"],
+                noise_sd=read["noise"]["sd"],
+                field=SSFField(field["values"], field["pixel_mm"], (float(u_mm), float(v_mm))),
+                instrumentation=Instrumentation(**read["instrumentation"]),
+                effects=read["effects"],
+                forms=read["forms"],
+                patterns=read["patterns"],
+                absent={name: _mask_of_rows(rows, len(samples)) for name, rows in read["absent"].items()},
+                origins={name: Origin(**place) for name, place in read["origins"].items()},
+                scan_noise=tuple(ScanNoise(**each) for each in read["noise"]["scans"]),
+                **read["recording"],
+                orders=tuple(OrderEvidence(**each) for each in read["orders"]),
+                priors=tuple(PriorRow(**each) for each in read["priors"]),
+                notes=read["notes"],
+                version=read["version"],
             )
-        except FileError:
-            raise
         except (ProbewiseError, ValueError, TypeError) as error:
             raise FileError(
                 path, f"inconsistent contents ({error})", "an undamaged sensor.json; calibrate the recording anew"
             ) from error
-        return sensor
 
     def unit_of_parameter(self, name: str) -> str:
         """Return the unit of a parameter, by its name; "" where it is unknown."""
@@ -456,110 +442,69 @@ def _precision_determinants(samples: FloatArray, n_gaussians: int) -> FloatArray
     return np.where(a > 0, a * b - c * c, -np.inf)
 
 
-class _Reader:
-    """Reads typed values of a parsed document by their keys; FileError names the file and the entry if one is wrong."""
-
-    def __init__(self, path: object, document: Mapping[str, Any]) -> None:
-        self.path, self.document = path, document
-
-    def value(self, *keys: str) -> Any:
-        at: Any = self.document
-        for key in keys:
-            if not isinstance(at, dict) or key not in at:
-                raise FileError(self.path, f"no {'.'.join(keys)}", "every entry that `probewise calibrate` writes")
-            at = at[key]
-        return at
-
-    def error_for(self, place: str, found: object, allowed: str) -> FileError:
-        return FileError(self.path, f"{place} is {shown(found)}", allowed)
-
-    def text(self, *keys: str) -> str:
-        found = self.value(*keys)
-        if not isinstance(found, str):
-            raise self.error_for(".".join(keys), found, "a text")
-        return found
-
-    def texts(self, *keys: str) -> list[str]:
-        found = self.value(*keys)
-        if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
-            raise self.error_for(".".join(keys), found, "a list of texts")
-        return found
-
-    def objects(self, *keys: str) -> list[dict[str, Any]]:
-        found = self.value(*keys)
-        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            raise self.error_for(".".join(keys), found, "a list of objects")
-        return found
-
-    def number(self, *keys: str) -> float:
-        found = self.value(*keys)
-        if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
-            raise self.error_for(".".join(keys), found, "a finite number")
-        return float(found)
-
-    def whole_number(self, *keys: str) -> int:
-        found = self.value(*keys)
-        if isinstance(found, bool) or not isinstance(found, int):
-            raise self.error_for(".".join(keys), found, "a whole number")
-        return found
-
-    def array(self, *keys: str, ndim: int) -> FloatArray:
-        found = self.value(*keys)
-        try:
-            array = np.array(found, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise self.error_for(".".join(keys), found, f"numbers in {ndim} equal dimensions") from error
-        if array.ndim != ndim or not np.isfinite(array).all():
-            raise self.error_for(".".join(keys), found, f"finite numbers in {ndim} equal dimensions")
-        return array
-
-    def mask(self, n: int, *keys: str) -> BoolArray:
-        """Read a list of row numbers as a mask, (n,)."""
-        found = self.array(*keys, ndim=1)
-        if not np.isin(found, np.arange(n)).all():
-            raise self.error_for(".".join(keys), found.tolist(), f"whole numbers from 0 to {n - 1}")
-        out = np.zeros(n, dtype=np.bool_)
-        out[found.astype(np.int64)] = True
-        return out
+_NUMBERS, _ROWS = 1, 2  # forms of arrays, by their dimensions
+_FORM = {
+    "version": str,
+    "recording": {"fingerprint": str, "source": str},
+    "instrumentation": {
+        **dict.fromkeys(("unit", "sensor", "description"), str),
+        **dict.fromkeys(("min", "max", "step", "height_mm"), None),
+        "controls": [str],
+    },
+    "n_gaussians": int,
+    "parameters": [{"name": str}],
+    "effects": [str],
+    "forms": {...: str},
+    "patterns": {...: [str]},
+    "origins": {...: {...: float}},
+    "absent": {...: _NUMBERS},
+    "noise": {"sd": _NUMBERS, "scans": [{"scan": str, "n_readings": int, "mean": float, "sd": float}]},
+    "orders": [{"n_gaussians": int, "log_z": float, "log_z_error": float}],
+    "priors": [dict.fromkeys(("parameter", "unit", "distribution", "reason"), str)],
+    "notes": [str],
+    "field": {"pixel_mm": float, "origin_mm": _NUMBERS, "values": _ROWS},
+    "samples": _ROWS,
+}
+"""What a sensor.json must hold: objects by key (`...`: any), lists, arrays, texts, numbers; None: a number or null."""
 
 
-def _text_of_item(read: _Reader, item: Mapping[str, Any], key: str, place: str) -> str:
-    found = item.get(key)
-    if not isinstance(found, str):
-        raise read.error_for(f"{place}.{key}", found, "a text")
-    return found
+def _read(path: object, value: Any, form: Any, place: str = "") -> Any:
+    """Return what a parsed document holds of `form`; FileError names the first place that differs."""
+    if isinstance(form, dict):
+        if isinstance(value, dict):
+            keys = value if ... in form else form
+            missing = [key for key in keys if key not in value]
+            if missing:
+                lacking = f"{place}{'.' if place else ''}{missing[0]}"
+                raise FileError(path, f"no {lacking}", "every entry that `probewise calibrate` writes")
+            places = {key: f"{place}{'.' if place else ''}{key}" for key in keys}
+            return {key: _read(path, value[key], form.get(key, form.get(...)), at) for key, at in places.items()}
+        allowed = "an object"
+    elif isinstance(form, list):
+        if isinstance(value, list):
+            return tuple(_read(path, each, form[0], place) for each in value)
+        allowed = "a list"
+    elif form in (_NUMBERS, _ROWS):
+        allowed = f"finite numbers in {form} equal dimensions"
+        with contextlib.suppress(TypeError, ValueError):
+            array = np.array(value, dtype=np.float64)
+            if array.ndim == form and np.isfinite(array).all():
+                return array
+    elif form in (str, int):
+        allowed = "a text" if form is str else "a whole number"
+        if isinstance(value, form) and not isinstance(value, bool):
+            return value
+    else:
+        allowed = "a finite number"
+        if form is None and value is None:
+            return None
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    raise FileError(path, f"{place} is {shown(value)}", allowed)
 
 
-def _checked_pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
-    if values.shape != (2,):
-        raise read.error_for("field.origin_mm", values.tolist(), "two numbers")
-    return float(values[0]), float(values[1])
-
-
-def _dataclass_of_item(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -> T:
-    """Build a dataclass of texts, numbers and counts from a JSON object; FileError if a value has a wrong type."""
-    kinds: dict[str, type | tuple[type, ...]] = {"str": str, "int": int, "float": (int, float)}
-    values: dict[str, object] = {}
-    for field in fields(kind):  # type: ignore[arg-type]
-        found = item.get(field.name)
-        wrong = isinstance(found, bool) or not isinstance(found, kinds[str(field.type)])
-        if wrong or (isinstance(found, int | float) and not math.isfinite(found)):
-            raise read.error_for(f"{place}.{field.name}", found, f"a value of kind {field.type}")
-        values[field.name] = found
-    return kind(**values)
-
-
-def _read_instrumentation(read: _Reader) -> Instrumentation:
-    def optional_number(key: str) -> float | None:
-        return None if read.value("instrumentation", key) is None else read.number("instrumentation", key)
-
-    return Instrumentation(
-        unit=read.text("instrumentation", "unit"),
-        min=optional_number("min"),
-        max=optional_number("max"),
-        step=optional_number("step"),
-        sensor=read.text("instrumentation", "sensor"),
-        height_mm=optional_number("height_mm"),
-        controls=tuple(read.texts("instrumentation", "controls")),
-        description=read.text("instrumentation", "description"),
-    )
+def _mask_of_rows(rows: FloatArray, n: int) -> BoolArray:
+    """Convert the numbers of rows to a mask, (n,)."""
+    if not np.isin(rows, np.arange(n)).all():
+        raise ParameterError("absent", rows.tolist(), f"whole numbers from 0 to {n - 1}")
+    return np.isin(np.arange(n), rows)

@@ -27,6 +27,7 @@ from probewise.diagnosis.simulator_fit import log_evidence_of, modes_of
 from probewise.diagnosis.simulator_posterior import NUMBERS, Draws, ProblemInBlocks, draw_by_importance
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested.repartition import repartitioned
 from probewise.nested.weights import resampled_rows
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
@@ -315,7 +316,7 @@ def _nested_sampling(
     """Compute the evidence by nested sampling; of a law, from a prior near the samples, which takes fewer calls."""
     method, target = "nested sampling", cast(nested.Samplable, problem)
     if problem.model.sensor.predicts_cheaply_nearby:
-        method, target = "nested sampling near the posterior", nested.repartitioned(problem, z)
+        method, target = "nested sampling near the posterior", repartitioned(problem, z)
 
     def report_round(state: nested.RoundSummary) -> None:
         to_come = state.log_ratio_remaining

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit
@@ -21,7 +21,13 @@ from probewise.diagnosis.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.simulator_fit import log_evidence_of
 from probewise.nested import pareto_k
-from probewise.nested.weights import n_effective, resampled_rows, tempering_power
+from probewise.nested.weights import (
+    n_effective,
+    resampled_rows,
+    student_t_draws,
+    student_t_log_norm,
+    tempering_power,
+)
 from probewise.progress import Progress
 
 NUMBERS = 4_000_000
@@ -123,15 +129,15 @@ class _Kernels:
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         which = rng.choice(len(self.share), n, p=self.share)
-        white = rng.standard_normal((n, self.mean.shape[1]))
-        white *= np.sqrt(self.degrees_of_freedom / rng.chisquare(self.degrees_of_freedom, (n, 1)))
+        white = student_t_draws(n, self.mean.shape[1], self.degrees_of_freedom, rng=rng)
         root = np.linalg.inv(self.lower).transpose(0, 2, 1)
         return np.asarray(self.mean[which] + np.einsum("nij,nj->ni", root[which], white))
 
     def log_density(self, z: FloatArray) -> FloatArray:
         n_params, nu = z.shape[1], self.degrees_of_freedom
-        norm = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
-        norm = norm + np.log(self.share) + np.log(np.einsum("kpp->kp", self.lower)).sum(axis=1)
+        norm = (
+            student_t_log_norm(n_params, nu) + np.log(self.share) + np.log(np.einsum("kpp->kp", self.lower)).sum(axis=1)
+        )
         blocks = np.array_split(z, max(len(z) * self.mean.size // NUMBERS, 1))
         squares = (np.sum(((block - self.mean[:, None]) @ self.lower) ** 2, axis=2) for block in blocks)
         each = (norm[:, None] - 0.5 * (nu + n_params) * np.log1p(square / nu) for square in squares)

@@ -11,7 +11,6 @@ from probewise.nested.merge import merge
 from probewise.nested.moves import KernelMove, Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import Bound, Evaluator, FunctionProblem, Points, Samplable, make_problem
 from probewise.nested.refine import refine, update
-from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult, Samples
 from probewise.nested.sampler import (
     LIVE_PER_PARAM,
@@ -41,7 +40,6 @@ __all__ = [
     "Points",
     "PriorRejection",
     "RemainingEvidence",
-    "Repartitioned",
     "RoundSummary",
     "Samplable",
     "Samples",
@@ -55,7 +53,6 @@ __all__ = [
     "merge",
     "pareto_k",
     "refine",
-    "repartitioned",
     "run",
     "update",
 ]

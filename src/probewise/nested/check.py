@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -45,22 +44,15 @@ _MET = 0.5  # of the share of a part: with more, a run has met it
 _MATTERS = 0.25  # errors by which a lost part raises log Z, above which the run is repeated
 _MISSING = 1.0  # the same, above which it is a doubt
 
-
-class SingleRunFunction(Protocol):
-    """A function that runs nested sampling once, without a check; it raises NotConvergedError as `run` does."""
-
-    def __call__(
-        self, problem: Samplable, *, n_live: int, move: Move, max_calls: int | None, rng: np.random.Generator
-    ) -> NestedResult:
-        """Run nested sampling on the problem."""
-        ...
+Search = Callable[..., NestedResult]
+"""Function that runs nested sampling once, without a check, as `run_once` does."""
 
 
 @dataclass
 class _Budget:
     """The likelihood evaluations of a check, the first run's included: at most `limit` in all, `spent` so far."""
 
-    search: SingleRunFunction
+    search: Search
     limit: float
     spent: int
     rng: np.random.Generator
@@ -101,7 +93,6 @@ class _SecondEstimate:
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
     def disagrees_or_is_doubtful(self, run: NestedResult, most: float) -> bool:
-        """Return whether a run is more than `most` errors away, or the last run of this estimate has warnings."""
         return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
 
 
@@ -166,7 +157,7 @@ def check_and_repeat(
     first: NestedResult,
     problem: Samplable,
     move: Move,
-    search: SingleRunFunction,
+    search: Search,
     *,
     max_cost: float,
     max_calls: int | None,
@@ -177,9 +168,9 @@ def check_and_repeat(
 ) -> NestedResult:
     """Check a run that its stopping rule ended; repeat it with longer chains where the second estimate disagrees.
 
-    `search` runs nested sampling once, without a check. Limits on all evaluations, those of `first` included:
-    `max_cost` times those of `first`, and `max_calls`, if not None. `least_live`: fewest live points allowed for the
-    problem. `executor` and `n_workers` are for the search of missed peaks; `search` brings its own.
+    Limits on all evaluations, those of `first` included: `max_cost` times those of `first`, and `max_calls`, if not
+    None. `least_live`: fewest live points allowed for the problem. `executor` and `n_workers` are for the search of
+    missed peaks; `search` brings its own.
 
     Return the first run, or a repetition: with hops between modes where `first` lost one, or with longer chains if only
     that agrees with the second estimate. `check` holds the second estimate; None if it failed or did not end, which
@@ -187,8 +178,8 @@ def check_and_repeat(
     """
     limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
     budget = _Budget(search, limit, first.n_calls, rng)
-    now, notes = first, tuple[str, ...]()
-    longer = _with_longer_chains(move)
+    now, longer = first, _with_longer_chains(move)
+    notes: tuple[str, ...]
     try:
         peaks = find_missed_peaks(
             first, problem, max_calls=budget.left, rng=rng, executor=executor, n_workers=n_workers
@@ -210,8 +201,8 @@ def check_and_repeat(
             lost, above = parts.missing_shares(first)
             if _rise_in_errors(first, lost) > _MATTERS:
                 modes = parts.modes
-                again = budget.run(problem, first.n_live, move if isinstance(move, SliceMove) else SliceMove(), modes)
-                now = first if again is None else again
+                chain = move if isinstance(move, SliceMove) else SliceMove()
+                now = budget.run(problem, first.n_live, chain, modes) or first
         # Neither chains nor hops lead to a peak above the end.
         if _rise_in_errors(now, above) <= DISAGREE:
             if second.disagrees_or_is_doubtful(now, _APART):
@@ -231,7 +222,7 @@ def check_and_repeat(
 
 
 def doubts_of_missed_parts(
-    run: NestedResult, judged: Samples, problem: Samplable, search: SingleRunFunction, *, rng: np.random.Generator
+    run: NestedResult, judged: Samples, problem: Samplable, search: Search, *, rng: np.random.Generator
 ) -> tuple[tuple[str, ...], int]:
     """Look for parts of the posterior that a run has missed; weigh any by a second estimate with a part about each.
 
@@ -275,10 +266,9 @@ def _plan_second_estimate(
 def _with_more_live_points(
     second: _SecondEstimate, now: NestedResult, first: NestedResult, chain: SliceMove, budget: _Budget
 ) -> _SecondEstimate:
-    """Repeat a second estimate with more live points, at most as many as `now` has, and combine the two runs.
+    """Repeat a second estimate with more live points, as many as `now` has or the budget allows; combine the two runs.
 
-    Where the first run of the estimate has warnings, the new one replaces it. If the budget does not allow more live
-    points, the estimate is returned as it was.
+    The new run replaces a first one with warnings.
     """
     again_costs = _AGAIN * first.n_calls
     room = budget.left - again_costs if budget.left > again_costs else budget.left
@@ -302,6 +292,7 @@ def _with_longer_chains(move: Move) -> SliceMove:
 
 def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
     """Return the inverse-variance weighted mean of independent estimates of log Z, and its error."""
+    # A constant likelihood has an exact evidence: the error is nought, or a last digit.
     weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 

@@ -69,16 +69,10 @@ def integrate(
 ) -> Evidence:
     """Estimate the evidence: sum the likelihood over the shells of prior volume between successive deaths.
 
-    Parameters
-    ----------
-    log_likelihood
-        Log likelihoods of the dead points in order of death, the last live points included, (n_dead,).
-    n_at_death
-        Number of points alive when each died, itself included, (n_dead,).
-    rng
-        Source of randomness for the `spread` of log Z: its sd over 200 draws of the shrinkages t = Beta(n, 1).
-    log_start, log_start_error
-        Log of the prior's share with a likelihood above zero, and its standard error.
+    `log_likelihood` of the dead points in order of death, the last live points included; `n_at_death`: number of points
+    alive when each died, itself included, (n_dead,) both. `rng` draws 200 times the shrinkages t = Beta(n, 1), for the
+    `spread` of log Z. `log_start`, `log_start_error`: log of the prior's share with a likelihood above zero, and its
+    standard error.
     """
     log_x = log_volumes(n_at_death, log_start)
     log_shell = _log_shell_volumes(np.concatenate([[log_start], log_x]))
@@ -174,73 +168,48 @@ def relative_lineage_variance(
     the run are less noisy but miss the correlations that began before them. The two are extrapolated linearly in the
     inverse window length to the whole run.
 
-    Parameters
-    ----------
-    parent
-        Row of each point's parent; -1 for draws from the whole prior, (n_dead,). Rows are in order of death.
-    birth_row
-        Row of the dead point above whose level each point was drawn; -1 at the start, (n_dead,).
-    n_at_death
-        Number of points alive when each died, itself included, (n_dead,).
-    log_weight
-        Natural log of each point's share of the evidence, (n_dead,).
+    `parent`: row of each point's parent, -1 for draws from the whole prior; rows are in order of death. `birth_row`:
+    row of the dead point above whose level each was drawn, -1 at the start. `n_at_death`: number of points alive when
+    each died, itself included. `log_weight`: log of each point's share of the evidence. All (n_dead,).
 
-    Returns
-    -------
-    The ratio of variances, 1 or more; 1 for a run of fewer than 17 rounds, too short for an estimate.
+    Return the ratio of variances, 1 or more; 1 for a run of fewer than 17 rounds, too short for an estimate.
     """
-    genealogy = _Genealogy(parent, birth_row, n_at_death, log_weight)
+    weight = np.exp(log_weight)
+    left = np.append(np.cumsum(weight[::-1])[::-1], 0.0)  # evidence from each row on
+    from_shrinkage = np.concatenate([[0.0], np.cumsum((left[:-1] / n_at_death) ** 2)])
+    births = np.sort(birth_row)
+    # Just after a round as many points are alive as at the next death.
+    n_alive = n_at_death[np.minimum(births + 1, len(n_at_death) - 1)]
+    by_chance = np.concatenate([[0.0], np.cumsum(2.0 * (left[births + 1] / n_alive) ** 2)])
+    rows = np.arange(len(parent))
+
+    def excess_and_shrinkage_variance(first: int, last: int) -> tuple[float, float]:
+        """Trace the lineages of the points alive at row `last`, which share the evidence beyond it, to row `first`."""
+        row = np.flatnonzero((rows > first) & (birth_row <= last))
+        ancestor = row.copy()
+        while (young := birth_row[ancestor] > first).any():
+            ancestor[young] = parent[ancestor[young]]
+        alive = row > last
+        part = np.where(alive, left[last + 1] / max(int(alive.sum()), 1), weight[row])
+        whole = float(part.sum())
+        share = np.bincount(ancestor, part) / whole
+        alone = 1.0 / int(n_at_death[first + 1])  # two draws of the same point
+        met = -math.log(max(1.0 - float(share @ share), 1e-12)) - alone
+        born = np.searchsorted(births, [first, last], side="right")
+        chance = float(by_chance[born[1]] - by_chance[born[0]])
+        return met * whole**2 - chance, float(from_shrinkage[last + 1] - from_shrinkage[first + 1])
+
+    def from_windows(lag: int) -> float:
+        starts = np.unique(np.linspace(0, n_rounds - lag, _MOST_WINDOWS).astype(int))
+        windows = [excess_and_shrinkage_variance(ends[i], ends[i + lag]) for i in starts]
+        excess, own = np.array(windows).sum(axis=0)
+        return 1.0 + float(excess / own)
+
     ends = np.unique(birth_row)  # of rounds
     n_rounds = len(ends) - 1
     if n_rounds // 4 < _LEAST_LAG:
         return 1.0
-    half, quarter = (genealogy.relative_variance_from_windows(ends, n_rounds // part) for part in (2, 4))
-    return max(1.0, 1.5 * half - 0.5 * quarter)
-
-
-class _Genealogy:
-    """Births, deaths and weights of a run's points, for tracing lineages between the ends of any two rounds."""
-
-    def __init__(self, parent: IntArray, birth_row: IntArray, n_at_death: IntArray, log_weight: FloatArray) -> None:
-        self._parent, self._birth_row, self._n_at_death = parent, birth_row, n_at_death
-        self._weight = np.exp(log_weight)
-        self._left = np.append(np.cumsum(self._weight[::-1])[::-1], 0.0)  # evidence from each row on
-        self._own = np.concatenate([[0.0], np.cumsum((self._left[:-1] / n_at_death) ** 2)])
-        self._births = np.sort(birth_row)
-        # Just after a round as many points are alive as at the next death.
-        n_alive = n_at_death[np.minimum(self._births + 1, len(n_at_death) - 1)]
-        self._chance = np.concatenate([[0.0], np.cumsum(2.0 * (self._left[self._births + 1] / n_alive) ** 2)])
-
-    def relative_variance_from_windows(self, ends: IntArray, lag: int) -> float:
-        """Estimate the variance of log Z over that of independent draws from up to 32 windows of `lag` rounds each.
-
-        `ends` are the last rows of all rounds, in order.
-        """
-        starts = np.unique(np.linspace(0, len(ends) - 1 - lag, _MOST_WINDOWS).astype(int))
-        windows = [self._excess_and_shrinkage_variance(ends[i], ends[i + lag]) for i in starts]
-        excess, own = np.array(windows).sum(axis=0)
-        return 1.0 + float(excess / own)
-
-    def _excess_and_shrinkage_variance(self, first: int, last: int) -> tuple[float, float]:
-        """Return a window's excess variance of log Z over that of independent draws, and its variance from shrinkage.
-
-        Lineages are traced back from row `last` to row `first`; the points alive at `last` share the evidence beyond
-        it.
-        """
-        rows = np.arange(len(self._parent))
-        row = np.flatnonzero((rows > first) & (self._birth_row <= last))
-        ancestor = row.copy()
-        while (young := self._birth_row[ancestor] > first).any():
-            ancestor[young] = self._parent[ancestor[young]]
-        alive = row > last
-        part = np.where(alive, self._left[last + 1] / max(int(alive.sum()), 1), self._weight[row])
-        whole = float(part.sum())
-        share = np.bincount(ancestor, part) / whole
-        alone = 1.0 / int(self._n_at_death[first + 1])  # two draws of the same point
-        met = -math.log(max(1.0 - float(share @ share), 1e-12)) - alone
-        born = np.searchsorted(self._births, [first, last], side="right")
-        chance = float(self._chance[born[1]] - self._chance[born[0]])
-        return met * whole**2 - chance, float(self._own[last + 1] - self._own[first + 1])
+    return max(1.0, 1.5 * from_windows(n_rounds // 2) - 0.5 * from_windows(n_rounds // 4))
 
 
 def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_live: int) -> str | None:
@@ -263,12 +232,7 @@ def warning_of_coarse_coordinates(names: Sequence[str], u: FloatArray, weight: F
     Just below 1 numbers are 1e-16 apart, so this is the case about 8 sds above the mean of a normal prior. Below the
     mean, near 0, there are numbers enough.
 
-    Parameters
-    ----------
-    names
-        Names of the parameters.
-    u, weight
-        Points in the sampling coordinates, (n, n_params), and their posterior weights, (n,), sum 1.
+    `u`: points in the sampling coordinates, (n, n_params); `weight`, (n,): of the posterior, sum 1.
     """
     low, high = weighted_quantiles(u, weight, [0.25, 0.75])
     steps = (high - low) / np.spacing(np.abs(low))

@@ -13,13 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, gammaln, logsumexp
+from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, read_only_floats
 from probewise.nested.clusters import Clusters, find_disconnected_clusters
 from probewise.nested.problem import Evaluator, Space
 from probewise.nested.result import NestedResult, Samples
-from probewise.nested.weights import n_effective
+from probewise.nested.weights import n_effective, student_t_draws, student_t_log_norm
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 _MOST_K = 0.7
@@ -38,23 +38,11 @@ _BLOCK = 2048
 class Weighted(Samples):
     """Weighted posterior samples and the evidence, from importance sampling; see also `Samples`.
 
-    Attributes
-    ----------
-    theta
-        Draws with nonzero likelihood, (n, n_params).
-    n_calls
-        Likelihood evaluations, including those of a fallback run.
-    pareto_k
-        Shape of the weights' tail; above 0.7 the error is unreliable.
-    run
-        The fallback run, made where the weights were unreliable; else None.
-    missed
-        Share of the posterior that the draws undersample, estimated from held-out samples; `log_z` includes it, the
-        samples do not.
-    lost
-        Share of the posterior that the run may have lost undetected, see `refine`; the error includes it.
-    inherited
-        Doubts about the refined run, and about a disagreement with it, in words.
+    `theta` are the draws with nonzero likelihood, (n, n_params). `pareto_k` is the shape of the weights' tail; above
+    0.7 the error is unreliable. `run` is the fallback run, made where the weights were, else None; `n_calls` includes
+    its own. `missed` is the share of the posterior that the draws undersample, estimated from held-out samples: `log_z`
+    includes it, the samples do not. `lost` is the share that the run may have lost undetected, see `refine`; the error
+    includes it. `inherited`: doubts about the refined run, and about a disagreement with it, in words.
     """
 
     names: tuple[str, ...]
@@ -123,17 +111,9 @@ def evenly_weighted(
 ) -> Weighted:
     """Return equally weighted samples, theta (n, n_params) and log_likelihood (n,), and an evidence, by default one."""
     n = len(theta)
+    even = np.full(n, -math.log(n))
     return Weighted(
-        names,
-        theta,
-        log_likelihood=log_likelihood,
-        log_weight=np.full(n, -math.log(n)),
-        log_z=log_z,
-        log_z_error=log_z_error,
-        n_eff=float(n),
-        n_calls=n_calls,
-        pareto_k=-math.inf,
-        run=run,
+        names, theta, log_likelihood, even, log_z, log_z_error, float(n), n_calls, pareto_k=-math.inf, run=run
     )
 
 
@@ -154,8 +134,7 @@ class Proposal:
         """Draw points, (n, n_params)."""
         n_params = self.clusters.mean.shape[1]
         which = rng.choice(len(self.share), size=n, p=self.share)
-        white = rng.standard_normal((n, n_params))
-        white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
+        white = student_t_draws(n, n_params, _DEGREES_OF_FREEDOM, rng=rng)
         out = np.empty((n, n_params))
         for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
             rows = np.flatnonzero(which == k)
@@ -170,8 +149,7 @@ class Proposal:
 
     def _log_density_of_block(self, x: FloatArray) -> FloatArray:
         n_params, nu = x.shape[1], _DEGREES_OF_FREEDOM
-        constant = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
-        parts = []
+        constant, parts = student_t_log_norm(n_params, nu), []
         for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
             white = (x - self.clusters.mean[k]) @ self.clusters.inverse_root[k].T
             square = (white**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2.0 * white @ centres.T
@@ -284,17 +262,8 @@ def draw_and_weigh(
     alive = np.isfinite(log_ratio)
     if not alive.any():
         nothing = np.empty(0)
-        return Weighted(
-            evaluate.names,
-            theta[:0],
-            log_likelihood=nothing,
-            log_weight=nothing,
-            log_z=-math.inf,
-            log_z_error=math.inf,
-            n_eff=0.0,
-            n_calls=evaluate.n_calls,
-            pareto_k=math.inf,
-        )
+        n_calls = evaluate.n_calls
+        return Weighted(evaluate.names, theta[:0], nothing, nothing, -math.inf, math.inf, 0.0, n_calls, math.inf)
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
     k = pareto_k(log_ratio)
     held_ratio, n_held = np.empty(0), 0.0
@@ -304,19 +273,8 @@ def draw_and_weigh(
     log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, n_held)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
-    n_eff = n_effective(log_weight)
-    return Weighted(
-        evaluate.names,
-        theta,
-        log_likelihood=log_likelihood,
-        log_weight=log_weight,
-        log_z=log_z,
-        log_z_error=error,
-        n_eff=n_eff,
-        n_calls=evaluate.n_calls,
-        pareto_k=k,
-        missed=missed,
-    )
+    n_eff, n_calls = n_effective(log_weight), evaluate.n_calls
+    return Weighted(evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, n_calls, k, missed=missed)
 
 
 def _bridge_sampling_estimate(

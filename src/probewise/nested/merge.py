@@ -19,7 +19,6 @@ from probewise.nested.result import Agreement, Check, NestedResult, software_ver
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
-_LEAST_ERROR = 1e-12
 _LEVELS = ("log_likelihood", "label", "log_birth", "birth_label")
 
 
@@ -56,40 +55,51 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     require_rng(rng)
     parts = tuple(results)
     seeds = _seed_states_of_mergeable_runs(parts)
-    together = [np.concatenate([getattr(r, name) for r in parts]) for name in _LEVELS]
-    order = np.lexsort((together[1], together[0]))
-    log_likelihood, label, log_birth, birth_label = levels = tuple(each[order] for each in together)
-    n_at_death = n_alive_at_death(*levels)
+    order = np.lexsort([np.concatenate([getattr(r, name) for r in parts]) for name in _LEVELS[1::-1]])
+    joined = {name: np.concatenate([getattr(r, name) for r in parts])[order] for name in ("theta", *_LEVELS)}
+    n_at_death = n_alive_at_death(*(joined[name] for name in _LEVELS))
     first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
     parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
     parent = np.where(parent >= 0, np.argsort(order)[parent], -1)[order]
     # Each run has its own estimate: in the joined record a run is never complete between two rounds.
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _pooled_log_possible_share(parts)
+    log_likelihood = joined["log_likelihood"]
     evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
-    agreement = agreement_of(parts)
-    check = _averaged_check(parts, evidence.log_z, evidence.log_z_error(remembered))
+    log_z, error = evidence.log_z, evidence.log_z_error(remembered)
     # Fisher's method combines independent p values.
     fisher = -2.0 * float(np.log(np.maximum([r.insertion_p_value for r in parts], 1e-300)).sum())
     p_value = float(chdtrc(2 * len(parts), fisher))
-    error, doubts = _error_and_doubts(agreement, check, p_value, evidence.log_z, evidence.log_z_error(remembered))
+    agreement, check, doubts = agreement_of(parts), _averaged_check(parts, log_z, error), list[str]()
+    widened = error
+    if agreement.p_value < _DISAGREE:
+        widened = max(error, agreement.log_z_sd)
+        doubts.append(
+            f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
+            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
+            "the error is widened to their scatter; use more n_live or longer chains"
+        )
+    if p_value < DOUBTFUL_P_VALUE:
+        doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
+    if check is not None and abs(check.distance) > DISAGREE:
+        doubts.append(
+            f"{check.route} gives log Z = {check.log_z:.2f} ± {check.log_z_error:.2f}, the runs together "
+            f"{log_z:.2f} ± {widened:.2f}: {abs(check.distance):.1f} errors apart; a bias shared by all runs "
+            "does not average out; use longer chains"
+        )
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
     return NestedResult(
         names=parts[0].names,
-        theta=np.concatenate([r.theta for r in parts])[order],
-        log_likelihood=log_likelihood,
-        label=label,
+        **joined,
         log_weight=evidence.log_weight,
-        log_birth=log_birth,
-        birth_label=birth_label,
         parent=parent,
         n_at_death=n_at_death,
         log_start=log_start,
         log_start_error=log_start_error,
-        log_z=evidence.log_z,
-        log_z_error=error,
+        log_z=log_z,
+        log_z_error=widened,
         memory=remembered,
         information=evidence.information,
         n_eff=evidence.n_eff,
@@ -108,44 +118,15 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     )
 
 
-def _error_and_doubts(
-    agreement: Agreement, check: Check | None, p_value: float, log_z: float, error: float
-) -> tuple[float, list[str]]:
-    """Return the error of the joint log Z, widened where the runs disagree, and the doubts about the runs in words."""
-    doubts = list[str]()
-    if agreement.p_value < _DISAGREE:
-        doubts.append(
-            f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
-            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
-            "the error is widened to their scatter; use more n_live or longer chains"
-        )
-        error = max(error, agreement.log_z_sd)
-    if p_value < DOUBTFUL_P_VALUE:
-        doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
-    if check is not None and abs(check.distance) > DISAGREE:
-        doubts.append(
-            f"{check.route} gives log Z = {check.log_z:.2f} ± {check.log_z_error:.2f}, the runs together "
-            f"{log_z:.2f} ± {error:.2f}: {abs(check.distance):.1f} errors apart; a bias shared by all runs "
-            "does not average out; use longer chains"
-        )
-    return error, doubts
-
-
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:
-    """Compare the evidences of independent runs by chi-square; a merged run counts as its single runs.
-
-    ParameterError for fewer than two runs.
-    """
+    """Compare the evidences of independent runs by chi-square; a merged run counts as its single runs."""
     log_z, log_z_error = list[float](), list[float]()
     for result in results:
         runs = result.agreement
         log_z += [result.log_z] if runs is None else runs.log_z
         log_z_error += [result.log_z_error] if runs is None else runs.log_z_error
-    if len(log_z) < 2:
-        raise ParameterError("results", f"{len(log_z)} runs", "two runs or more")
-    # A constant likelihood has an exact evidence: the error is nought, or a last digit.
-    weight: FloatArray = np.maximum(log_z_error, _LEAST_ERROR) ** -2.0
-    middle = float(weight @ log_z / weight.sum())
+    middle, _ = weighted_mean_and_error(log_z, log_z_error)
+    weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
     chi_square = float(weight @ np.square(np.asarray(log_z) - middle))
     return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chdtrc(len(log_z) - 1, chi_square)))
 
@@ -177,27 +158,20 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
     """Return the seed states of all runs; raise ParameterError if the runs cannot be merged."""
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
-    names = parts[0].names
+    names, seeds = parts[0].names, list[object]()
     if not names:
         raise ParameterError("results", "runs without parameters", "runs with some; the evidence is exact without")
-    seeds = list[object]()
     for number, result in enumerate(parts, start=1):
         if result.names != names:
             raise ParameterError(f"names of run {number}", result.names, f"those of the first run, {names}")
         if not np.array_equal(n_alive_at_death(*(getattr(result, name) for name in _LEVELS)), result.n_at_death):
-            raise ParameterError(
-                f"n_at_death of run {number}",
-                "not what births and deaths give",
-                "complete runs of nested sampling, in the order of log likelihood and label",
-            )
+            allowed = "complete runs of nested sampling, in the order of log likelihood and label"
+            raise ParameterError(f"n_at_death of run {number}", "not what births and deaths give", allowed)
         state = json.loads(result.seed_state)
         for one in state if isinstance(state, list) else [state]:
             if one in seeds:
-                raise ParameterError(
-                    f"seed_state of run {number}",
-                    "that of a run before it",
-                    "independent runs: give each its own generator, `rng.spawn(n_runs)`",
-                )
+                allowed = "independent runs: give each its own generator, `rng.spawn(n_runs)`"
+                raise ParameterError(f"seed_state of run {number}", "that of a run before it", allowed)
             seeds.append(one)
     return seeds
 
@@ -205,8 +179,8 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
 def _pooled_log_possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
     """Pool the shares of the prior with nonzero likelihood; return the log of the pooled share and its error.
 
-    A share s = m / n has the relative error sqrt((1 - s) / m), from which m follows; if all were
-    possible, m is the number of live points.
+    A share s = m / n has the relative error sqrt((1 - s) / m), from which m follows; if all were possible, m is the
+    number of live points.
     """
     found = drawn = 0.0
     for result in parts:

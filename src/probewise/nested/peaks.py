@@ -108,8 +108,7 @@ def find_missed_peaks(
 ) -> MissedPeaks:
     """Look for peaks of the posterior that a run has missed; none are found for a prior without an inverse.
 
-    `max_calls`: limit of evaluations; at most about a third of the run's are used. `executor` evaluates batches of
-    the likelihood in `n_workers` parts, as for `run`. NotConvergedError if the likelihood fails.
+    `max_calls`: limit of evaluations; at most about a third of the run's are used. `executor`, `n_workers`: see `run`.
     """
     if not run.names or not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
         return MissedPeaks()
@@ -118,12 +117,10 @@ def find_missed_peaks(
     def calls_left(share: float = math.inf) -> int:
         return int(min(max_calls - evaluate.n_calls, share * run.n_calls))
 
-    def samples(tops: Iterable[GaussianAtPeak]) -> Iterable[FloatArray]:
-        for top in tops:
-            n_draws = max(_SAMPLES_PER_PARAM * len(run.names), _FEWEST_SAMPLES)
-            drawn = _samples_if_unmet(top, run, evaluate, n_draws, rng) if n_draws <= calls_left() else None
-            if drawn is not None:
-                yield drawn
+    def samples(tops: Iterable[GaussianAtPeak]) -> tuple[FloatArray, ...]:
+        n_draws = max(_SAMPLES_PER_PARAM * len(run.names), _FEWEST_SAMPLES)
+        drawn = (_samples_if_unmet(top, run, evaluate, n_draws, rng) for top in tops if n_draws <= calls_left())
+        return tuple(each for each in drawn if each is not None)
 
     top = climb_to_top(
         gaussian_of_last_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng
@@ -132,7 +129,7 @@ def find_missed_peaks(
     if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
         lost.append(top)
     above = _higher_tops(run, top, evaluate, max_calls=calls_left(), rng=rng)
-    return MissedPeaks(tuple(samples(lost)), tuple(samples(above)), evaluate.n_calls)
+    return MissedPeaks(samples(lost), samples(above), evaluate.n_calls)
 
 
 def _samples_if_unmet(
@@ -202,7 +199,7 @@ def climb_to_top(
 
 
 def gaussian_of_last_live_points(run: NestedResult, evaluate: Evaluator) -> GaussianAtPeak:
-    """Return the mean and covariance of a run's last live points, with the highest of them, to start a climb."""
+    """Return mean and covariance of a run's last live points, with the highest of them, to start a climb."""
     last = slice(-run.n_live, None)
     live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
     highest = live.take_rows(live.rows_by_rising_likelihood()[-1:])

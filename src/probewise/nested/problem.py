@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any, Protocol, Self, TypeAlias, cast
 
@@ -147,7 +147,7 @@ class Rows:
     @classmethod
     def join(cls, *parts: Self) -> Self:
         """Return the rows of all parts, in order."""
-        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,7 +404,7 @@ def make_problem(
         A prior with names (`probewise.priors`); a dict of distributions by name; a list of distributions; or a function
         that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
         `probewise.priors`, pairs (low, high) for uniform ones, or frozen continuous ones of scipy.stats. A function
-        suffices for `run`; `refine`, `repartitioned`, `update` and `diversify` need the prior's density or inverse.
+        suffices for `run`; `refine`, `update` and `diversify` need the prior's density or inverse.
     names
         Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default.
     vectorized

@@ -201,18 +201,9 @@ def update(
             return found
         k = found.pareto_k
     fallen = fall_back()
-    return Weighted(
-        fallen.names,
-        fallen.theta,
-        log_likelihood=fallen.log_likelihood,
-        log_weight=fallen.log_weight,
-        log_z=fallen.log_z,
-        log_z_error=fallen.log_z_error,
-        n_eff=fallen.n_eff,
-        n_calls=evaluate.n_calls + fallen.n_calls,
-        pareto_k=k,
-        run=fallen,
-    )
+    samples = fallen.names, fallen.theta, fallen.log_likelihood, fallen.log_weight
+    evidence = fallen.log_z, fallen.log_z_error, fallen.n_eff
+    return Weighted(*samples, *evidence, evaluate.n_calls + fallen.n_calls, k, run=fallen)
 
 
 def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:

@@ -38,20 +38,9 @@ _ARRAYS = ("theta", *_FLOATS, *_COUNTS, *_PER_INSERTION)
 class Samples(ShowsItself):
     """Weighted samples of a posterior: base of results with `names`, `theta` and weights that sum to one.
 
-    Attributes
-    ----------
-    names
-        Parameter names, one per column of theta.
-    theta
-        Parameters of each sample, (n, n_params).
-    log_likelihood, log_weight
-        Of each sample, (n,).
-    log_z, log_z_error
-        Natural log of the evidence and its standard error.
-    n_eff
-        Kish's effective sample size.
-    n_calls
-        Number of likelihood evaluations.
+    `theta` (n, n_params) are the parameters of each sample; `log_likelihood` and `log_weight`, (n,), its own; `log_z`
+    and `log_z_error` the natural log of the evidence and its standard error; `n_eff` is Kish's effective sample size,
+    `n_calls` the number of likelihood evaluations.
     """
 
     names: tuple[str, ...]
@@ -129,14 +118,8 @@ class Samples(ShowsItself):
 class Agreement:
     """A test whether independent runs of one problem agree within their errors.
 
-    Attributes
-    ----------
-    log_z, log_z_error
-        Of each run.
-    chi_square
-        Sum of the squared deviations from the weighted mean, in units of each run's error.
-    p_value
-        Probability of a chi-square at least as large if the errors are right (n_runs - 1 degrees of freedom).
+    `log_z` and `log_z_error` of each run; `chi_square`: sum of the squared deviations from their weighted mean, in
+    units of each run's error; `p_value`: probability of a chi-square at least as large if the errors are right.
     """
 
     log_z: tuple[float, ...]
@@ -159,16 +142,8 @@ class Agreement:
 class Check:
     """A second, independent estimate of the evidence; see `probewise.nested.check`.
 
-    Attributes
-    ----------
-    route
-        The method, in words.
-    log_z, log_z_error
-        Natural log of the evidence by that method, and its standard error.
-    distance
-        The run's log Z minus this one, in units of the combined error.
-    n_calls
-        Likelihood evaluations used.
+    `route` is the method, in words; `log_z`, `log_z_error` are its estimate; `distance` is the run's log Z minus this
+    one, in units of the combined error; `n_calls` the likelihood evaluations used.
     """
 
     route: str
@@ -191,31 +166,23 @@ class NestedResult(Samples):
     log_birth, birth_label
         Log likelihood and label of the dead point above which each was drawn, (n_dead,);
         minus infinity and 1 for draws from the whole prior.
-    parent
-        Row of the point at which each point's chain began; -1 for the initial draws from the prior, (n_dead,).
-    n_at_death
-        Number of points alive when each died, itself included, (n_dead,).
+    parent, n_at_death
+        Row of the point at which each point's chain began, -1 for the initial draws from the prior; number of points
+        alive when each died, itself included; (n_dead,) both.
     log_start, log_start_error
         Natural log of the share of the prior with nonzero likelihood, and its standard error.
-    log_z_error
-        Standard error of ln Z: from simulated shrinkages, times the root of `memory`.
     memory
-        Lineage variance: variance of log Z relative to independent points, 1 or more; see
+        Lineage variance: variance of log Z relative to independent points, 1 or more; `log_z_error` includes it. See
         `probewise.nested.evidence.relative_lineage_variance`.
     information
         Kullback-Leibler divergence of posterior from prior, nats.
-    n_calls, n_live
-        Numbers of likelihood evaluations, those of the check included, and of live points.
     stop_reason, complete
         Why the run ended; whether its stopping rule ended it, rather than a limit, an interruption or a failure.
-    insertion_rank, insertion_n_ranked
-        Rank of each new point among those alive, 0 to m, and m, both (n_inserted,).
-    insertion_p_value
-        p value of the test that the insertion ranks are uniform, as for a correct sampler.
-    seed_state
-        State of the random generator at the start, as JSON; a list of states for merged runs.
-    versions
-        Of probewise, numpy, scipy and python.
+    insertion_rank, insertion_n_ranked, insertion_p_value
+        Rank of each new point among those alive, 0 to m, and m, both (n_inserted,); p value of the test that the ranks
+        are uniform, as for a correct sampler.
+    seed_state, versions
+        State of the random generator at the start, as JSON, a list of states for merged runs; versions of the software.
     warnings
         Reasons to doubt the result; empty for a sound run.
     agreement, check
@@ -323,11 +290,9 @@ class NestedResult(Samples):
     def to_anesthetic(self) -> Any:
         """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.
 
-        anesthetic recomputes the number of live points from births and deaths, and knows no labels. On a plateau of the
-        likelihood the levels are therefore made distinct by single units in the last place, in the order of the labels.
-        anesthetic does not know impossible hypotheses (zero likelihood) either: its prior is that of the possible ones.
-        To restore the evidence, `log_start` (log of the possible share of the prior) is added to every level.
-        ImportError if anesthetic is not installed.
+        anesthetic knows neither labels nor impossible hypotheses. So the levels of a plateau are made distinct by
+        single units in the last place, in the order of the labels, and `log_start` (log of the possible share of the
+        prior) is added to every level. ImportError if anesthetic is not installed.
         """
         anesthetic = _import_optional("anesthetic")
         death, birth = self._log_likelihoods_without_ties()
@@ -343,20 +308,16 @@ class NestedResult(Samples):
         likelihood `log_l`, the level `log_l_birth` above which it was drawn, and its `row` in the result. Attributes
         are those of the run. ImportError if arviz is not installed; ParameterError if there are no parameters.
         """
-        arviz = _import_optional("arviz")
         if not self.names:
             raise ParameterError("names", self.names, "one parameter or more; without any there are no samples")
+        arviz = _import_optional("arviz")
+        told = ("log_z", "log_z_error", "n_eff", "n_calls", "n_live", "stop_reason")
         attributes = {
             "inference_library": "probewise",
             "inference_library_version": self.versions["probewise"],
-            "log_z": self.log_z,
-            "log_z_error": self.log_z_error,
             "information_nats": self.information,
-            "n_eff": self.n_eff,
-            "n_calls": self.n_calls,
-            "n_live": self.n_live,
-            "stop_reason": self.stop_reason,
             "warnings": json.dumps(self.warnings),
+            **{name: getattr(self, name) for name in told},
         }
         rows = self.draw_rows(max(1, int(self.n_eff)) if n is None else n, rng=rng)
         groups = {
@@ -374,15 +335,12 @@ class NestedResult(Samples):
 
     def _log_likelihoods_without_ties(self) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods at death and birth, (n_dead,) each, plus `log_start`; ties are broken by label."""
-        order = np.lexsort((self.label, self.log_likelihood))
-        strict = self.log_likelihood[order] + self.log_start
+        strict = self.log_likelihood + self.log_start  # deaths are in order, ties by label
         for i in range(1, len(strict)):
             if strict[i] <= strict[i - 1]:
                 strict[i] = np.nextafter(strict[i - 1], np.inf)
-        death = np.empty_like(strict)
-        death[order] = strict
         born = birth_rows(self.log_likelihood, self.label, self.log_birth, self.birth_label)
-        return death, np.where(born >= 0, strict[born], -np.inf)
+        return strict, np.where(born >= 0, strict[born], -np.inf)
 
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically; FileError if it cannot be written."""

@@ -40,7 +40,6 @@ from probewise.nested.evidence import (
     birth_rows,
     insertion_p_value,
     integrate,
-    log_volumes,
     relative_lineage_variance,
     warning_of_coarse_coordinates,
     warning_of_few_lineages,
@@ -49,14 +48,7 @@ from probewise.nested.evidence import (
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError, Points, Samplable, as_problem
 from probewise.nested.result import NestedResult, as_json, software_versions
-from probewise.nested.save import (
-    BirthRecords,
-    CheckpointFile,
-    DeadPointsOfRound,
-    LivePoints,
-    RunState,
-    settings_of_run,
-)
+from probewise.nested.save import CheckpointFile, DeadPoints, LivePoints, RunState, settings_of_run
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
@@ -182,34 +174,29 @@ def run(
     stop
         Stopping rule; default `RemainingEvidence(0.05)`. The paper's rule is `EvidenceChange(1e-8)`.
     move
-        How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior
-        is alive, points are drawn from the prior itself.
+        How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior is alive, points are
+        drawn from the prior itself.
     n_replaced
-        Points replaced per round; default half of `n_live`. The shrinkage is counted exactly for any
-        number. With half, batches are large; compared with one at a time, 28 % fewer points are drawn and
-        the variance of log Z is 44 % greater.
+        Points replaced per round; default half of `n_live`, for large batches: compared with one at a time, 28 % fewer
+        points are drawn and the variance of log Z is 44 % greater.
     progress
         Called with a `RoundSummary` after every round.
     max_calls
         Limit of likelihood evaluations; at the limit the run ends with a warning.
     max_cost
-        Limit of all evaluations in units of those of the first run; 1 means no check. First, modes that died out among
-        the live points are looked for; if some of them matter, the run is repeated with hops to them. Then the evidence
-        is estimated again, at about a fifth of the first run's cost. Where the two disagree, a more precise second
-        estimate and a run with chains twice as long follow. A disagreement or a lost mode that remains is reported as a
-        warning, and so is a second estimate that does not end within the limits.
+        Limit of all evaluations in units of those of the first run; 1 means no check. Else the evidence is estimated a
+        second time, and the run repeated where the two disagree or a mode was lost (`probewise.nested.check`); what
+        remains in doubt is a warning.
     checkpoint
         File to which the state is saved atomically as the run proceeds; its folder is created if missing. If the file
         exists, the run resumes and ends bit for bit as if it had not been interrupted or killed; `rng` must be in
         the state of the run's start, made from the same seed. `max_calls` may differ.
     checkpoint_every_s
         Least seconds between savings, but no less than ten times the saving time. 0: save after every round.
-    executor
-        Evaluates a slow likelihood in parallel; by default it is evaluated in this process. Each batch is
-        split into `n_workers` parts. The result is the same to the last bit if a hypothesis' likelihood
-        does not depend on its batch (for matrix products in NumPy it may).
-    n_workers
-        Parts of a batch; default the number of processors.
+    executor, n_workers
+        Evaluates each batch of a slow likelihood in `n_workers` parts, by default the number of processors. The result
+        is the same to the last bit if a hypothesis' likelihood does not depend on its batch (for matrix products in
+        NumPy it may).
     return_interrupted
         Whether Ctrl-C returns the result so far, with a warning; otherwise it raises `KeyboardInterrupt`.
 
@@ -281,7 +268,7 @@ def least_live(n_params: int) -> int:
 
 def replace_worst_live_points(
     live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
-) -> tuple[LivePoints, DeadPointsOfRound, Tally]:
+) -> tuple[LivePoints, DeadPoints, Tally]:
     """Replace the `n_replaced` worst live points by new ones above the best of the replaced.
 
     Return the new live points, the dead ones, and the statistics of the move.
@@ -289,32 +276,23 @@ def replace_worst_live_points(
     The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is counted
     exactly; the new points are drawn together.
     """
-    n_live = len(live.points)
-    order = live.points.rows_by_rising_likelihood()
-    doomed, spared = order[:n_replaced], order[n_replaced:]
-    last = doomed[-1]
-    bound = Bound(float(live.points.log_likelihood[last]), float(live.points.label[last]))
-    survivors = live.points.take_rows(spared)
-    begin = rng.permutation(len(spared))[:n_replaced]
+    n_live = len(live)
+    order = live.rows_by_rising_likelihood()
+    doomed, survivors = live.take_rows(order[:n_replaced]), live.take_rows(order[n_replaced:])
+    bound = Bound(float(doomed.log_likelihood[-1]), float(doomed.label[-1]))
+    begin = rng.permutation(len(survivors))[:n_replaced]
     start = survivors.take_rows(begin)
-    new, tally = move.draw(start, bound, survivors.u, evaluate, rng)
-    points = Points.join(survivors, new)
+    new, tally = move.draw(start.without_births(), bound, survivors.u, evaluate, rng)
+    ident = live.ident.max() + 1 + np.arange(n_replaced)
+    level = np.full(n_replaced, bound.log_likelihood), np.full(n_replaced, bound.label)
+    after = LivePoints.join(survivors, LivePoints(*vars(new).values(), *level, ident, start.ident))
     place = np.empty(n_live, dtype=np.int64)
-    place[points.rows_by_rising_likelihood()] = np.arange(n_live)
-    worse = place[None, :] < place[len(spared) :, None]
-    n_ranked = len(spared) + np.arange(n_replaced)
+    place[after.rows_by_rising_likelihood()] = np.arange(n_live)
+    n_ranked = len(survivors) + np.arange(n_replaced)
+    worse = place[None, :] < place[len(survivors) :, None]
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    dead = DeadPointsOfRound(live.points.take_rows(doomed), live.births.take_rows(doomed), n_at_death, rank, n_ranked)
-    known = live.births.take_rows(spared)
-    fresh = BirthRecords(
-        np.full(n_replaced, bound.log_likelihood),
-        np.full(n_replaced, bound.label),
-        live.births.ident.max() + 1 + np.arange(n_replaced),
-        known.ident[begin],
-    )
-    log_volume = float(log_volumes(n_at_death, live.log_volume)[-1])
-    return LivePoints(points, BirthRecords.join(known, fresh), log_volume), dead, tally
+    return after, DeadPoints(*vars(doomed).values(), n_at_death, rank, n_ranked), tally
 
 
 def run_once(
@@ -368,12 +346,10 @@ def run_once(
     keeper = None
     if checkpoint is not None:
         settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
-        with contextlib.suppress(OSError):  # `CheckpointFile` reports a folder that cannot be created
-            checkpoint.parent.mkdir(parents=True, exist_ok=True)
         keeper = CheckpointFile(checkpoint, checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
     now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
-    if len(now.live.points) < n_live:  # a run with more calls begins anew
+    if len(now.live) < n_live:  # a run with more calls begins anew
         keeper = None
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
@@ -382,21 +358,20 @@ def run_once(
         if keeper is not None:
             keeper.save(now)
 
-    def finish(reason: str, *more_notes: str) -> NestedResult:
+    def finish(reason: str, *notes: str) -> NestedResult:
         save()
         # Depends only on the state after the last round: not on where in a round an interruption came, nor on
         # the generator's seed sequence, which its state does not include.
         rng.bit_generator.state = now.rng_state
         summing = np.random.default_rng(rng.integers(2**63, size=4))
-        noted = replace(now, notes=(*now.notes, *more_notes))
-        return _final_result(evaluate, noted, n_live, reason, seed_state, summing)
+        return _final_result(evaluate, now, n_live, reason, seed_state, summing, notes)
 
     try:
         while now.ended is None:
             # A round can cost twice the last one: the volume halves while points are drawn from the prior.
             few = max_calls is not None and evaluate.n_calls + 2 * now.last_cost > max_calls
             try:
-                if few or len(now.live.points) < n_live:
+                if few or len(now.live) < n_live:
                     raise OutOfCallsError
                 after, state = _do_round(now, evaluate, n_replaced, rng)
             except OutOfCallsError:  # also the first round, or one that costs more than twice the last
@@ -452,34 +427,24 @@ def _do_round(
     now: RunState, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator
 ) -> tuple[RunState, RoundSummary]:
     """Replace the worst points once and add the dead ones to the evidence; return the new state and its summary."""
-    live, moving = now.live, now.moving
-    volume = math.exp(live.log_volume)
+    volume = math.exp(now.log_volume)
     chains = volume <= _PRIOR_VOLUME  # else new points are drawn from the whole prior
-    move = moving if chains else PriorRejection(volume)
-    fresh, gone, tally = replace_worst_live_points(live, move, evaluate, n_replaced=n_replaced, rng=rng)
-    edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
+    move = now.moving if chains else PriorRejection(volume)
+    live, gone, tally = replace_worst_live_points(now.live, move, evaluate, n_replaced=n_replaced, rng=rng)
+    edges = now.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
+    log_volume = float(edges[-1])
     # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
-    best = float(fresh.points.log_likelihood.max())
-    log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + (gone.points.log_likelihood - best)
+    best = float(live.log_likelihood.max())
+    log_mass = edges[:-1] + np.log(-np.expm1(np.diff(edges))) + (gone.log_likelihood - best)
     so_far = now.log_z_over_best + (now.best - best) if now.dead else -math.inf
     before = float(logsumexp(np.concatenate([[so_far], log_mass[:-1]])))
     log_z = float(np.logaddexp(before, log_mass[-1]))
-    state = RoundSummary(
-        n_dead=(len(now.dead) + 1) * n_replaced,
-        n_calls=evaluate.n_calls,
-        log_z=best + log_z,
-        log_z_remaining=best + fresh.log_volume,
-        log_ratio_remaining=fresh.log_volume - log_z,
-        last_change=log_z - before,
-        log_volume=fresh.log_volume,
-        best_log_likelihood=best,
-        level=bool(fresh.points.log_likelihood.min() == best),
-    )
     after = replace(
         now,
-        live=fresh,
+        live=live,
         dead=(*now.dead, gone),
-        moving=moving.adapted(tally) if chains else moving,
+        moving=now.moving.adapted(tally) if chains else now.moving,
+        log_volume=log_volume,
         best=best,
         log_z_over_best=log_z,
         n_stuck=now.n_stuck + (tally.n_stuck if chains else 0),
@@ -487,7 +452,17 @@ def _do_round(
         n_calls=evaluate.n_calls,
         rng_state=rng.bit_generator.state,
     )
-    return after, state
+    return after, RoundSummary(
+        n_dead=sum(map(len, after.dead)),
+        n_calls=evaluate.n_calls,
+        log_z=best + log_z,
+        log_z_remaining=best + log_volume,
+        log_ratio_remaining=log_volume - log_z,
+        last_change=log_z - before,
+        log_volume=log_volume,
+        best_log_likelihood=best,
+        level=bool(live.log_likelihood.min() == best),
+    )
 
 
 def _initial_run_state(
@@ -538,58 +513,56 @@ def _initial_run_state(
                 mixed, tally = mixing.draw(mixed, bound, mixed.u, evaluate, rng)
                 mixing = mixing.adapted(tally)
             points, move = mixed, mixing
-    live = LivePoints(points, BirthRecords.of_prior_draws(len(points)), log_volume)
-    return RunState(live, (), move, log_volume, error, (), n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
+    live, state = LivePoints.drawn_from_prior(points), rng.bit_generator.state
+    return RunState(live, (), move, log_volume, error, log_volume, n_calls=evaluate.n_calls, rng_state=state)
 
 
 def _final_result(
-    evaluate: Evaluator, now: RunState, n_live: int, reason: str, seed_state: str, rng: np.random.Generator
+    evaluate: Evaluator,
+    now: RunState,
+    n_live: int,
+    reason: str,
+    seed_state: str,
+    rng: np.random.Generator,
+    notes: Sequence[str] = (),
 ) -> NestedResult:
     """Let the remaining live points die and compute the result."""
-    live, dead, notes = now.live, now.dead, now.notes
-    n_dead = sum(len(d.points) for d in dead)
-    few = warning_of_few_possible_draws(now.log_start, now.log_start_error, n_live)
-    if few is not None:
-        notes = (*notes, few)
-    if now.n_stuck > _STUCK_SHARE * n_dead:
-        notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
-    order = live.points.rows_by_rising_likelihood()
-    points = Points.join(*(d.points for d in dead), live.points.take_rows(order))
-    n_at_death = np.concatenate([*(d.n_at_death for d in dead), np.arange(len(live.points), 0, -1)])
+    n_dead = sum(map(len, now.dead))
+    last = now.live.take_rows(now.live.rows_by_rising_likelihood())
+    points = LivePoints.join(*now.dead, last)
+    of_dead = {name: [getattr(each, name) for each in now.dead] for name in ("n_at_death", "rank", "n_ranked")}
+    n_at_death = np.concatenate([*of_dead["n_at_death"], np.arange(len(last), 0, -1)])
+    rank, n_ranked = (np.concatenate([np.empty(0, dtype=np.int64), *of_dead[name]]) for name in ("rank", "n_ranked"))
     evidence = integrate(
         points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
-    births = BirthRecords.join(*(d.births for d in dead), live.births.take_rows(order))
-    parent = np.where(births.parent >= 0, np.argsort(births.ident)[births.parent], -1)
-    born = birth_rows(points.log_likelihood, points.label, births.log_birth, births.birth_label)
+    parent = np.where(points.parent >= 0, np.argsort(points.ident)[points.parent], -1)
+    born = birth_rows(points.log_likelihood, points.label, points.log_birth, points.birth_label)
     remembered = relative_lineage_variance(parent, born, n_at_death, evidence.log_weight)
-    empty = np.empty(0, dtype=np.int64)
-    rank = np.concatenate([empty, *(d.rank for d in dead)])
-    n_ranked = np.concatenate([empty, *(d.n_ranked for d in dead)])
     p_value = insertion_p_value(rank, n_ranked, rng=rng)
+    doubts = [*notes, warning_of_few_possible_draws(now.log_start, now.log_start_error, n_live)]
+    if now.n_stuck > _STUCK_SHARE * n_dead:
+        doubts.append(f"{now.n_stuck} of {n_dead} chains could not leave their start")
     if p_value < DOUBTFUL_P_VALUE:
-        notes = (
-            *notes,
+        doubts.append(
             f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
-            "use more steps_per_param or more n_live",
+            "use more steps_per_param or more n_live"
         )
-    if (uncertain := warning_of_few_lineages(remembered)) is not None:
-        notes = (*notes, uncertain)
+    doubts.append(warning_of_few_lineages(remembered))
     if not evaluate.names:
         pass  # the evidence is exact
     elif evidence.n_eff < _FEW_EFFECTIVE:
-        notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")
+        doubts.append(f"only {evidence.n_eff:.0f} effective samples: use more n_live")
     else:
-        coarse = warning_of_coarse_coordinates(evaluate.names, points.u, np.exp(evidence.log_weight))
-        notes = notes if coarse is None else (*notes, coarse)
+        doubts.append(warning_of_coarse_coordinates(evaluate.names, points.u, np.exp(evidence.log_weight)))
     return NestedResult(
         names=evaluate.names,
         theta=points.theta,
         log_likelihood=points.log_likelihood,
         log_weight=evidence.log_weight,
         label=points.label,
-        log_birth=births.log_birth,
-        birth_label=births.birth_label,
+        log_birth=points.log_birth,
+        birth_label=points.birth_label,
         parent=parent,
         n_at_death=n_at_death,
         log_start=now.log_start,
@@ -608,7 +581,7 @@ def _final_result(
         insertion_p_value=p_value,
         seed_state=seed_state,
         versions=software_versions(),
-        warnings=notes,
+        warnings=tuple(note for note in doubts if note is not None),
     )
 
 
@@ -620,7 +593,7 @@ def _result_of_problem_without_parameters(
     log_likelihood = evaluate.log_likelihood(only)
     if not np.isfinite(log_likelihood[0]):
         raise NotConvergedError("the only hypothesis has zero likelihood: it excludes what was measured")
-    live = LivePoints(Points(only, only, np.zeros(1), log_likelihood, np.zeros(1)), BirthRecords.of_prior_draws(1), 0.0)
+    live = LivePoints.drawn_from_prior(Points(only, only, np.zeros(1), log_likelihood, np.zeros(1)))
     reason = "no free parameters: the likelihood is the evidence"
-    now = RunState(live, (), move, 0.0, 0.0, (), ended=reason)
+    now = RunState(live, (), move, 0.0, 0.0, 0.0, ended=reason)
     return _final_result(evaluate, now, n_live, reason, seed_state, np.random.default_rng(0))

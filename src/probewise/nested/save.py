@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import tempfile
 import time
@@ -9,7 +10,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,31 +18,18 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._writing import write_bytes_atomically
 from probewise.errors import FileError, NotSavedWarning, ParameterError
 from probewise.nested.moves import Move
-from probewise.nested.problem import Evaluator, Points, Rows
+from probewise.nested.problem import Evaluator, Points
 from probewise.nested.result import archive_bytes, read_archive
 
-_FORMAT = "nested-checkpoint/3"
+_FORMAT = "nested-checkpoint/4"
 _ROUNDING = 1e-6
 _WAY_OUT = "give another file, or delete this one to start anew"
-_POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
-_BIRTHS = ("log_birth", "birth_label", "ident", "parent")
-_RECORD = ("n_at_death", "rank", "n_ranked")
-_PLAIN = (
-    "log_start",
-    "log_start_error",
-    "notes",
-    "best",
-    "log_z_over_best",
-    "n_stuck",
-    "last_cost",
-    "n_calls",
-    "ended",
-)
+_WRITABLE = "a file in an existing, writable folder"
 
 
 @dataclass(frozen=True, eq=False)
-class BirthRecords(Rows):
-    """How points were born; all arrays are (n,).
+class LivePoints(Points):
+    """Points with the record of their births, (n,) each.
 
     `log_birth`, `birth_label`: log likelihood and label of the bound above which each was drawn. `ident`: its number in
     order of birth; `parent`: `ident` of the point at which its chain began, -1 for a draw from the prior.
@@ -52,31 +40,25 @@ class BirthRecords(Rows):
     ident: IntArray
     parent: IntArray
 
+    def without_births(self) -> Points:
+        """Return the points alone, as moves take them."""
+        return Points(self.u, self.theta, self.log_density, self.log_likelihood, self.label)
+
     @classmethod
-    def of_prior_draws(cls, n: int) -> BirthRecords:
-        """Return the records of `n` draws from the prior, numbered from 0."""
-        return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
+    def drawn_from_prior(cls, points: Points) -> Self:
+        """Return draws from the prior, numbered from 0."""
+        n = len(points)
+        return cls(*vars(points).values(), np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
 
 
 @dataclass(frozen=True, eq=False)
-class LivePoints:
-    """The live points, their birth records, and the log of the prior volume that they fill."""
-
-    points: Points
-    births: BirthRecords
-    log_volume: float
-
-
-@dataclass(frozen=True, eq=False)
-class DeadPointsOfRound:
-    """The points that one round removed, worst first, and the insertion ranks of the points that replaced them.
+class DeadPoints(LivePoints):
+    """Points that a round removed, worst first, and the insertion ranks of the points that replaced them, (n,) each.
 
     `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the `n_ranked` points
-    alive at the insertion of each new point were worse than it. All arrays are (n_replaced,).
+    alive at the insertion of each new point were worse than it.
     """
 
-    points: Points
-    births: BirthRecords
     n_at_death: IntArray
     rank: IntArray
     n_ranked: IntArray
@@ -87,17 +69,18 @@ class RunState:
     """The state of the sampler after a round: everything that the rest of the run depends on.
 
     `moving`: the move as tuned so far. `log_start`, `log_start_error`: log of the share of the prior with nonzero
-    likelihood, and its error. `best`: greatest log likelihood of the live points; `log_z_over_best`: log evidence of
-    the dead points, minus `best`. `n_stuck`: chains that never left their start, so far; `last_cost`: evaluations of
-    the last round; `ended`: the stop reason, None while the run goes on.
+    likelihood, and its error; `log_volume`: log of the share that the live points fill. `best`: greatest log likelihood
+    of the live points; `log_z_over_best`: log evidence of the dead points, minus `best`. `n_stuck`: chains that never
+    left their start, so far; `last_cost`: evaluations of the last round; `ended`: the stop reason, None while the run
+    goes on.
     """
 
     live: LivePoints
-    dead: tuple[DeadPointsOfRound, ...]
+    dead: tuple[DeadPoints, ...]
     moving: Move
     log_start: float
     log_start_error: float
-    notes: tuple[str, ...]
+    log_volume: float
     best: float = -np.inf
     log_z_over_best: float = -np.inf
     n_stuck: int = 0
@@ -115,14 +98,9 @@ def settings_of_run(
     ParameterError if the move is not a dataclass, which a checkpoint requires.
     """
     _numeric_fields_of_move(move)
-    return {
-        "names": list(names),
-        "n_live": n_live,
-        "n_replaced": n_replaced,
-        "move": _value_as_text(move),
-        "stop": _value_as_text(stop),
-        "seed_state": seed_state,
-    }
+    texts = {"move": _value_as_text(move), "stop": _value_as_text(stop)}
+    counts = {"names": list(names), "n_live": n_live, "n_replaced": n_replaced}
+    return {**counts, **texts, "seed_state": seed_state}
 
 
 def _value_as_text(value: object) -> str:
@@ -147,17 +125,15 @@ class CheckpointFile:
     _state_in_file: RunState | None = None
 
     def __post_init__(self) -> None:
-        if not self.every_s >= 0:
-            raise ParameterError("checkpoint_every_s", self.every_s, "0 or more")
+        with contextlib.suppress(OSError):  # the next lines report a folder that cannot be created
+            self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.is_dir():
-            raise FileError(self.path, "a folder", "a file in an existing, writable folder")
+            raise FileError(self.path, "a folder", _WRITABLE)
         try:
             # Fail now, before anything is computed.
             tempfile.TemporaryFile(dir=self.path.parent).close()
         except OSError as error:
-            raise FileError(
-                self.path, f"cannot be written ({error.strerror})", "a file in an existing, writable folder"
-            ) from error
+            raise FileError(self.path, f"cannot be written ({error.strerror})", _WRITABLE) from error
 
     def save_if_due(self, now: RunState) -> None:
         """Save once `every_s` and ten times the duration of the last saving have passed; always if `every_s` is 0."""
@@ -169,8 +145,12 @@ class CheckpointFile:
         if now is self._state_in_file:
             return
         begun = time.monotonic()
+        head = {name: value for name, value in vars(now).items() if name not in ("live", "dead", "moving")}
+        head |= {"format": _FORMAT, "settings": self.settings, "moving": _numeric_fields_of_move(now.moving)}
+        parts = {"live": now.live, **({"dead": DeadPoints.join(*now.dead)} if now.dead else {})}
+        arrays = {f"{which}_{name}": array for which, part in parts.items() for name, array in vars(part).items()}
         try:
-            write_bytes_atomically(self.path, self._file_content(now))
+            write_bytes_atomically(self.path, archive_bytes(head, arrays))
             self._state_in_file = now
         except FileError as error:
             warnings.warn(f"{error}; the run goes on unsaved", NotSavedWarning, stacklevel=2)
@@ -178,41 +158,26 @@ class CheckpointFile:
             self._last_saving = time.monotonic()
             self._saving_time_s = self._last_saving - begun
 
-    def _file_content(self, now: RunState) -> bytes:
-        head = {
-            "format": _FORMAT,
-            "settings": self.settings,
-            "moving": _numeric_fields_of_move(now.moving),
-            "log_volume": now.live.log_volume,
-            "sizes": [len(d.points) for d in now.dead],
-            "rng_state": now.rng_state,
-            **{name: getattr(now, name) for name in _PLAIN},
-        }
-        arrays = {f"live_{name}": array for name, array in (vars(now.live.points) | vars(now.live.births)).items()}
-        if now.dead:
-            dead, births = (
-                Points.join(*(d.points for d in now.dead)),
-                BirthRecords.join(*(d.births for d in now.dead)),
-            )
-            arrays |= {f"dead_{name}": array for name, array in (vars(dead) | vars(births)).items()}
-            arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
-        return archive_bytes(head, arrays)
-
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> RunState | None:
         """Read the state of the run and set `rng` and the count of `evaluate` to it; None where there is no file.
 
-        Raises
-        ------
-        FileError
-            If the file is damaged, or of a run with other settings, prior or likelihood.
+        `move`, the one given on resuming, gets the tuned numbers of the file. FileError if the file is damaged, or of a
+        run with other settings, prior or likelihood.
         """
         if not self.path.exists():
             return None
         cure = "delete the file to start anew"
         head, arrays = read_archive(self.path, _FORMAT, "a checkpoint of this run; delete it to start anew", cure=cure)
-        if head["settings"] != self.settings:
-            raise self._error_for_other_settings(head["settings"])
-        now = _run_state_from_file(head, arrays, move)
+        if (settings := head.pop("settings")) != self.settings:
+            raise self._error_for_other_settings(settings)
+        assert is_dataclass(move)  # as settings_of_run requires
+        moving = replace(move, **head.pop("moving"))
+
+        def points(kind: type[LivePoints], which: str) -> Any:
+            return kind(*(arrays[f"{which}_{f.name}"] for f in fields(kind)))
+
+        dead = (points(DeadPoints, "dead"),) if "dead_u" in arrays else ()
+        now = RunState(points(LivePoints, "live"), dead, moving, **head)
         self._require_same_problem(now, evaluate)
         evaluate.n_calls = now.n_calls
         rng.bit_generator.state = now.rng_state
@@ -232,38 +197,16 @@ class CheckpointFile:
         return FileError(self.path, f"of a run with {why}", f"{allowed}; {_WAY_OUT}")
 
     def _require_same_problem(self, now: RunState, evaluate: Evaluator) -> None:
-        points = now.live.points
-        theta, log_density = evaluate.space.leave(points.u)
-        scale = np.abs(points.theta).max(axis=0)
-        if not (_nearly_equal(theta, points.theta, scale) and _nearly_equal(log_density, points.log_density, 1.0)):
+        theta, log_density = evaluate.space.leave(now.live.u)
+        scale = np.abs(now.live.theta).max(axis=0)
+        if not (_nearly_equal(theta, now.live.theta, scale) and _nearly_equal(log_density, now.live.log_density, 1.0)):
             why = "another prior: it leads from its live points' coordinates to other parameters"
             raise FileError(self.path, f"of a run with {why}", f"the same problem; {_WAY_OUT}")
-        then = points.log_likelihood[:1]
-        again = evaluate.log_likelihood(points.theta[:1])
+        then = now.live.log_likelihood[:1]
+        again = evaluate.log_likelihood(now.live.theta[:1])
         if not _nearly_equal(again, then, 1.0 + np.abs(then)):
             why = f"another likelihood: its first live point had {then[0]:.10g}, now {again[0]:.10g}"
             raise FileError(self.path, f"of a run with {why}", f"the same problem and readings; {_WAY_OUT}")
-
-
-def _run_state_from_file(head: dict[str, Any], arrays: dict[str, np.ndarray], move: Move) -> RunState:
-    """Rebuild the state of a run from the JSON head and the arrays of a checkpoint.
-
-    `move`: the one given on resuming; it gets the tuned numbers of the file.
-    """
-
-    def rows_of(which: str, rows: slice) -> tuple[Points, BirthRecords]:
-        columns = (tuple(arrays[f"{which}_{name}"][rows] for name in names) for names in (_POINTS, _BIRTHS))
-        return Points(*next(columns)), BirthRecords(*next(columns))
-
-    ends = np.cumsum(np.asarray(head["sizes"], dtype=np.int64))
-    dead = []
-    for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):
-        rows = slice(int(end - size), int(end))
-        dead.append(DeadPointsOfRound(*rows_of("dead", rows), *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
-    assert is_dataclass(move)  # as settings_of_run requires
-    live = LivePoints(*rows_of("live", slice(None)), float(head["log_volume"]))
-    plain = {name: head[name] for name in _PLAIN} | {"notes": tuple(head["notes"])}
-    return RunState(live, tuple(dead), replace(move, **head["moving"]), rng_state=head["rng_state"], **plain)
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:

@@ -1,4 +1,4 @@
-"""Weighted samples: effective sample size, resampling and quantiles."""
+"""Weighted samples: effective sample size, resampling and quantiles; and the Student-t that proposals are made of."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from scipy.special import gammaln
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
@@ -67,3 +68,16 @@ def weighted_quantiles(
         mass = weight[order]
         out[:, i] = np.interp(levels, (np.cumsum(mass) - 0.5 * mass) / mass.sum(), values[order, i])
     return out
+
+
+def student_t_draws(n: int, n_params: int, degrees_of_freedom: float, *, rng: np.random.Generator) -> FloatArray:
+    """Draw from the multivariate Student-t about 0 whose scale matrix is the identity, (n, n_params)."""
+    white = rng.standard_normal((n, n_params))
+    white *= np.sqrt(degrees_of_freedom / rng.chisquare(degrees_of_freedom, size=(n, 1)))
+    return white
+
+
+def student_t_log_norm(n_params: int, degrees_of_freedom: float) -> float:
+    """Return the log of that density at 0; at a distance r it is (1 + r^2 / nu)^(-(nu + n_params) / 2) times that."""
+    nu = degrees_of_freedom
+    return float(gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi))

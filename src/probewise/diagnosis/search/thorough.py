@@ -26,6 +26,7 @@ from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocab
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.words import combination_label
 from probewise.errors import DoubtfulResultWarning
+from probewise.nested.repartition import repartitioned
 from probewise.progress import Progress, silent
 
 A_NAT = 1.0
@@ -120,7 +121,7 @@ def weigh_thoroughly(
         Source of randomness.
     n_live
         Live points of each run, or more if there are many parameters. The first run, from the whole prior, locates the
-        posterior; further runs, from priors near it (`probewise.nested.repartitioned`), estimate the evidence until its
+        posterior; further runs, from priors near it (`probewise.nested.repartition`), estimate the evidence until its
         error is small.
     progress
         Called first with an estimate of the minutes, from timed evaluations of the hypotheses; then after every round.
@@ -281,7 +282,7 @@ def _evidence_near_posterior(
     """
     runs: list[nested.NestedResult] = []
     while True:
-        nearer = nested.repartitioned(problem, theta)
+        nearer = repartitioned(problem, theta)
         found = run(nearer)
         runs.append(found)
         sharper = nested.refine(found, nearer, rng=rng, look=False)

@@ -116,7 +116,7 @@ SAID = [
         "them for heavy-tailed noise, gives p = 0.0001).",
     ),
     (
-        judged("named", ("lag",)).with_verdict_withdrawn(),
+        replace(judged("cannot_tell", ()), hypotheses=judged("named", ("lag",)).hypotheses, withdrawn=True),
         {},
         "Something is missing (p = 0.0001); a sensor that follows slowly fits these readings best, but predicts "
         "held-out readings far worse "

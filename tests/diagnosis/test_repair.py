@@ -37,7 +37,6 @@ def test_a_repair_that_predicts_the_same_changes_nothing():
 def test_what_samples_lack_is_left_open_in_its_share():
     marks = {"lag": np.array([False, False, True, False]), "step": np.array([True, True, True, False])}
     assert repair(marks).combination_shares == {("lag",): 0.5, (): 0.25, ("lag", "step"): 0.25}
-    assert repair(marks).effects_in_all_samples == ("outliers",)
 
 
 def test_the_samples_are_told_in_words_with_their_shares():

@@ -208,11 +208,6 @@ def test_noise_is_no_verdict_if_most_of_the_probability_is_on_the_mean():
     assert by_what_is_shared("noise", ("outliers",), {("outliers",): 0.5, ("drift",): 0.5})[0] == "noise"
 
 
-def test_what_fails_on_held_out_readings_is_withdrawn():
-    judged = Judged("named", ("lag",), 1e-6, (Hypothesis(("lag",), 1.0),)).with_verdict_withdrawn()
-    assert (judged.verdict, judged.combination, judged.withdrawn) == ("cannot_tell", (), True)
-
-
 def test_the_unknown_is_shared_out_over_what_it_may_be():
     hypotheses = (Hypothesis(("unknown",), 0.8), Hypothesis((), 0.2))
     judged = Judged("unknown", ("unknown",), 1e-6, hypotheses, unknown_shares={"time": 0.25, "level": 0.75})

@@ -175,7 +175,8 @@ def judged_and_best_repair(
     on_mean = tuple(name for name in judged.repaired_by if name not in on_noise)
     best = BestRepair.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
     if judged.verdict == "named" and predicts_far_worse(best.improvement):  # it is no repair
-        return judged.with_verdict_withdrawn(), BestRepair.of(searched, test, null, noise, rng=rng)
+        judged = replace(judged, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
+        return judged, BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best
 
 

@@ -1,13 +1,11 @@
 """Diagnosis of a user's simulator against a table: fit it, scale the effects to the fit, run the engine.
 
 The integration step is chosen for the residuals of the law without effects. The repaired law's are smaller, and its
-predictions may change by more than their noise where the step is halved: then what has a chance is refitted at a finer
-step, or the search is made again.
+predictions may change by more than their noise where the step is halved: then all is done again at a finer step.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -19,7 +17,7 @@ from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
-from probewise.diagnosis.fit import Fit, Model
+from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.left_out import (
     NEAR_END,
     readings_near_ends,
@@ -29,18 +27,15 @@ from probewise.diagnosis.left_out import (
     without_readings_near_ends,
     without_unpredictable_readings,
 )
+from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import find_lost_readings
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.prior_odds import Names
-from probewise.diagnosis.search.refits import WeighedFit
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.thorough import A_NAT
 from probewise.diagnosis.simulator_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.effects import NamedEffect
-from probewise.errors import NotConvergedError, ParameterError
+from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, table_for
@@ -144,7 +139,7 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
 
-    def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> tuple[Searched, Diagnosis]:
+    def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
         if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
@@ -153,19 +148,16 @@ def diagnose_system(
             searched = replace(found, prepared=prepared)
         else:
             searched = search_prepared(prepared, progress=told)
-        return searched, diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
+        return diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
 
-    searched, diagnosis = fit_and_diagnose(simulator)
+    diagnosis = fit_and_diagnose(simulator)
     needed = finer_step_for_repair(diagnosis)
     if needed is None:
         return diagnosis
     step, stiff = needed
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    finer = searched_at_step(searched, step, stiff=stiff, progress=progress)
-    if finer is not None:
-        return diagnosis_of_search(finer, thorough=thorough, progress=progress, rng=rng)
-    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff)[1]
+    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff)
 
 
 def prepare_system(
@@ -182,11 +174,8 @@ def prepare_system(
 
     A law is integrated by a linearly implicit method if `stiff`, or where it needs one.
     """
-    recording = replace(
-        recording_from_table(simulator, table),
-        source=source or simulator.source,
-        notes=(*table.notes, *notes, *note_on_row_order(simulator, table)),
-    )
+    said = (*table.notes, *notes, *note_on_row_order(simulator, table))
+    recording = replace(recording_from_table(simulator, table), source=source or simulator.source, notes=said)
     system = System.of(simulator, table, stiff=stiff)
     if with_effects and len(table) < 2:  # nothing can change along it
         raise ParameterError("the table", "one row", f"{system.least_readings} rows or more, not all readings equal")
@@ -208,14 +197,11 @@ def prepare_system(
     plain = system
     system, found, sd = fit_system(plain, recording)
     first = SimulatorApparatus(ReferenceFit(system, table, found.z, sd))
-    lost = find_lost_readings(
-        found.model,
-        recording,
-        found,
-        list(system.starts),
-        lambda fitted: first.covariates_and_predicted_slope(fitted, recording)[0],
-        sd=sd,
-    )
+
+    def covariates(fitted: Fit) -> Sequence[Covariate]:
+        return first.covariates_and_predicted_slope(fitted, recording)[0]
+
+    lost = find_lost_readings(found.model, recording, found, list(system.starts), covariates, sd=sd)
     effect = None if lost is None else lost.effect(recording)
     if lost is not None:
         told("fitting the simulator without lost readings")
@@ -295,7 +281,6 @@ def _notes_on_integration(tally: IntegrationTally, most: int, *, sets_step: bool
 
 
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
-_HAS_A_CHANCE = 0.01  # probability from which a combination is refitted at the finer step
 
 
 def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
@@ -316,71 +301,3 @@ def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
         return None
     needed = still.max_step, still.stiff
     return needed if needed != (system.max_step, system.stiff) else None
-
-
-def searched_at_step(
-    searched: Searched, max_step: float, *, stiff: bool = False, progress: Progress = silent
-) -> Searched | None:
-    """Return a search with the combinations that have a chance refitted at another step, from their own parameters.
-
-    None if one of them, the most probable first, gains or loses more than a nat: then errors of the integration may
-    have led the search, and it has to be made again.
-
-    `max_step`, `stiff`: the step, in the unit of time, and whether a linearly implicit method takes it.
-    """
-    prepared = searched.prepared
-    apparatus = cast(SimulatorApparatus, prepared.apparatus)
-    finer = replace(cast(System, prepared.null), max_step=max_step, stiff=stiff)
-    fits, unknown = dict(searched.evidences.fits), dict(searched.evidences.unknown)
-    with_a_chance = _combinations_with_a_chance(searched)
-    asked = [*with_a_chance, *([] if () in with_a_chance else [()])]  # the null is part of every report
-    keys = [key for names in asked for key in searched.evidences.fits if key[1] == names]
-    for k, key in enumerate(keys):
-        progress("refitting at a finer step", k, len(keys))
-        held = searched.evidences.fits[key]
-        try:
-            again = _refitted(searched, held, finer)
-        except NotConvergedError:
-            return None
-        moved = {noise: again.evidence[noise].log_z - e.log_z for noise, e in held.evidence.items()}
-        if key[1] in with_a_chance and not abs(again.log_z - held.log_z) < A_NAT:
-            return None
-        fits[key] = again
-        unknown |= {
-            (n, names, noise): value + moved[noise]
-            for (n, names, noise), value in unknown.items()
-            if (n, names) == key and math.isfinite(moved[noise])
-        }
-    return replace(
-        searched,
-        prepared=replace(
-            prepared,
-            null=finer,
-            apparatus=replace(apparatus, finer=replace(apparatus.system, max_step=max_step, stiff=stiff)),
-        ),
-        nulls=dict.fromkeys(searched.nulls, finer),
-    ).with_evidences(replace(searched.evidences, fits=fits, unknown=unknown))
-
-
-def _combinations_with_a_chance(searched: Searched) -> list[Names]:
-    """List the refitted combinations with a probability of 0.01 or more, most probable first.
-
-    With or without an unknown effect beside: if that is probable, so are the fits that it is most probable beside.
-    """
-    chance = searched.posterior.marginal_over_noise
-    unknown, beside = chance.get(("unknown",), 0.0), dict[Names, float]()
-    for (_, names, _), value in searched.evidences.unknown.items():
-        beside[names] = max(value + searched.prior.log_prior_with_unknown(names), beside.get(names, -math.inf))
-    most = max(beside.values(), default=0.0)
-    refitted = dict.fromkeys(names for _, names in searched.evidences.fits)
-    own = {
-        names: max(chance.get(names, 0.0), unknown * math.exp(beside.get(names, -math.inf) - most))
-        for names in refitted
-    }
-    return sorted((names for names in refitted if own[names] >= _HAS_A_CHANCE), key=lambda names: -own[names])
-
-
-def _refitted(searched: Searched, held: WeighedFit, system: System) -> WeighedFit:
-    model = Model(system, held.found.model.effects, held.found.model.plan)
-    again = searched.refits.fit_and_weigh(model, held.found.z[None, :], held.law)
-    return again.with_variant_factor_and_weights(held.log_share, held.weights)

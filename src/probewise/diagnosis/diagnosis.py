@@ -46,22 +46,9 @@ class VerdictReport:
 class Diagnosis(ShowsItself):
     """The result of a diagnosis: the content of diagnosis.json, and the arrays for its figures.
 
-    Attributes
-    ----------
-    recording
-        The diagnosed recording (several are joined).
-    judged
-        Verdict, probabilities, aliases.
-    repair
-        The calibrated and the repaired model, and the gain.
-    where
-        Places (ranges of covariates) of the repair's effects, largest first, then of other significant residuals.
-    next_measurement
-        The next measurement to make; None if no question is open, or no readings would answer it.
-    report
-        The verdict in words, and the numbers of effects and noise.
-    apparatus
-        What took the readings: a light sensor, or a user's simulator over a table.
+    `recording` is what was diagnosed (several are joined). `where`: places (ranges of covariates) of the repair's
+    effects, largest first, then of other significant residuals. `next_measurement`: None if no question is open, or no
+    readings would answer it.
     """
 
     recording: Recording
@@ -129,7 +116,9 @@ class Diagnosis(ShowsItself):
             odd = "probability of readings at least this odd if nothing is missing from the mean"
             lines.append(f"{p_in_words(self.p_value)} ({odd})")
         lines.append("probability  explanation")
-        lines += [f"  {h.probability:9.3f}  {_with_code(h)}" for h in self.hypotheses[:5] if h.probability > 1e-3]
+        for h in (h for h in self.hypotheses[:5] if h.probability > 1e-3):
+            words, code = hypothesis_in_words(h.effects), h.label
+            lines.append(f"  {h.probability:9.3f}  {words if words == code else f'{words} ({code})'}")
         # The reason is not repeated.
         lines += [
             f"{self.apparatus.words.as_sentence(e.sentence)} ({name_without_copy_suffix(e.name)}, probability "
@@ -156,11 +145,6 @@ class Diagnosis(ShowsItself):
         if self.repair.combination_shares:
             lines.append(f"samples of the repaired model contain {self.repair.shares_in_words}")
         return "\n".join(lines)
-
-
-def _with_code(hypothesis: Hypothesis) -> str:
-    words, label = hypothesis_in_words(hypothesis.effects), hypothesis.label
-    return words if words == label else f"{words} ({label})"
 
 
 def require_diagnosis(diagnosis: object) -> None:
@@ -222,18 +206,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for place in diagnosis.where
         ],
-        "improvement": {
-            "log_evidence": gain.log_evidence,
-            "heldout_log_density_per_reading": gain.heldout_log_density_per_reading,
-            "heldout_sd": gain.heldout_sd,
-            "rms_before": gain.rms_before,
-            "rms_after": gain.rms_after,
-            "p_value_after": gain.p_value_after,
-        },
-        "aliases": [
-            {"effects": list(a.effects), "cosine": a.cosine, "settle_by": a.settle_by, "readings": a.readings}
-            for a in diagnosis.judged.aliases
-        ],
+        "improvement": {key: value for key, value in asdict(gain).items() if key != "heldout_by_scan"},
+        "aliases": [asdict(a) | {"effects": list(a.effects)} for a in diagnosis.judged.aliases],
         "noise": {
             "model": diagnosis.report.noise.model,
             "p_value": diagnosis.report.noise.p_value,
@@ -255,9 +229,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             document["remainder"]["formula"] = _formula_json(remainder.formula)
     if formula is not None:
         document["formula"] = _formula_json(formula)
-    return document | (
-        {"thorough": [_weighing_json(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
-    )
+    if diagnosis.report.weighings:
+        document["thorough"] = [_weighing_json(w) for w in diagnosis.report.weighings]
+    return document
 
 
 def _public_names(effects: Iterable[str]) -> list[str]:
@@ -281,10 +255,4 @@ def _formula_json(formula: Formula) -> dict[str, Any]:
 
 
 def _parameter_json(found: ParameterFound) -> dict[str, Any]:
-    return {
-        "name": found.name,
-        "unit": found.unit,
-        "mean": found.mean,
-        "sd": found.sd,
-        "interval95": list(found.interval95),
-    }
+    return asdict(found) | {"interval95": list(found.interval95)}

@@ -25,7 +25,6 @@ from probewise.diagnosis.words import p_in_words, substitute_reading_unit
 from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
 from probewise.effects.noise import Dropouts
-from probewise.recordings.plan import Plan
 
 _LEAST_PROBABILITY = 1e-3
 _IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
@@ -95,13 +94,19 @@ def effects_found(
         beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()
     unit = plan.instrumentation.unit
     drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
+    ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
+
+    def likeliest_candidate_with(name: str) -> tuple[WeighedFit | None, Names]:
+        fits = ((searched.best_refit_of(*key), key[1]) for key, p in ranked if p > 0 and name in (*key[0], *key[1]))
+        return next(((fit, noise) for fit, noise in fits if fit is not None), (None, ()))
+
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
         if beside.get(name, 0.0) >= _STANDS_BESIDE and not is_out_of_vocabulary(name):
             p += unknown * beside[name]
         if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)):
             continue
-        holder, noise = (best.fit, best.noise) if name in samples.effects else _likeliest_candidate_with(searched, name)
+        holder, noise = (best.fit, best.noise) if name in samples.effects else likeliest_candidate_with(name)
         if holder is None:
             effect, values, size = _samples_of_insignificant(searched, effect, rng=rng)
         else:
@@ -114,29 +119,12 @@ def effects_found(
             values, size = own.effect_samples(name), _lambda_of(searched, holder, name, noise)
         of_curve = name.startswith("curve:") and name in samples.effects
         formula, said = _formula_of_curve(searched, best, name, rng=rng) if of_curve else (None, "")
-        out.append(
-            EffectFound(
-                name,
-                min(p, 1.0),
-                size,
-                sentence_from_samples(effect, values) + said,
-                (*parameters_found(effect, values, unit), *_scan_numbers_found(effect, plan)),
-                effect.scans,
-                formula,
-            )
-        )
+        parameters, said = parameters_found(effect, values, unit), sentence_from_samples(effect, values) + said
+        numbers = np.flatnonzero([scan in effect.scans for scan in plan.scan_names]).astype(np.float64)
+        if numbers.size:  # from 0, of the scans to which it is bound
+            parameters = (*parameters, _parameter_found("scans", "scan", numbers))
+        out.append(EffectFound(name, min(p, 1.0), size, said, parameters, effect.scans, formula))
     return tuple(sorted(out, key=lambda e: -e.probability))
-
-
-def _likeliest_candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
-    """Return the most probable refit that contains an effect, and its noise effects; None, () if there is none."""
-    ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
-    for (mean, noise), p in ranked:
-        if p > 0 and name in (*mean, *noise):
-            candidate = searched.best_refit_of(mean, noise)
-            if candidate is not None:
-                return candidate, noise
-    return None, ()
 
 
 def _samples_of_insignificant(
@@ -242,11 +230,6 @@ def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) ->
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
         if name not in fixed
     )
-
-
-def _scan_numbers_found(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
-    numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
-    return (_parameter_found("scans", "scan", numbers),) if numbers.size else ()
 
 
 def _parameter_found(name: str, unit: str, values: FloatArray) -> ParameterFound:

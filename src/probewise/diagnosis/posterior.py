@@ -12,7 +12,7 @@ point. Negligible changes of the readings are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self, TypeAlias
@@ -25,7 +25,7 @@ from probewise.diagnosis.fit import FARTHEST, Fit
 from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
-from probewise.diagnosis.profiled import ProfiledDensity
+from probewise.diagnosis.simulator_posterior import ProblemInBlocks, draw_by_importance
 from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.progress import Progress, silent
@@ -233,7 +233,8 @@ _N_WALKERS = 250
 _MOVES = 6  # of each walker after a step of beta
 _N_FIRST = 1000  # draws of a proposal
 _LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
-_NEARLY_ALL = 0.8  # and where slices of the simulation itself cost little
+_NEARLY_ALL = 0.8  # and where adaptive importance sampling costs little
+_SIZES = 1000, 60, 8, 250.0  # of that: draws of a round, kernels, rounds, effective draws that suffice
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -253,10 +254,9 @@ def posterior_draws(
 
     Unless `annealed`, they are draws of Laplace's approximation, or of `LinearAmplitudes` where it applies. Otherwise:
     If an effect on the readings has a nonlinear coordinate, they are resampled from a `ConditionallyLinearDensity`;
-    where many samples cost little more than one, from a `ProfiledDensity` if an effect has a nonlinear coordinate, or
-    else from `LinearAmplitudes`. Without any of these, samples of Laplace's approximation are moved to the posterior in
-    two stages, the first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's
-    samples predict new angles far worse.
+    else, where many samples cost little more than one, they are drawn by adaptive importance sampling. Without either,
+    samples of Laplace's approximation are moved to the posterior in two stages, the first through a quadratic
+    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
 
     `n_samples` is their number; the other parameters are those of `sample_model`.
     """
@@ -271,9 +271,18 @@ def posterior_draws(
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    for weighed in _resampled_from_proposals(laplace, log_posterior, n_samples, rng=rng):
-        if weighed is not None:
-            return weighed
+    in_bulk = found.model.sensor.predicts_in_bulk
+    grid = ConditionallyLinearDensity.of(found, laplace.law, recording, laplace.steps.T @ laplace.steps, laplace.sd)
+    if grid is not None:
+        first, least = grid.draw(n_samples if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
+        drawn = importance_resample(first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least)
+        if drawn is not None:
+            return drawn
+    if in_bulk:
+        asked = ProblemInBlocks(found.model, recording, problem.noise)
+        draws, _ = draw_by_importance(asked, [found], laplace.law, sizes=_SIZES, rng=rng, progress=progress)
+        if draws.n_effective >= _LEAST_OF_IT * _ENOUGH * n_samples:
+            return np.asarray(draws.z[rng.permutation(resampled_rows(draws.weight, n_samples, rng))])
     return _annealed(laplace, steps, log_posterior, n_samples, rng=rng, progress=progress)
 
 
@@ -325,27 +334,6 @@ class _Laplace:
     def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""
         return np.asarray(self.center + rng.standard_normal((n_samples, len(self.center))) @ self.steps)
-
-
-def _resampled_from_proposals(
-    laplace: _Laplace, log_posterior: Density, n_samples: int, *, rng: np.random.Generator
-) -> Iterator[FloatArray | None]:
-    """Yield samples by importance from one proposal after another, None for one that is too far from the posterior."""
-    found, law, recording = laplace.found, laplace.law, laplace.recording
-    in_bulk = found.model.sensor.predicts_in_bulk
-    grid = ConditionallyLinearDensity.of(found, law, recording, laplace.steps.T @ laplace.steps, laplace.sd)
-    if grid is not None:
-        first, least = grid.draw(n_samples if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
-        yield importance_resample(first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least)
-    if not in_bulk:
-        return
-    profiled = ProfiledDensity.of(found, law, recording)
-    if profiled is not None:
-        yield profiled.importance_resample(log_posterior, n_first=_N_FIRST, n_wanted=n_samples, rng=rng)
-    linear = laplace.linear_amplitudes
-    if linear is not None:
-        first = linear.draw(_N_FIRST, rng=rng)
-        yield importance_resample(first, linear.log_density, log_posterior, n_wanted=n_samples, rng=rng)
 
 
 def _annealed(

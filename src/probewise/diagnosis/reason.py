@@ -30,7 +30,7 @@ _OPEN = 0.05  # least probability of a rival: what has less is no open question
 class Grounds:
     """The facts, in addition to the verdict, for the sentence that gives its reason.
 
-    `words`: the apparatus' words; `n_readings`, `least_readings`: usable readings, and the fewest for a verdict;
+    `n_readings`, `least_readings`: usable readings, and the fewest for a verdict;
     `form`: description of the calibrated SSF, "" if there is none; `sentences`: sentence on each effect, by name;
     `like`: sentences on the effects that the unknown one resembles; `family`: the most probable family of bases of the
     unknown effect, such as "time"; `beside`: effects that act in addition to the unknown one; `shows_in`: names of the
@@ -58,12 +58,21 @@ class Grounds:
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:
     """Return the verdict and its reason, in one sentence or two."""
+    n, p = grounds.n_readings, p_in_words(judged.p_value)
+    if judged.too_little and n >= grounds.least_readings:
+        return f"All {n} usable readings are equal: there is no signal to diagnose; {grounds.words.find_signal}."
     if judged.too_little:
-        return _too_little_sentence(grounds)
+        has = "1 usable reading is" if n == 1 else f"{n} usable readings are"
+        return f"{has} too few for a diagnosis; {grounds.least_readings} or more are needed."
     if judged.withdrawn:
-        return _withdrawn_sentence(judged, grounds)
+        leader = hypothesis_in_words(judged.hypotheses[0].effects)
+        worse = f"predicts held-out readings far worse than {grounds.words.null} without it"
+        return f"Something is missing ({p}); {leader} fits these readings best, but {worse}."
+    if judged.verdict == "clean":
+        form = f", {grounds.form}," if grounds.form else ""
+        rare = ", which is rare; nothing that was tried explains them better" if judged.p_value < ALARM else ""
+        return f"The model{form} explains all {n} readings to within their noise ({p}{rare})."
     say = {
-        "clean": _clean_sentence,
         "unknown": _unknown_sentence,
         "cannot_tell": _cannot_tell_sentence,
         "noise": _noise_sentence,
@@ -77,27 +86,6 @@ def combinations_in_reason(judged: Judged) -> list[Names]:
     if judged.shared:
         return [tuple(sorted({*judged.shared, *h.effects})) for h in _rivals_to_name(judged.beside_shared)]
     return [h.effects for h in _rivals_to_name(judged.hypotheses)]
-
-
-def _withdrawn_sentence(judged: Judged, grounds: Grounds) -> str:
-    leader, p = hypothesis_in_words(judged.hypotheses[0].effects), p_in_words(judged.p_value)
-    worse = f"predicts held-out readings far worse than {grounds.words.null} without it"
-    return f"Something is missing ({p}); {leader} fits these readings best, but {worse}."
-
-
-def _too_little_sentence(grounds: Grounds) -> str:
-    n = grounds.n_readings
-    if n >= grounds.least_readings:
-        return f"All {n} usable readings are equal: there is no signal to diagnose; {grounds.words.find_signal}."
-    has = "1 usable reading is" if n == 1 else f"{n} usable readings are"
-    return f"{has} too few for a diagnosis; {grounds.least_readings} or more are needed."
-
-
-def _clean_sentence(judged: Judged, grounds: Grounds) -> str:
-    form = f", {grounds.form}," if grounds.form else ""
-    rare = ", which is rare; nothing that was tried explains them better" if judged.p_value < ALARM else ""
-    p = p_in_words(judged.p_value)
-    return f"The model{form} explains all {grounds.n_readings} readings to within their noise ({p}{rare})."
 
 
 def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:

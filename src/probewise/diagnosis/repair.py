@@ -54,18 +54,10 @@ class PredictionAndResiduals:
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """The calibrated and the repaired model, as posterior samples.
+    """The calibrated and the repaired model, as posterior samples (`null`, `model`), and the gain of the latter.
 
-    Parameters
-    ----------
-    null, model
-        Posterior samples of the calibrated and of the repaired model.
-    improvement
-        Gain of the repaired model.
-    before, after
-        Predictions and residuals of the calibrated and of the repaired model, for all rows, under the same noise.
-    by_rows
-        Whether an unknown effect is corrected row by row; `improvement` and `after` include that, `model` does not.
+    `before`, `after`: predictions and residuals of both, for all rows, under the same noise. `by_rows`: whether an
+    unknown effect is corrected row by row; `improvement` and `after` include that, `model` does not.
     """
 
     null: ModelSamples
@@ -107,15 +99,10 @@ class Repair:
         return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
 
     @property
-    def effects_in_all_samples(self) -> tuple[str, ...]:
-        """Effects that all samples of the repaired model contain."""
-        return tuple(name for name in self.model.effects if name not in self.model.absent)
-
-    @property
     def shares_in_words(self) -> str:
         """Which effects all samples of the repaired model contain, and which only a share of them, in words."""
-        everywhere, nothing = self.effects_in_all_samples, "no effect"
-        opening = ""
+        everywhere = tuple(name for name in self.model.effects if name not in self.model.absent)
+        opening, nothing = "", "no effect"
         if everywhere:
             opening, nothing = f"{join_names(effects_in_words(everywhere))}; beside that ", "nothing more"
         held = (

@@ -145,7 +145,13 @@ class _Kernels:
 
 
 def draw_by_importance(
-    problem: ProblemInBlocks, fits: Sequence[Fit], law: NoiseLaw, *, rng: np.random.Generator, progress: Progress
+    problem: ProblemInBlocks,
+    fits: Sequence[Fit],
+    law: NoiseLaw,
+    *,
+    sizes: tuple[int, int, int, float] | None = None,
+    rng: np.random.Generator,
+    progress: Progress,
 ) -> tuple[Draws, bool]:
     """Draw from a posterior by adaptive importance sampling from its modes; return the draws, and whether they settled.
 
@@ -161,12 +167,14 @@ def draw_by_importance(
         Its modes, the most probable first.
     law
         White noise of the readings.
+    sizes
+        Draws of a round, kernels, rounds at most, and effective draws that suffice.
     rng, progress
         Source of randomness; called after each round.
     """
     ridge = _Ridge(problem, fits[0], law)
     sensor, n_params = problem.model.sensor, problem.model.n_params
-    n_draws, n_kernels, n_rounds, enough = _SIZES[sensor.predicts_in_bulk]
+    n_draws, n_kernels, n_rounds, enough = sizes or _SIZES[sensor.predicts_in_bulk]
     kernels, proposals = ridge.kernels_at_modes(fits), list[_Kernels]()
     z, (log_prior, log_likelihood, log_mixture) = np.zeros((0, n_params)), np.zeros((3, 0))
     before, log_share = (math.inf, np.zeros(n_params)), -math.log(_PER_PRIOR)
@@ -212,7 +220,7 @@ class _Ridge:
         self.eye = np.eye(len(best.z))
 
     def _variance(self, found: Fit) -> float:
-        return max(found.sd, LEAST_SCALE) ** 2 * self.law.n_kept / self.free
+        return max(found.sd, LEAST_SCALE) ** 2 * self.law.n_kept / self.free / self.law.fisher_information
 
     def _linearise(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Return slopes (k, n_params, n), residuals (k, n), both in noise sds, precisions, and which are possible."""

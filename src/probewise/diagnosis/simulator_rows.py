@@ -234,20 +234,18 @@ class SimulatorApparatus(Apparatus):
     """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
 
     `about`: the system, its table, the first fit, and the sd of a reading; `stop`: the level at which the meter stops
-    without having declared it, if the readings show one; `finer`: the system with a finer integration step, if the
-    leading hypotheses were refitted with one. Effects keep the scales and origins of `about`. `lost`: the effect that
-    lost readings which were left out, if any.
+    without having declared it, if the readings show one; `lost`: the effect that lost readings which were left out, if
+    any.
     """
 
     about: ReferenceFit
     stop: MeterStop | None = None
-    finer: System | None = None
     lost: Dropouts | None = None
 
     @property
     def system(self) -> System:
         """The simulator over the runs of the table."""
-        return self.finer or self.about.system
+        return self.about.system
 
     @property
     def rows_are_in_order(self) -> bool:

@@ -107,19 +107,6 @@ def shared_effects(probabilities: Mapping[Names, float]) -> Names:
     return tuple(sorted(shared))
 
 
-def probabilities_beside(shared: Names, probabilities: Mapping[Names, float]) -> dict[Names, float]:
-    """Return, most probable first, what acts beside shared effects: () for nothing more, and its probability.
-
-    Hypotheses that lack one of the shared effects are left out.
-    """
-    beside = {
-        tuple(name for name in names if name not in shared): p
-        for names, p in probabilities.items()
-        if {*shared} <= {*names}
-    }
-    return dict(sorted(beside.items(), key=lambda item: -item[1]))
-
-
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
 
@@ -160,10 +147,6 @@ class Judged:
     shared: Names = ()
     leader: Names = ()
 
-    def with_verdict_withdrawn(self) -> Judged:
-        """Return a copy whose verdict is `cannot_tell`, names no effect and is marked as `withdrawn`."""
-        return replace(self, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
-
     @property
     def repaired_by(self) -> Names:
         """The set of effects by which the model is repaired: the `combination`, or the larger set that leads."""
@@ -177,18 +160,26 @@ class Judged:
     @property
     def beside_shared(self) -> tuple[Hypothesis, ...]:
         """What may act beside the `shared` effects, most probable first; () is nothing more."""
-        found = probabilities_beside(self.shared, {h.effects: h.probability for h in self.hypotheses})
-        return tuple(Hypothesis(names, p) for names, p in found.items())
+        beside = [
+            Hypothesis(tuple(name for name in h.effects if name not in self.shared), h.probability)
+            for h in self.hypotheses
+            if {*self.shared} <= {*h.effects}
+        ]
+        return tuple(sorted(beside, key=lambda h: -h.probability))
+
+    def probability_of(self, effects: Names) -> float:
+        """Return the probability of a hypothesis, 0 of one that is not among those compared."""
+        return next((h.probability for h in self.hypotheses if h.effects == effects), 0.0)
 
     @property
     def unknown_probability(self) -> float:
         """Probability of an effect on the mean that is out of vocabulary and not named."""
-        return next((h.probability for h in self.hypotheses if h.effects == ("unknown",)), 0.0)
+        return self.probability_of(("unknown",))
 
     @property
     def clean_probability(self) -> float:
         """Probability that no effect is missing, neither on the mean nor on the noise."""
-        return next((h.probability for h in self.hypotheses if not h.effects), 0.0)
+        return self.probability_of(())
 
     @property
     def credible(self) -> tuple[str, ...]:
@@ -209,8 +200,9 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
 
     The probability of what is out of vocabulary counts `unknown_weight` times against all others.
     """
-    prepared, posterior = searched.prepared, searched.posterior
+    prepared, prior = searched.prepared, searched.prior
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
+    on_noise, certain, half = prepared.pure_noise_effect_names, frozenset(searched.certain), prior.named_needs_half
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
         noise = prepared.noise_effect_names & {*combination}
@@ -223,11 +215,11 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
         return verdict_and_combination(
             hypotheses,
             test.p_value,
-            noise_names=prepared.pure_noise_effect_names,
+            noise_names=on_noise,
             aliases=pairs,
             aliased_with=aliased_combinations,
-            certain=frozenset(searched.certain),
-            named_needs_half=searched.prior.named_needs_half,
+            certain=certain,
+            named_needs_half=half,
         )
 
     hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
@@ -235,7 +227,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
     )
     if (
         verdict == "unknown"
-        and searched.prior.named_needs_half
+        and half
         and credible_labels(hypotheses) != ("unknown",)  # otherwise nothing named is left to lead instead
         and searched.evidences.one_name_outweighs_unnamed()
     ):
@@ -249,13 +241,11 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
         test.p_value,
         hypotheses,
         aliases=pairs,
-        order_probabilities=dict(posterior.order_probabilities),
+        order_probabilities=dict(searched.posterior.order_probabilities),
         unknown_shares=searched.probabilities_of_unknown_forms(besides=rare),
         too_little=prepared.has_too_little_data,
     )
-    if searched.prior.named_needs_half and not judged.too_little:
-        judged = with_shared_effects(judged, prepared.pure_noise_effect_names, certain=frozenset(searched.certain))
-    return judged
+    return with_shared_effects(judged, on_noise, certain=certain) if half and not judged.too_little else judged
 
 
 def hypotheses_with_verdict(

@@ -1,4 +1,4 @@
-"""A proposal density in slices along one coordinate."""
+"""Adaptive importance sampling, against a long chain."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from refitted import refitted_with
 from scipy.special import ndtr
 
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.profiled import ProfiledDensity
 from probewise.diagnosis.samples import sample_model
 from probewise.systems import RunTable, Simulator
 
@@ -63,7 +62,6 @@ def test_intervals_of_a_time_constant_hold_what_they_say_of_the_exact_posterior(
     for seed in (1, 2, 3):
         recording, candidate, evidence = _settled(seed)
         found = candidate.found
-        assert ProfiledDensity.of(found, evidence.likeliest_law, recording) is not None
         samples = sample_model(
             found, evidence, recording, weights=candidate.weights, rng=np.random.default_rng(seed), annealed=True
         )

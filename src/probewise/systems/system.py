@@ -21,10 +21,10 @@ from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
 from probewise.systems.calls import Caller, IntegrationTally, user_function_error
-from probewise.systems.law import LawWithEffects, evaluations_per_step, integrate_readings, readings_of_states
+from probewise.systems.law import LawWithEffects, evaluations_per_step, integrate_states, readings_of_states
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.simulator import Simulator
-from probewise.systems.step import RowsInRuns, Steps, steps_for_table
+from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import RunTable, relative_sds_of_column
 
 _N_STARTS = 8
@@ -131,7 +131,7 @@ class System:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or RowsInRuns(table).typical_gap, stiff=stiff)
+        system = replace(bare, max_step=simulator.law.max_step_s or Steps(table).typical_gap, stiff=stiff)
         system.require_working_law(table)
         return system
 
@@ -156,7 +156,8 @@ class System:
         for z in self.starts:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
-                readings.append(integrate_readings(LawWithEffects(law), self.steps(table), parameters, columns))
+                states = integrate_states(law, self.steps(table), parameters, columns)
+                readings.append(readings_of_states(law, states, parameters, columns))
             except ProbewiseError:
                 raise
             except Exception as error:
@@ -496,7 +497,7 @@ def with_converged_step(
         cost = _cost_of_integration(found, table)
     except ParameterError as error:
         found, cost = error, math.inf
-    stiff = replace(system, max_step=max(system.max_step, system.steps(table).places.typical_gap), stiff=True)
+    stiff = replace(system, max_step=max(system.max_step, system.steps(table).typical_gap), stiff=True)
     if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, table):
         try:
             return _halved_until_still(stiff, table, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
@@ -554,11 +555,11 @@ def _cost_of_integration(system: System, table: RunTable) -> float:
     """Return the number of evaluations of the rates, of all samples and runs together."""
     law = system.simulator.law
     assert law is not None
-    schedule = system.steps(table).schedule
-    return float(schedule.n_steps.sum() * evaluations_per_step(LawWithEffects(law), schedule.method))
+    steps = system.steps(table)
+    return float(steps.n_steps.sum() * evaluations_per_step(LawWithEffects(law), steps.method))
 
 
 def _has_affordable_steps(system: System, table: RunTable) -> bool:
     """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
     steps = system.steps(table)
-    return bool(steps.schedule.n_steps.sum() <= _MOST_STEPS + len(steps.places.row_by_position_and_run))
+    return bool(steps.n_steps.sum() <= _MOST_STEPS + len(steps.row_by_position_and_run))

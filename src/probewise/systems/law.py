@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
-from probewise.systems.calls import call_on_read_only, read_only_views
+from probewise.systems.calls import call_on_read_only, number_of_samples, read_only_views
 from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.simulator import Law
 from probewise.systems.step import FOURTH_ORDER, N_LONGER, Rosenbrock, RungeKutta, Steps, Terms
@@ -159,9 +159,9 @@ def states_by_step(
     columns: Mapping[str, NDArray[Any]],
 ) -> Iterator[dict[str, FloatArray]]:
     """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
-    n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
     gaps = time_gaps(steps, columns)
-    s = motion.clip_and_stop_states({}, initial_states(motion.law, steps, parameters, n_samples))
+    start = initial_states(motion.law, steps, parameters, number_of_samples(parameters, columns))
+    s = motion.clip_and_stop_states({}, start)
     with np.errstate(all="ignore"):
         given = LawInputs.of(motion.law, steps, parameters, columns, motion.between_rows)
         yield s

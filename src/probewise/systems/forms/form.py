@@ -98,6 +98,11 @@ class BlockForm(StepForm):
         return np.concatenate([theta[:, :1], drawn], axis=1)
 
 
+def says_value(text: str, unit: str = "") -> Say:
+    """Return the sentence of an effect of one parameter: a text with {value} in place of the value with its sd."""
+    return lambda mean, sd: text.replace("{value}", value_with_sd(mean[0], sd[0], unit))
+
+
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
     """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
     value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH

@@ -540,8 +540,15 @@ def require_effect_kinds(effects: object) -> None:
             raise ParameterError("effects", name, f"{kind.name!r}, the name of that effect")
 
 
+@dataclass(frozen=True)
 class NoiseEffect(NamedEffect[NoiseParameters]):
-    """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True."""
+    """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True.
+
+    A class declares name, words and covariates, prior and units of its parameters, `apply` and `sentence`.
+    """
+
+    stage = Stage.NOISE
+    units = ("1",)
 
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""

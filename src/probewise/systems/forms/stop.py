@@ -14,7 +14,6 @@ from probewise.effects import Extent, NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan, Recording
-from probewise.sensor import Stage
 from probewise.sensor.stages import NoiseParameters
 
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
@@ -41,7 +40,6 @@ class MeterStop(NoiseEffect):
     unit: str = ""
 
     name: ClassVar[str] = "saturation"
-    stage: ClassVar[Stage] = Stage.NOISE
     units: ClassVar[tuple[str, ...]] = ("reading",)
     covariates: ClassVar[tuple[str, ...]] = ("level",)
     amplitudes: ClassVar[tuple[int, ...]] = ()

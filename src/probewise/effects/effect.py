@@ -17,10 +17,9 @@ from probewise._arrays import BoolArray, FloatArray, distinct_values
 from probewise._kinds import require_mapping
 from probewise._words import unit_after_number
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reference import ZERO, Extent, Origin
 from probewise.errors import ParameterError
-from probewise.priors import Marginal, Prior, Product, Uniform
+from probewise.priors import HeavyTailedPrior, Marginal, Prior, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage
 

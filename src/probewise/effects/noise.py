@@ -13,9 +13,8 @@ from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import NoiseEffect
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.priors import LogHeavyTailedPrior
 from probewise.effects.reference import Extent
-from probewise.priors import LogUniform, Product, Uniform
+from probewise.priors import LogHeavyTailedPrior, LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters
 

@@ -13,8 +13,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import Act, Effect, Fixed, Say, StepEffect, VariantMasks, WaveEffect, thinned
-from probewise.effects.priors import HeavyTailedPrior
-from probewise.priors import Uniform
+from probewise.priors import HeavyTailedPrior, Uniform
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.table import RunTable
 

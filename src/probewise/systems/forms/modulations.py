@@ -12,9 +12,8 @@ import numpy as np
 from probewise._arrays import FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import PHASE, ChangePoints, sine_and_cosine_entries
-from probewise.effects.priors import SharedScalePrior
 from probewise.effects.reference import is_far_from_zero
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.priors import LogUniform, Marginal, SharedScalePrior, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import (
     AMPLITUDE,

@@ -12,9 +12,8 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
-from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reading import decaying_sum
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import AMPLITUDE, Act, Fixed, Form, flag, says_value
 from probewise.systems.forms.modulations import (

@@ -23,7 +23,7 @@ from probewise.diagnosis.sensors import default_sensor
 from probewise.diagnosis.templates import _gram_eigensystems
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
-from probewise.effects.priors import SharedScalePrior
+from probewise.priors import SharedScalePrior
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.systems import Simulator, table_for
 

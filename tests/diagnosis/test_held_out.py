@@ -83,3 +83,11 @@ def test_a_parameter_of_one_part_stays_its_own_where_integration_leaves_rounding
     part = np.array([True, True, False, False])
     slopes = np.array([[3.0, 3.0, 3.0, 0.0], [2.0, 2.0, 3.0, 0.0], [0.0, 5e-10, 1e-3, 0.0], [0.0, -5e-10, 3.0, 0.0]])
     np.testing.assert_array_equal(are_of_part_alone(slopes, part), [True, True, False, False])
+
+
+def test_what_comes_next_is_held_out_alone():
+    """The readings numbered -1 are never held out; seven readings are too few."""
+    part = np.where(np.arange(40) < 32, -1, 0)
+    held = mean_gain_over_parts(part, lambda out: np.full(out.sum(), 0.25), ("the last fifth",))
+    assert (held.per_reading, held.n_readings, held.by_scan) == (0.25, 8, (("the last fifth", 0.25),))
+    assert mean_gain_over_parts(part[:-1], lambda out: np.ones(out.sum())).n_readings == 0

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtr, ndtri
 
 from probewise.effects import HeavyTailedPrior
-from probewise.effects.priors import SharedScalePrior
+from probewise.priors import SharedScalePrior
 
 
 def _prior(n):

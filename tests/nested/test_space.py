@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 
 from probewise.calibration import SSFPrior, default_prior
-from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.nested.problem import space_of, unbounded_space_of
-from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
+from probewise.priors import (
+    Empty,
+    HeavyTailedPrior,
+    Joint,
+    LogHeavyTailedPrior,
+    LogUniform,
+    Normal,
+    Prior,
+    Product,
+    Uniform,
+)
 from probewise.recordings import Recording, paper_plan
 from probewise.scene import AnyOf, Circle, Ellipse, Rectangle, RegularPolygon
 

@@ -177,6 +177,10 @@ class Apparatus(ABC):
     def held_out_parts(self, recording: Recording) -> Parts:
         """Return the part of each usable reading, (n_usable,), and the names of the parts, to hold out in turn."""
 
+    def what_comes_next(self, recording: Recording) -> Parts | None:
+        """Return the last fifth of each run as the one part to hold out; None, the default, without a time."""
+        return None
+
     def coordinates_of_new_run(self, model: Model) -> IntArray:
         """Return the indices of a model's coordinates of which each run has a value of its own; none by default.
 

@@ -67,7 +67,8 @@ class Improvement:
 
     `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading,
     `heldout_by_scan` the mean by part; rms residuals (`Recording.rms`) in the unit of the readings, beside a random
-    walk if the noise has one; `p_value_after` of the global test of the repaired model.
+    walk if the noise has one; `p_value_after` of the global test of the repaired model; `comes_next` the gain on the
+    last fifth of each run given the rest, where rows have a time.
     """
 
     log_evidence: float
@@ -77,6 +78,7 @@ class Improvement:
     rms_before: float
     rms_after: float
     p_value_after: float
+    comes_next: HeldOutGain | None = None
 
 
 def p_value_after(searched: Searched, fit: WeighedFit, after: Linearised, *, rng: np.random.Generator) -> float:
@@ -122,16 +124,19 @@ class BestRepair:
         calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
         after = Linearised.of(repaired, law)
         rms = [recording.rms(residuals_beside_walk(found.residuals, law)) for found in (calibrated, repaired)]
-        held, p_after = HeldOutGain(0.0, 0.0, 0, ()), test.p_value
+        held, comes_next, p_after = HeldOutGain(0.0, 0.0, 0, ()), None, test.p_value
         if fit is not test.null:
             parts = searched.prepared.apparatus.held_out_parts(recording)
             # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
             own = test.null.evidence[test.null.possible_noise(noise)].likeliest_law
             own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
             held = held_out_gain(calibrated, repaired, recording, law, parts, law_of_null=own)
+            later = searched.prepared.apparatus.what_comes_next(recording)
+            comes_next = later and held_out_gain(calibrated, repaired, recording, law, later, law_of_null=own)
             p_after = p_value_after(searched, fit, after, rng=rng)
         log_evidence = fit.evidence[noise].log_z - test.null.evidence[searched.certain].log_z
-        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after)
+        of_parts = held.per_reading, held.sd, held.by_scan
+        gain = Improvement(log_evidence, *of_parts, rms[0], rms[1], p_after, comes_next)
         return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 

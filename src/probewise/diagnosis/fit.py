@@ -15,7 +15,7 @@ from scipy.special import ndtr, ndtri
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.effects import NamedEffect
-from probewise.effects.priors import SharedScalePrior
+from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, AnyEffect
 from probewise.sensor.stages import effects_with_columns

@@ -21,7 +21,7 @@ MOST_PARTS = 10
 """Largest number of parts held out in turn."""
 
 Parts = tuple[IntArray, tuple[str, ...]]
-"""Part number of each usable reading, (n_usable,), and the names of the parts."""
+"""Part number of each usable reading, (n_usable,), -1 for one that is never held out, and the names of the parts."""
 
 N_BLOCKS = 5
 """Number of parts of readings that have no scans or runs."""
@@ -89,10 +89,10 @@ def mean_gain_over_parts(
 
     `scan`: number of the part of each usable reading, such as its scan, (n_usable,); `gain`: function of a mask of
     held-out readings (n_usable,); returns the gain of each of them, in nats. Returns the gain; no readings and gain 0
-    if fewer than two parts are long enough.
+    if fewer than two parts are long enough, or none beside readings that are never held out.
     """
-    long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= LEAST_ROWS]
-    if len(long_enough) < 2:
+    long_enough = [int(k) for k in np.unique(scan) if k >= 0 and np.sum(scan == k) >= LEAST_ROWS]
+    if len(long_enough) < (1 if np.any(scan < 0) else 2):
         return HeldOutGain(0.0, 0.0, 0, ())
     if len(long_enough) > MOST_PARTS:
         long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, MOST_PARTS).round()]

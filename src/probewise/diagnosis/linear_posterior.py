@@ -27,8 +27,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.effects import HeavyTailedPrior, NamedEffect
-from probewise.effects.priors import SharedScalePrior
-from probewise.priors import Prior, Product
+from probewise.priors import Prior, Product, SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 from probewise.sensor.stages import effects_with_columns

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from probewise.effects import noise, optics, pose, reading
 from probewise.effects.effect import AGAIN, Effect, EffectKind, LightEffect, NamedEffect, NoiseEffect, light_effect
 from probewise.effects.known import Estimated, Known
-from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.reference import Extent, Origin
+from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior
 
 
 def _by_name(*effects: EffectKind) -> Mapping[str, EffectKind]:

@@ -17,10 +17,9 @@ from probewise._arrays import BoolArray, FloatArray, distinct_values
 from probewise._kinds import require_mapping
 from probewise._words import unit_after_number
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reference import ZERO, Extent, Origin
 from probewise.errors import ParameterError
-from probewise.priors import Marginal, Prior, Product, Uniform
+from probewise.priors import HeavyTailedPrior, Marginal, Prior, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage
 
@@ -540,8 +539,15 @@ def require_effect_kinds(effects: object) -> None:
             raise ParameterError("effects", name, f"{kind.name!r}, the name of that effect")
 
 
+@dataclass(frozen=True)
 class NoiseEffect(NamedEffect[NoiseParameters]):
-    """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True."""
+    """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True.
+
+    A class declares name, words and covariates, prior and units of its parameters, `apply` and `sentence`.
+    """
+
+    stage = Stage.NOISE
+    units = ("1",)
 
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""

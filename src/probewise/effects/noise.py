@@ -13,11 +13,10 @@ from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import NoiseEffect
 from probewise.effects.noise_distribution import FittedReadings
-from probewise.effects.priors import LogHeavyTailedPrior
 from probewise.effects.reference import Extent
-from probewise.priors import LogUniform, Product, Uniform
+from probewise.priors import LogHeavyTailedPrior, LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import NoiseParameters, Stage
+from probewise.sensor.stages import NoiseParameters
 
 _SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
 _NEWTON_STEPS = 40
@@ -27,23 +26,12 @@ _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printe
 _DIGITS = 1e-6  # of a step: below this a difference is rounding
 
 
-@dataclass(frozen=True)
 class CorrelatedNoise(NoiseEffect):
     """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
 
-    lowest: float = -0.5
-    highest: float = 0.95
-
-    name = "correlated_noise"
-    words = "noise that neighbouring readings share"
-    stage = Stage.NOISE
-    units = ("1",)
-    covariates = ("scan",)
+    name, words, covariates = "correlated_noise", "noise that neighbouring readings share", ("scan",)
+    prior = Product({"rho": Uniform(-0.5, 0.95)})
     n_nodes = 28  # dense enough to integrate the posterior of a thousand readings
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"rho": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, rho=theta[:, :1])
@@ -55,34 +43,22 @@ class CorrelatedNoise(NoiseEffect):
         )
 
 
-@dataclass(frozen=True)
 class SignalDependentNoise(NoiseEffect):
     """Noise that grows with the light: variance x (1 + ratio u), u the seen white fraction."""
 
-    least: float = 0.05
-    most: float = 50.0
-
-    name = "signal_dependent_noise"
-    words = "noise that grows with the signal"
-    stage = Stage.NOISE
-    units = ("1",)
-    covariates = ("level",)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"ratio": LogUniform(self.least, self.most)})
+    name, words, covariates = "signal_dependent_noise", "noise that grows with the signal", ("level",)
+    prior = Product({"ratio": LogUniform(0.05, 50.0)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        times = value_with_sd(1 + mean[0], sd[0])
         return (
-            f"the noise grows with the reading: its variance at the highest level is "
-            f"{value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
+            f"the noise grows with the reading: its variance at the highest level is {times} times that at the lowest"
         )
 
 
-@dataclass(frozen=True)
 class DriftingNoise(NoiseEffect):
     """Noise whose sd grows or shrinks exponentially in time: sd x growth^(time / duration - 1/2).
 
@@ -91,18 +67,8 @@ class DriftingNoise(NoiseEffect):
     recording's.
     """
 
-    least: float = 0.2
-    most: float = 5.0
-
-    name = "drifting_noise"
-    words = "noise that changes in time"
-    stage = Stage.NOISE
-    units = ("1",)
-    covariates = ("time",)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"growth": LogUniform(self.least, self.most)})
+    name, words, covariates = "drifting_noise", "noise that changes in time", ("time",)
+    prior = Product({"growth": LogUniform(0.2, 5.0)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
@@ -120,24 +86,14 @@ class RandomWalk(NoiseEffect):
     """
 
     n_before: int = 0
-    least: float = 5e-3
-    most: float = 3.0
 
-    name = "random_walk"
-    words = "a zero that wanders"
-    stage = Stage.NOISE
+    name, words, covariates = "random_walk", "a zero that wanders", ("time", "row", "run")
     units = ("noise sd",)
-    covariates = ("time", "row", "run")
+    prior = Product({"sd_per_row": LogUniform(5e-3, 3.0)})
     n_nodes = 16
 
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"sd_per_row": LogUniform(self.least, self.most)})
-
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(
-            value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
-        )
+        return replace(value, walk=theta[:, :1], walked=self.n_before + 1.0 + np.arange(float(len(plan))))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return f"the offset is a random walk with steps of sd {value_with_sd(mean[0], sd[0])} noise sds from row to row"
@@ -154,10 +110,8 @@ class NoisePerRun(NoiseEffect):
     runs: tuple[str, ...] = ()
     n_rows: tuple[int, ...] = ()
 
-    name = "noise_per_run"
-    words = "noise that differs from run to run"
-    stage = Stage.NOISE
-    covariates = ("run",)
+    name, words, covariates = "noise_per_run", "noise that differs from run to run", ("run",)
+    amplitudes = ()
     nodes_per_parameter = ()  # they are most probable values about a fit
 
     @classmethod
@@ -169,10 +123,6 @@ class NoisePerRun(NoiseEffect):
     @property
     def units(self) -> tuple[str, ...]:
         return ("1",) * len(self.runs)
-
-    @property
-    def amplitudes(self) -> tuple[int, ...]:
-        return ()
 
     @property
     def nothing(self) -> dict[int, float]:
@@ -254,20 +204,16 @@ MOST_OUTLYING = 0.2
 """Largest share of outlying or of lost readings."""
 
 
-@dataclass(frozen=True)
+_SHARES = LogUniform(2e-3, MOST_OUTLYING)
+
+
 class Outliers(NoiseEffect):
     """A heavy tail: with probability `share`, a reading's noise is `size` times as wide (sd)."""
 
-    name = "outliers"
-    words = "outlying readings"
-    stage = Stage.NOISE
+    name, words, covariates = "outliers", "outlying readings", ("level", "time")
     units = ("1", "noise sd")
-    covariates = ("level", "time")
+    prior = Product({"share": _SHARES, "size": LogUniform(2.5, LARGEST_SIZE)})
     nodes_per_parameter = (4, 4)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"share": LogUniform(2e-3, MOST_OUTLYING), "size": LogUniform(2.5, LARGEST_SIZE)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
@@ -297,11 +243,8 @@ class Dropouts(NoiseEffect):
     n_readings: int = field(default=0, kw_only=True)
     distance: float = field(default=0.0, kw_only=True)
 
-    name = "dropouts"
-    words = "lost readings"
-    stage = Stage.NOISE
+    name, words, covariates = "dropouts", "lost readings", ("level", "time")
     units = ("1", "reading")
-    covariates = ("level", "time")
     nodes_per_parameter = ()  # they depend on the readings, and the share's lie close
 
     @classmethod
@@ -333,7 +276,7 @@ class Dropouts(NoiseEffect):
 
     @cached_property
     def prior(self) -> Product:
-        return Product({"share": LogUniform(2e-3, MOST_OUTLYING), "value": Uniform(self.lowest, self.highest)})
+        return Product({"share": _SHARES, "value": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
@@ -355,7 +298,7 @@ class Dropouts(NoiseEffect):
         if not (at_end | (n_alike > 1)).any():
             return np.zeros((0, 2))
         value = far[int(np.argmax(n_alike + 0.5 * at_end))]
-        shares = LogUniform(2e-3, MOST_OUTLYING).from_unit((np.arange(12) + 0.5) / 12)
+        shares = _SHARES.from_unit((np.arange(12) + 0.5) / 12)
         return np.stack([shares, np.full(12, value)], axis=1)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -376,11 +319,8 @@ class Quantisation(NoiseEffect):
     largest: float = 20.0
     unit: str = field(default="", kw_only=True)
 
-    name = "quantisation"
-    words = "rounded readings"
-    stage = Stage.NOISE
+    name, words, covariates = "quantisation", "rounded readings", ("lattice",)
     units = ("reading",)
-    covariates = ("lattice",)
     n_nodes = 16
     nodes_per_parameter = ()  # one node, from the readings
     seen_above: ClassVar[float] = 0.3

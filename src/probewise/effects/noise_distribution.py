@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -67,15 +68,25 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
     `readings`: measured readings, (n_points,); `predicted`: noise-free readings, (n_samples, n_points).
     """
     noise = noise_with_walk_variance(noise)
-    of_kept = _log_density_rounded(readings, predicted, noise.sd, noise.step)
+    return _log_of_mixture(
+        noise,
+        lambda sd: _log_density_rounded(readings, predicted, sd, noise.step),
+        lambda: _log_density_rounded(readings, noise.lost_value, noise.sd * _NARROW, noise.step),
+    )
+
+
+def _log_of_mixture(
+    noise: NoiseParameters, of_sd: Callable[[FloatArray], FloatArray], of_lost: Callable[[], FloatArray]
+) -> FloatArray:
+    """Return the log of the sum over narrow, wide and lost readings, each with its share; `of_sd` is log density."""
+    out = of_sd(noise.sd)
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
         if np.any(noise.wide_share):
-            wide = _log_density_rounded(readings, predicted, noise.sd * noise.wide_times, noise.step)
-            of_kept = np.logaddexp(np.log1p(-noise.wide_share) + of_kept, np.log(noise.wide_share) + wide)
+            wide = of_sd(noise.sd * noise.wide_times)
+            out = np.logaddexp(np.log1p(-noise.wide_share) + out, np.log(noise.wide_share) + wide)
         if np.any(noise.lost_share):
-            lost = _log_density_rounded(readings, noise.lost_value, noise.sd * _NARROW, noise.step)
-            of_kept = np.logaddexp(np.log1p(-noise.lost_share) + of_kept, np.log(noise.lost_share) + lost)
-    return of_kept
+            out = np.logaddexp(np.log1p(-noise.lost_share) + out, np.log(noise.lost_share) + of_lost())
+    return np.asarray(out)
 
 
 def reading_variance(noise: NoiseParameters) -> FloatArray:
@@ -112,15 +123,10 @@ def log_probability_at_end(
     noise = noise_with_walk_variance(noise)
     sign = 1.0 if is_high else -1.0
     beyond = sign * (predicted - readings) + 0.5 * noise.step
-    out = log_ndtr(beyond / noise.sd)
-    with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
-        if np.any(noise.wide_share):
-            wide = log_ndtr(beyond / (noise.sd * noise.wide_times))
-            out = np.logaddexp(np.log1p(-noise.wide_share) + out, np.log(noise.wide_share) + wide)
-        if np.any(noise.lost_share):
-            lost = np.where(sign * (noise.lost_value - readings) + 0.5 * noise.step >= 0, 0.0, -np.inf)
-            out = np.logaddexp(np.log1p(-noise.lost_share) + out, np.log(noise.lost_share) + lost)
-    return np.asarray(out)
+    lost_beyond = sign * (noise.lost_value - readings) + 0.5 * noise.step
+    return _log_of_mixture(
+        noise, lambda sd: np.asarray(log_ndtr(beyond / sd)), lambda: np.where(lost_beyond >= 0, 0.0, -np.inf)
+    )
 
 
 def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high: float) -> FloatArray:
@@ -139,12 +145,9 @@ def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high
 def _mean_of_limited_normal(mean: FloatArray, sd: FloatArray, low: float, high: float) -> FloatArray:
     """Return the mean of a normal variable that is limited to a range; arrays broadcast."""
     a, b = (np.clip((end - mean) / sd, -_FARTHEST, _FARTHEST) for end in (low, high))
-    z = a * ndtr(a) + b * ndtr(-b) + _density(a) - _density(b)
+    at_a, at_b = (np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi) for z in (a, b))
+    z = a * ndtr(a) + b * ndtr(-b) + at_a - at_b
     return np.asarray(np.clip(mean + sd * z, low, high))
-
-
-def _density(z: FloatArray) -> FloatArray:
-    return np.asarray(np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi))
 
 
 @dataclass(eq=False)

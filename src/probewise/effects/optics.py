@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import ClassVar
@@ -24,7 +24,6 @@ from probewise.effects.effect import (
     scans_in_words,
     single_column_bank,
 )
-from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reference import (
     Extent,
     Origin,
@@ -32,7 +31,7 @@ from probewise.effects.reference import (
     distinct_positions_mm,
     scan_indicator,
 )
-from probewise.priors import LogUniform, Normal, Product, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Normal, Product, Uniform
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Ramp, Stripes
 from probewise.recordings.plan import Plan
 from probewise.scene.regions import Region, edge_distance
@@ -272,8 +271,7 @@ def albedo_gradient(kind: LightEffect, of: Extent) -> Effect:
     """
 
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        regions = _regions_with_readings(value, plan)
-        return replace(value, regions={name: RegionWithGradient(r, theta, of.origin) for name, r in regions.items()})
+        return _with_changed_regions(value, plan, lambda region: RegionWithGradient(region, theta, of.origin))
 
     return kind.linear(
         of,
@@ -293,8 +291,7 @@ def albedo_patch(kind: LightEffect, of: Extent) -> Effect | None:
     """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y)."""
 
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        regions = _regions_with_readings(value, plan)
-        return replace(value, regions={name: RegionWithPatch(r, theta) for name, r in regions.items()})
+        return _with_changed_regions(value, plan, lambda region: RegionWithPatch(region, theta))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -307,28 +304,38 @@ def albedo_patch(kind: LightEffect, of: Extent) -> Effect | None:
 
 
 @dataclass(frozen=True, eq=False)
-class RegionWithGradient:
-    """A region whose albedo is multiplied by 1 + per_mm . (X, Y), from `origin`; `per_mm` has shape (n_samples, 2)."""
+class ChangedRegion:
+    """A region whose albedo an effect changes smoothly; its edges stay in place. Each sample has a row of `theta`."""
 
     region: Region
-    per_mm: FloatArray
-    origin: Origin = field(default=Origin())
+    theta: FloatArray
 
     @property
     def n_regions(self) -> int:
         """Number of regions, one for each sample; 1 where all samples share one."""
-        return max(self.region.n_regions, len(self.per_mm))
+        return max(self.region.n_regions, len(self.theta))
+
+    def changed(self, albedo: FloatArray, points_mm: FloatArray) -> FloatArray:
+        """Return albedo at points (n_points, 2), (n_regions, n_points), as the effect changes it there."""
+        raise NotImplementedError
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.region.albedo(points_mm) * self._albedo_factor_at_points(points_mm)
+        return self.changed(self.region.albedo(points_mm), points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels, the gradient taken at their centres: (n_regions, n_points)."""
-        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._albedo_factor_at_points(centers_mm)
+        """Return the mean albedo over pixels, the change taken at their centres: (n_regions, n_points)."""
+        return self.changed(self.region.coverage(centers_mm, pixel_mm, turn_rad), centers_mm)
 
-    def _albedo_factor_at_points(self, points_mm: FloatArray) -> FloatArray:
-        return np.asarray(1 + self.per_mm @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
+
+@dataclass(frozen=True, eq=False)
+class RegionWithGradient(ChangedRegion):
+    """A region whose albedo is multiplied by 1 + theta . (X, Y), from `origin`; theta has shape (n_samples, 2)."""
+
+    origin: Origin = field(default=Origin())
+
+    def changed(self, albedo: FloatArray, points_mm: FloatArray) -> FloatArray:
+        return albedo * np.asarray(1 + self.theta @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
 
 
 @mean_albedo_under_one_gaussian.register
@@ -338,7 +345,7 @@ def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian
     The mean is the gradient's factor at the centre times the region's mean albedo, plus a central difference of the
     region's mean along the gradient.
     """
-    a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
+    a, b = region.theta[:, :1], region.theta[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
     rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
     x, y = x / rise * _STEP, y / rise * _STEP
@@ -355,34 +362,18 @@ def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian
 
 
 @dataclass(frozen=True, eq=False)
-class RegionWithPatch:
-    """A region and a bell-shaped patch on it; `patch` holds albedo, x, y, r, (n_samples, 4)."""
+class RegionWithPatch(ChangedRegion):
+    """A region and a bell-shaped patch on it; theta holds its albedo, x, y, r, (n_samples, 4)."""
 
-    region: Region
-    patch: FloatArray
-
-    @property
-    def n_regions(self) -> int:
-        """Number of regions, one for each sample; 1 where all samples share one."""
-        return max(self.region.n_regions, len(self.patch))
-
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.region.albedo(points_mm) + self._added_albedo(points_mm)
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels, the patch taken at their centres: (n_regions, n_points)."""
-        return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added_albedo(centers_mm)
-
-    def _added_albedo(self, points_mm: FloatArray) -> FloatArray:
-        albedo, x, y, r = (self.patch[:, k : k + 1] for k in range(4))
-        return albedo * gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
+    def changed(self, albedo: FloatArray, points_mm: FloatArray) -> FloatArray:
+        added, x, y, r = (self.theta[:, k : k + 1] for k in range(4))
+        return albedo + added * gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
 
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under each Gaussian: the region's, plus the patch's, a bell of covariance C + r^2."""
-    albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
+    albedo, x, y, r = (region.theta[:, k : k + 1] for k in range(4))
     from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
     var_x, var_y = gaussian.var_x + r**2, gaussian.var_y + r**2
     det = var_x * var_y - gaussian.cov_xy**2
@@ -391,16 +382,14 @@ def _mean_albedo_with_patch(region: RegionWithPatch, gaussian: LabGaussian, n_no
     return mean_albedo_under_one_gaussian(region.region, gaussian, n_nodes) + added
 
 
-def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
-    """Return the regions over which at least one reading is taken, by the pattern's name."""
-    return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
+def _with_changed_regions(view: SceneView, plan: Plan, changed: Callable[[Region], Region]) -> SceneView:
+    """Return a view of the regions over which at least one reading is taken, each changed."""
+    with_readings = (name for name, _ in plan.rows_by_pattern() if name in view.regions)
+    return replace(view, regions={name: changed(view.regions[name]) for name in with_readings})
 
 
-@edge_distance.register(RegionWithGradient)
-@edge_distance.register(RegionWithPatch)
-def _distance_to_unchanged_edge(
-    region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
-) -> FloatArray:
+@edge_distance.register
+def _distance_to_unchanged_edge(region: ChangedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the distance of points from the nearest edge of the region, which the effect leaves in place, mm."""
     return edge_distance(region.region, x_mm, y_mm)
 

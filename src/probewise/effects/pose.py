@@ -22,9 +22,8 @@ from probewise.effects.effect import (
     sine_and_cosine_entries,
     single_column_bank,
 )
-from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reference import Extent, candidate_scan_groups, distinct_positions_mm, scan_indicator
-from probewise.priors import LogUniform, Product, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Poses, Stage

@@ -15,9 +15,8 @@ from probewise.effects.effect import (
     sine_and_cosine_entries,
     single_column_bank,
 )
-from probewise.effects.priors import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.reference import Extent, sign_of_motion
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior, LogUniform, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 

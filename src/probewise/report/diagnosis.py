@@ -150,6 +150,10 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     if gain.heldout_by_scan and changes:
         predicts = _heldout_gain_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd)
         facts.append(("Does the repair predict?", predicts))
+    if gain.comes_next and gain.comes_next.n_readings and changes:
+        told = _heldout_gain_in_words(gain.comes_next.per_reading, gain.comes_next.sd)
+        run = diagnosis.apparatus.words.run
+        facts.append(("Does it predict what comes next?", f"{told} Held out was the last fifth of each {run}."))
     if changes:
         beside = " (beside the random walk of the zero)" if repair.after.has_walk else ""
         left = f"{_rms_in_words(diagnosis)}{diagnosis.recording.weighting_in_words}{beside}"

@@ -19,26 +19,23 @@ from scipy.linalg.lapack import dtbtrs
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.systems.law import (
     LawWithEffects,
-    Stepper,
     evaluations_per_step,
     initial_states,
     integrate_states,
-    n_parts_of_schedule,
+    n_parts_of_steps,
     states_by_step,
     step_in_part,
     time_gaps,
 )
-from probewise.systems.law_inputs import LawInputs, of_columns
+from probewise.systems.law_inputs import LawInputs
 from probewise.systems.step import Steps
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
 _NEWTONS = 8  # iterations with a sample's own Jacobian
 _HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped
 _SLOW = 0.1  # change of a chord iteration, in that of the one before, from which a sample needs its own Jacobian
-_CONVERGED, _SETTLED = (
-    1e-8,
-    1e-12,
-)  # largest change of a state by an iteration, in that state's largest value; and by the next
+_CONVERGED = 1e-8  # largest change of a state by an iteration, in that state's largest value
+_SETTLED = 1e-12  # and by the next
 _NUDGE = 1e-7  # of each state's largest value, for the Jacobian
 _FAR = 1e-3  # change from a known trajectory, in a state's largest value, from which another one is remembered
 _MOST_NEW = 8  # trajectories remembered of one batch
@@ -146,31 +143,19 @@ def integrate_from_known_trajectories(
 ) -> tuple[dict[str, FloatArray], int]:
     """Integrate a law for samples, theta (n_samples, n_params); return their states at the rows and the cost.
 
-    Up to 300 samples times runs are solved for all steps at once, from the known trajectories nearest to them; the
-    others, and those for which that does not converge, step by step.
+    Up to 300 samples times runs are solved for all steps at once, from the trajectories in `memory` nearest to them;
+    the others, and those for which that does not converge, step by step. More trajectories are added to the memory.
+    `effects` is what distinguishes the law with its effects from the same law with others; the first `n_own` parameters
+    are the system's.
 
-    Parameters
-    ----------
-    law_and_inputs, steps
-        Function of sample indices that returns their law, parameters and columns; and the steps.
-    memory
-        Trajectories integrated before; more are added.
-    effects
-        What distinguishes the law with its effects from the same law with others.
-    theta, n_own
-        Parameters, of which the first `n_own` are the system's.
-
-    Returns
-    -------
-    Every state at every row, by name, (n_samples, n_points); and the cost, in evaluations of the rates of all samples
-    together.
+    Returns every state at every row, by name, (n_samples, n_points), and the cost, in evaluations of the rates of all
+    samples together.
     """
     n_samples = len(theta)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
         states_by_name = integrate_states(motion, steps, parameters, columns)
-        n_parts = n_parts_of_schedule(motion, steps.schedule)
-        return states_by_name, n_parts * evaluations_per_step(motion, steps.schedule.method)
+        return states_by_name, n_parts_of_steps(motion, steps) * evaluations_per_step(motion, steps.method)
     states, left, cost = None, np.arange(n_samples), 0
     known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
     refused = False
@@ -193,33 +178,20 @@ def integrate_from_known_trajectories(
             states = there
         else:
             states[:, left] = there
-        cost += n_parts_of_schedule(motion, steps.schedule)
+        cost += n_parts_of_steps(motion, steps)
         finite = np.isfinite(there).all(axis=(0, 2, 3))
-        memory.add(
-            steps,
-            effects,
-            [KnownTrajectory(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()],
-        )
+        new = np.flatnonzero(finite)[:_MOST_NEW].tolist()
+        memory.add(steps, effects, [KnownTrajectory(theta[left[k]], there[:, k]) for k in new])
     assert states is not None
     motion = law_and_inputs(np.arange(1))[0]
-    cost *= evaluations_per_step(motion, steps.schedule.method)
+    cost *= evaluations_per_step(motion, steps.method)
     return dict(zip(motion.law.states, steps.states_at_rows(states), strict=True)), cost
 
 
 def solve_all_steps(
     law_and_inputs: LawAndInputs, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray
 ) -> SolvedSteps:
-    """Solve for the states at the end of every step, each sample from the known trajectory nearest to it.
-
-    Parameters
-    ----------
-    law_and_inputs
-        Function of sample indices that returns their law, parameters and columns.
-    steps
-        The steps.
-    known, nearest
-        Trajectories, and for each sample the index of the one to begin from, (n_samples,).
-    """
+    """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known."""
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
     _iterate_with_shared_jacobians(search, known, nearest)
@@ -286,7 +258,7 @@ class _NewtonState:
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen = np.zeros(0, dtype=np.int64)
         motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
-        start = motion.clip_and_stop_states({}, initial_states(motion.law, self.steps.places, parameters, n_samples))
+        start = motion.clip_and_stop_states({}, initial_states(motion.law, self.steps, parameters, n_samples))
         self.states[:, :, 0] = np.stack(list(start.values()))
 
     @property
@@ -339,33 +311,23 @@ def _stepping_function(
     """
     motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
-    inputs = LawInputs.arranged_by_runs(motion.law, steps.places, parameters, columns, motion.between_rows)
-    gap, begin, length = steps.gap_of_step, steps.begin_share_of_gap, steps.length_share_of_gap
-    passing = time_gaps(steps.places, columns)[:, gap]
+    given = LawInputs.of(motion.law, steps, parameters, columns, motion.between_rows)
+    gap = steps.gap_of_step
+    passing = time_gaps(steps, columns)[:, gap]
     passing = passing.reshape(len(passing), -1)
-    parts = [
-        (
-            part,
-            Stepper(
-                motion,
-                steps.schedule.method,
-                part.inputs,
-                passing if part.columns is None else of_columns(passing, part.columns),
-            ),
-        )
-        for part in inputs.parts_of_steps(inputs.of_steps(gap), gap, begin, length, whole=False)
-    ]
+    inputs = given.of_gaps(gap, len(gap))
+    parts = list(given.parts_of_steps(inputs, gap, *steps.begin_and_length, whole=False))
 
     def states_after_each_step(begins: FloatArray) -> FloatArray:
         shape = begins.shape
         s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
         after: dict[str, Any] = s
-        for part, stepper in parts:
-            after = step_in_part(stepper, part, after)
+        for part in parts:
+            after = step_in_part(motion, steps.method, part, passing, after)
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
     n_steps = len(gap) * steps.n_runs
-    return states_after_each_step, sum(n_steps if part.columns is None else len(part.columns) for part, _ in parts)
+    return states_after_each_step, sum(n_steps if part.columns is None else len(part.columns) for part in parts)
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:

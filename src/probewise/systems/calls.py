@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import FileError, ParameterError, ShapeError, message_of
 from probewise.progress import Progress
 from probewise.recordings.io import EndedByFile
@@ -92,20 +92,10 @@ class IntegrationTally:
 class Caller:
     """Caller of a user's `simulate` for many samples; it counts the calls, and the samples that fail.
 
-    Parameters
-    ----------
-    simulate
-        The user's function.
-    broadcasts
-        Whether it takes parameters (n_samples, 1) with columns (n_points,).
-    by_row
-        Parameters that it takes as arrays (n_points,) when called for one sample; ignored where it broadcasts.
-    name
-        The name of the function in messages.
-
-    `cut_short` is set if work was skipped because of too many calls. `interpolated` collects the parameters that vary
-    by row though the function takes a number: its readings are interpolated between calls at five values of such a
-    parameter.
+    The function `broadcasts` if it takes parameters (n_samples, 1) with columns (n_points,); else it is called for one
+    sample at a time, and takes the parameters `by_row` as arrays (n_points,). `cut_short` is set if work was skipped
+    because of too many calls. `interpolated` collects the parameters that vary by row though the function takes a
+    number: its readings are interpolated between calls at five values of such a parameter.
     """
 
     simulate: Simulate
@@ -133,7 +123,8 @@ class Caller:
     ) -> Caller:
         """Find by trial calls the fastest way to call a function for many samples; return a caller that uses it.
 
-        `samples` are parameters by name, (n_samples, 1 or n_points) each.
+        `samples` are parameters by name, (n_samples, 1 or n_points) each. The function's own exception is raised if it
+        raises one at a trial call and no other gives a finite reading.
 
         Raises
         ------
@@ -141,8 +132,6 @@ class Caller:
             If no reading is finite, or another call with the same parameters returns other readings.
         ShapeError
             If it does not return one number per row.
-        Exception
-            The function's own, if it raises one at a trial call and no other gives a finite reading.
         """
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:
@@ -167,32 +156,20 @@ class Caller:
 
         A sample at which `simulate` raises an error gives NaN; with `strict`, the first error is raised if all fail.
         """
-        n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
+        n_samples = number_of_samples(parameters, columns)
         n_points = max(np.shape(v)[-1] for v in columns.values())
+        each = (_values_of_sample(parameters, columns, k) for k in range(n_samples))
         with np.errstate(all="ignore"):
+            if self.broadcasts and self._takes_changed_columns_together(parameters, columns):
+                return self._call_together(parameters, columns, (n_samples, n_points), strict=strict)
             if self.broadcasts:
-                if self._takes_changed_columns_together(parameters, columns):
-                    return self._call_together(parameters, columns, (n_samples, n_points), strict=strict)
-                return np.concatenate(
-                    [
-                        self._call_together(
-                            *_parameters_and_columns_of_sample(parameters, columns, k), (1, n_points), strict=strict
-                        )
-                        for k in range(n_samples)
-                    ]
-                )
+                return np.concatenate([self._call_together(*own, (1, n_points), strict=strict) for own in each])
             out, first_error = np.full((n_samples, n_points), np.nan), None
-            for k in range(n_samples):
-                own = {
-                    name: _parameter_value_of_sample(values, k, by_row=n_points == 1 and name in self.by_row)
-                    for name, values in parameters.items()
-                }
-                table = {
-                    name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values
-                    for name, values in columns.items()
-                }
+            for k, (own, table) in enumerate(each):
+                by_row = self.by_row if n_points == 1 else ()  # arrays even if there is only one row in the table
+                values = {n: float(v[0, 0]) if v.shape == (1, 1) and n not in by_row else v[0] for n, v in own.items()}
                 try:
-                    out[k] = self._call_for_one_sample(own, table, n_points)
+                    out[k] = self._call_for_one_sample(values, table, n_points)
                 except (ShapeError, KeyboardInterrupt):
                     raise
                 except Exception as error:
@@ -222,17 +199,11 @@ class Caller:
                 self.n_failed += 1
                 return np.full(shape, np.nan)
             middle = n_samples // 2
-            halves = (slice(0, middle), middle), (slice(middle, n_samples), n_samples - middle)
+            halves = slice(0, middle), slice(middle, n_samples)
+            parts = [(take_samples(parameters, own), take_samples(columns, own)) for own in halves]
+            sizes = (middle, shape[1]), (n_samples - middle, shape[1])
             return np.concatenate(
-                [
-                    self._call_together(
-                        _values_of_samples(parameters, own),
-                        _values_of_samples(columns, own),
-                        (n, shape[1]),
-                        strict=False,
-                    )
-                    for own, n in halves
-                ]
+                [self._call_together(*own, n, strict=False) for own, n in zip(parts, sizes, strict=True)]
             )
         return _readings_broadcast_to_shape(readings, shape, self.name)
 
@@ -250,17 +221,12 @@ class Caller:
         if changed not in self._taken_together:
             trial = Caller(self.simulate, broadcasts=True, name=self.name)
             own = {name: values[[0, -1]] for name, values in parameters.items()}
-            given = {
-                name: _column_and_altered_copy(columns[name][0]) if name in changed else columns[name]
-                for name in columns
-            }
+            given = {n: _column_and_altered_copy(v[0]) if n in changed else v for n, v in columns.items()}
             shape = 2, max(np.shape(v)[-1] for v in columns.values())
             try:
                 together = trial._call_together(own, given, shape, strict=True)
-                apart = [
-                    trial._call_together(*_parameters_and_columns_of_sample(own, given, k), (1, shape[1]), strict=True)
-                    for k in range(2)
-                ]
+                each = (_values_of_sample(own, given, k) for k in range(2))
+                apart = [trial._call_together(*of_one, (1, shape[1]), strict=True) for of_one in each]
                 self._taken_together[changed] = _nearly_equal(together, np.concatenate(apart))
             except Exception:
                 self._taken_together[changed] = False
@@ -275,8 +241,7 @@ class Caller:
         known = self._known.pop(key := digest.digest(), None)
         if known is None:
             self._count_call()
-            returned = np.array(self._simulated(own, columns), dtype=np.float64)
-            known = _readings_broadcast_to_shape(returned, (n_points,), self.name)
+            known = _readings_broadcast_to_shape(np.array(self._simulated(own, columns), float), (n_points,), self.name)
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -308,15 +273,7 @@ class Caller:
 
 
 class ProgressWithCallCount:
-    """A progress function that adds the number of calls of `simulate` to each stage, updated at every call.
-
-    Parameters
-    ----------
-    progress
-        The progress function that it calls.
-    caller
-        The caller whose calls are counted from now on.
-    """
+    """A progress function that adds the number of calls of `simulate` to each stage, updated at every call."""
 
     def __init__(self, progress: Progress, caller: Caller) -> None:
         self._progress, self._caller = progress, caller
@@ -361,7 +318,7 @@ def _require_finite_and_repeatable(
         raise ParameterError(caller.name, found, allowed)
     at = int(np.argmax(sound))
     again = Caller(caller.simulate, caller.broadcasts, caller.by_row, name=caller.name)
-    own = _parameters_and_columns_of_sample(samples, columns, at)
+    own = _values_of_sample(samples, columns, at)
     if not _nearly_equal(again(*own, strict=True), readings[[at]]):
         raise ParameterError(
             caller.name,
@@ -393,26 +350,22 @@ def _parameters_accepted_by_row(
     return frozenset(taken)
 
 
-def _parameter_value_of_sample(values: FloatArray, k: int, *, by_row: bool) -> Any:
-    """Return a parameter's value in sample k: a number, or an array (n_points,); a single row applies to all samples.
-
-    `by_row`: an array even if there is only one row in the table.
-    """
-    own = values[min(k, len(values) - 1)]
-    return float(own[0]) if own.shape == (1,) and not by_row else own
+def number_of_samples(*values: Mapping[str, Any]) -> int:
+    """Return the number of samples of values by name, of which those of two axes have one row for each, or one row."""
+    return max((len(v) for each in values for v in each.values() if np.ndim(v) == 2), default=1)
 
 
-def _values_of_samples(values: Mapping[str, Any], samples: slice) -> dict[str, Any]:
+def take_samples(values: Mapping[str, Any], samples: slice | IntArray) -> dict[str, Any]:
     """Select some samples of values by name; arrays of one axis, or of one sample, apply to all and are kept."""
     return {name: v[samples] if np.ndim(v) == 2 and len(v) > 1 else v for name, v in values.items()}
 
 
-def _parameters_and_columns_of_sample(
+def _values_of_sample(
     parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], k: int
 ) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
     """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
-    own = {name: v[[min(k, len(v) - 1)]] for name, v in parameters.items()}
-    return own, {name: v[min(k, len(v) - 1)] if np.ndim(v) == 2 else v for name, v in columns.items()}
+    own, table = (take_samples(each, slice(k, k + 1)) for each in (parameters, columns))
+    return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
 
 
 def _column_and_altered_copy(values: FloatArray) -> FloatArray:
@@ -463,27 +416,19 @@ def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], 
 def user_function_error(
     what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]
 ) -> FileError:
-    """Return a FileError for an exception that `simulate`, `rates` or `observe` raises at every call.
-
-    Parameters
-    ----------
-    what
-        Name of the function.
-    error
-        The exception.
-    simulator, columns
-        The simulator, and the columns passed to the function.
-    """
-    where = _files_of_user_functions(simulator)
-    if simulator.law is not None and simulator.law.observe is not None:
+    """Return a FileError for an exception that the function `what` raises at every call with these columns."""
+    law = simulator.law
+    functions: list[Any] = [simulator.simulate] if law is None else [law.rates, law.observe]
+    codes = [getattr(inspect.unwrap(each), "__code__", None) for each in functions if each is not None]
+    where = {code.co_filename for code in codes if code is not None}
+    if law is not None and law.observe is not None:
         raised_in = {frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)}
-        what = "observe" if getattr(inspect.unwrap(simulator.law.observe), "__code__", None) in raised_in else what
+        what = "observe" if codes[1] in raised_in else what
     frames = traceback.extract_tb(error.__traceback__)
     lines = [f.lineno for f in frames if f.filename in where]
     said = message_of(error, kind=False)
     found = f"{what} raises {said if isinstance(error, EndedByFile) else message_of(error)}"
-    law, outside = simulator.law, not frames or frames[-1].filename not in where
-    if law is not None and outside:
+    if law is not None and (not frames or frames[-1].filename not in where):
         by_name = f"a dict with a rate for each state, under its name: {', '.join(law.states)}"
         if isinstance(error, KeyError) and error.args and error.args[0] in law.states:
             return FileError(simulator.source or what, f"rates returns no {error.args[0]!r}", by_name)
@@ -493,11 +438,9 @@ def user_function_error(
     way_out = next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), "")
     texts = [name for name, values in columns.items() if values.dtype != np.float64]
     if isinstance(error, KeyError):
-        names = ", ".join(columns)
-        states = f", states {', '.join(simulator.law.states)}" if simulator.law is not None else ""
-        allowed = (
-            f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
-        )
+        states = "" if law is None else f", states {', '.join(law.states)}"
+        parameters = ", ".join((*simulator.parameters, *simulator.extra))
+        allowed = f"columns {', '.join(columns) or 'none'}, parameters {parameters}{states}"
     elif is_of_values and way_out:
         allowed = way_out
     elif is_of_values and texts:
@@ -509,14 +452,6 @@ def user_function_error(
         n_rows = max((np.shape(values)[-1] for values in columns.values()), default=0)
         allowed = f"a function that returns a reading for each of the {n_rows} rows somewhere in the prior"
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
-
-
-def _files_of_user_functions(simulator: Simulator) -> set[str]:
-    functions: list[Any] = [simulator.simulate]
-    if simulator.law is not None:
-        functions += [simulator.law.rates, simulator.law.observe]
-    codes = (getattr(inspect.unwrap(function), "__code__", None) for function in functions if function is not None)
-    return {code.co_filename for code in codes if code is not None}
 
 
 def _first_non_numeric_cell(values: NDArray[Any]) -> str:

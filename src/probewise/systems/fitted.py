@@ -44,8 +44,6 @@ class FittedSystem(NamedSamples):
 
     Parameters
     ----------
-    simulator
-        The simulator.
     names
         Names of the columns of `samples`: the simulator's parameters, `name[run]` for those per run, then
         "<effect>.<parameter>".
@@ -54,10 +52,8 @@ class FittedSystem(NamedSamples):
     noise_sd
         Sd of one new reading for each sample, (n_samples,), in the unit of the readings; relative if the simulator's
         `noise` names a column of sds.
-    effects
-        Names of the effects, including noise effects.
-    absent
-        By effect, the mask of the samples in which the effect is absent, (n_samples,).
+    effects, absent
+        Names of the effects, including noise effects; and by effect the mask of the samples without it, (n_samples,).
     level
         Smallest and largest of the readings predicted for the recording, in their unit.
     max_step, stiff
@@ -68,14 +64,10 @@ class FittedSystem(NamedSamples):
         most.
     best
         The point of highest posterior density in the priors' own coordinates, (n_params,), if it is known: see `mode`.
-    recording
-        Fingerprint (digest) of the recording.
-    source
-        Name of the recording's file.
-    notes
-        Reasons to use the result with care.
-    version
-        Version of the package.
+    recording, source
+        Fingerprint (digest) of the recording, and the name of its file.
+    notes, version
+        Reasons to use the result with care; version of the package.
     """
 
     simulator: Simulator
@@ -97,13 +89,11 @@ class FittedSystem(NamedSamples):
     def __post_init__(self) -> None:
         samples, noise_sd = checked_samples(self.samples, self.noise_sd, self.names)
         simulator = self.simulator
-        lacking = [
-            name
-            for name in simulator.parameters
-            if not any(own == name or (name in simulator.per_run and own.startswith(f"{name}[")) for own in self.names)
-        ]
-        if lacking:
-            raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
+        for name in simulator.parameters:
+            if name not in self.names and not (
+                name in simulator.per_run and any(own.startswith(f"{name}[") for own in self.names)
+            ):
+                raise ParameterError("names", self.names, f"all parameters of the simulator; {name} is missing")
         checked_texts("notes", self.notes, "reasons to use the result with care")
         effects = checked_texts("effects", self.effects, "names of effects")
         if self.known is None and any(getattr(EFFECTS.get(name), "stage", None) != Stage.NOISE for name in effects):
@@ -227,9 +217,7 @@ class FittedSystem(NamedSamples):
                 samples=samples,
                 noise_sd=np.array(document["noise"]["sd"], dtype=np.float64),
                 effects=tuple(document["effects"]),
-                absent={
-                    name: _mask_from_sample_numbers(rows, len(samples)) for name, rows in document["absent"].items()
-                },
+                absent={name: np.isin(np.arange(len(samples)), rows) for name, rows in document["absent"].items()},
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
                 stiff=bool(own["stiff"]),
@@ -240,18 +228,15 @@ class FittedSystem(NamedSamples):
                 notes=tuple(document["notes"]),
                 version=str(document["version"]),
             )
-            found = document.get("origins", 0)
-            if found != _ORIGINS and fitted._counts_from_far_origin:
-                # Its samples of a drift or of a phase would mean other ones.
-                raise FileError(
-                    path, f"written by an earlier version (origins {found!r}), which counted from another origin",
-                    "a model written by this version; diagnose again",
-                )  # fmt: skip
-            if document.get("bend") != _BEND and fitted._has_bend:
-                raise FileError(
-                    path, f"written by an earlier version (bend {document.get('bend')!r}), whose bend had other ends",
-                    "a model written by this version; diagnose again",
-                )  # fmt: skip
+            origins, bend = document.get("origins", 0), document.get("bend")
+            for is_older, rule in (  # samples of a drift or of a phase would mean other ones
+                (fitted._counts_from_far_origin and origins != _ORIGINS,
+                 f"(origins {origins!r}), which counted from another origin"),
+                (fitted._has_bend and bend != _BEND, f"(bend {bend!r}), whose bend had other ends"),
+            ):  # fmt: skip
+                if is_older:
+                    allowed = "a model written by this version; diagnose again"
+                    raise FileError(path, f"written by an earlier version {rule}", allowed)
             return fitted
         except FileError:
             raise
@@ -273,12 +258,8 @@ def _require_fingerprint(here: str, source: str, own: Mapping[str, Any], path: o
 def read_fitted_system(path: str | os.PathLike[str], simulator: Simulator | str | os.PathLike[str]) -> FittedSystem:
     """Read repaired.json, calibrated.json or fitted.json, for the simulator that it was made with.
 
-    A simulator given as its file, FILE.py, is run only if it is unchanged.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or damaged, or was made with another simulator.
+    A simulator given as its file, FILE.py, is run only if it is unchanged. Raises FileError if the file is missing or
+    damaged, or was made with another simulator.
     """
     return FittedSystem.from_json(read_text(Path(path), _WHAT), simulator, path)
 
@@ -330,12 +311,6 @@ def _column_from_json(values: list[Any]) -> NDArray[Any]:
     if any(isinstance(value, str) for value in values):
         return np.array([str(value) for value in values])
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
-
-
-def _mask_from_sample_numbers(rows: list[int], n_samples: int) -> BoolArray:
-    out = np.zeros(n_samples, dtype=np.bool_)
-    out[np.array(rows, dtype=np.int64)] = True
-    return out
 
 
 def samples_csv(fitted: FittedSystem) -> str:

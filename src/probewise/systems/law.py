@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,19 +11,10 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
-from probewise.systems.calls import call_on_read_only, read_only_views
+from probewise.systems.calls import call_on_read_only, number_of_samples, read_only_views
 from probewise.systems.law_inputs import BetweenRows, LawInputs, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.simulator import Law
-from probewise.systems.step import (
-    FOURTH_ORDER,
-    N_LONGER,
-    Rosenbrock,
-    RowsInRuns,
-    RungeKutta,
-    Steps,
-    StepSchedule,
-    Terms,
-)
+from probewise.systems.step import FOURTH_ORDER, N_LONGER, Rosenbrock, RungeKutta, Steps, Terms
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
 
@@ -66,17 +56,12 @@ class LawWithEffects:
 
     def with_friction(self, state: str, size: FloatArray) -> LawWithEffects:
         """Return the law with dry friction of this size, (n_samples, 1), added to a state."""
-        known = dict(self.friction)
-        known[state] = known[state] + size if state in known else size
-        return replace(self, friction=known)
+        before = self.friction.get(state)
+        return replace(self, friction={**self.friction, state: size if before is None else before + size})
 
     def with_limit(self, limit: Limit) -> LawWithEffects:
         """Return the law with a bound of a state added."""
         return replace(self, limits=(*self.limits, limit))
-
-    @cached_property
-    def _has_no_effects(self) -> bool:
-        return not (self.terms or self.friction or self.limits)
 
     def directions_of_motion(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
         """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
@@ -102,7 +87,7 @@ class LawWithEffects:
         for values in s.values():
             values.setflags(False)  # of writing; a keyword would double the time
         given: Mapping[str, Any] = call_on_read_only(self.law.rates, s, p, u)
-        if self._has_no_effects:
+        if not (self.terms or self.friction or self.limits):
             return given
         out = {state: given[state] for state in self.law.states}
         for state, term in self.terms:
@@ -129,29 +114,6 @@ class LawWithEffects:
         return after
 
 
-def integrate_readings(
-    motion: LawWithEffects,
-    steps: Steps,
-    parameters: Mapping[str, FloatArray],
-    columns: Mapping[str, NDArray[Any]],
-) -> FloatArray:
-    """Integrate a law by a Runge-Kutta method; return the reading at every row, (n_samples, n_points).
-
-    Parameters
-    ----------
-    motion
-        The law with the contributions of effects.
-    steps
-        The integration steps and their method.
-    parameters
-        (n_samples, 1), or (n_samples, n_points) if they vary by row.
-    columns
-        (n_points,), or (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
-    """
-    states = integrate_states(motion, steps, parameters, columns)
-    return readings_of_states(motion.law, states, parameters, columns)
-
-
 def readings_of_states(
     law: Law, states: Mapping[str, FloatArray], parameters: Mapping[str, Any], columns: Mapping[str, Any]
 ) -> FloatArray:
@@ -175,21 +137,19 @@ def integrate_states(
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
 ) -> dict[str, FloatArray]:
-    """Integrate a law as `integrate_readings` does; return every state at every row, by name, (n_samples, n_points)."""
+    """Integrate a law step by step; return every state at every row, by name, (n_samples, n_points).
+
+    Parameters are (n_samples, 1), or (n_samples, n_points) if they vary by row; columns (n_points,), or
+    (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
+    """
     motion = LawWithEffects(motion) if isinstance(motion, Law) else motion
-    places, at_row = steps.places, steps.n_steps_before_position
-    kept: dict[str, FloatArray] = {}
-    k = 0
-    for number, s in enumerate(states_by_step(motion, steps, parameters, columns)):
-        if number != at_row[k]:
-            continue
-        for state, values in s.items():
-            if k == 0:
-                kept[state] = np.empty((len(values), *places.row_by_position_and_run.shape))
-            kept[state][:, k] = values
-        k += 1
-    place, run = places.position_and_run_by_row
-    return {state: values[:, place, run] for state, values in kept.items()}
+    at_row, place = steps.n_steps_before_position, steps.position_by_row
+    every = enumerate(states_by_step(motion, steps, parameters, columns))
+    known = {*at_row.tolist()}
+    kept = [s for number, s in every if number in known]
+    return {
+        state: np.stack([s[state] for s in kept], axis=1)[:, place, steps.table.scan] for state in motion.law.states
+    }
 
 
 def states_by_step(
@@ -199,23 +159,17 @@ def states_by_step(
     columns: Mapping[str, NDArray[Any]],
 ) -> Iterator[dict[str, FloatArray]]:
     """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
-    places, schedule = steps.places, steps.schedule
-    n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
-    start = initial_states(motion.law, places, parameters, n_samples)
-    gaps = time_gaps(places, columns)
-    s = motion.clip_and_stop_states({}, dict(start))
+    gaps = time_gaps(steps, columns)
+    start = initial_states(motion.law, steps, parameters, number_of_samples(parameters, columns))
+    s = motion.clip_and_stop_states({}, start)
     with np.errstate(all="ignore"):
-        given = LawInputs.arranged_by_runs(motion.law, places, parameters, columns, motion.between_rows)
+        given = LawInputs.of(motion.law, steps, parameters, columns, motion.between_rows)
         yield s
-        for k, n in enumerate(schedule.n_steps.tolist()):
-            inputs = given.of_gap(k)
-            stepper = Stepper(motion, schedule.method, inputs, gaps[:, k])
+        for k, n in enumerate(steps.n_steps.tolist()):
+            inputs = given.of_gaps(slice(k, k + 1), 1)
             for i in range(n):
-                if given.has_breaks:
-                    for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n, whole=True):
-                        s = step_in_part(replace(stepper, between=part.inputs), part, s)
-                else:
-                    s = stepper.step(s, i / n, 1 / n)
+                for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n, whole=True):
+                    s = step_in_part(motion, steps.method, part, gaps[:, k], s)
                 yield s
 
 
@@ -234,26 +188,25 @@ def evaluations_per_step(motion: LawWithEffects, method: RungeKutta | Rosenbrock
     return n_stages + n_stages // 2 if motion.friction else n_stages
 
 
-def n_parts_of_schedule(motion: LawWithEffects, schedule: StepSchedule) -> int:
-    """Return about how many steps and parts of steps a schedule has: a column that is late divides one in each gap."""
-    return int(schedule.n_steps.sum() + len(schedule.n_steps) * bool(motion.between_rows.dead_times))
+def n_parts_of_steps(motion: LawWithEffects, steps: Steps) -> int:
+    """Return about how many steps and parts of steps are taken: a column that is late divides one in each gap."""
+    return int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.between_rows.dead_times))
 
 
-def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
+def time_gaps(steps: Steps, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
     """Return the time from each position to the next by the time column, (1 or n_samples, n_places - 1, n_runs).
 
     An effect on the clock changes the time column, and so these gaps.
     """
-    return np.asarray(np.diff(values_at_rows(columns[str(places.table.time)], places.row_by_position_and_run), axis=1))
+    return np.asarray(np.diff(values_at_rows(columns[str(steps.table.time)], steps.row_by_position_and_run), axis=1))
 
 
 def initial_states(
-    law: Law, places: RowsInRuns, parameters: Mapping[str, FloatArray], n_samples: int
+    law: Law, steps: Steps, parameters: Mapping[str, FloatArray], n_samples: int
 ) -> dict[str, FloatArray]:
     """Return the states in which the runs start, by name, (n_samples, n_runs) each."""
-    start = {}
+    start, first = {}, steps.row_by_position_and_run[:1]
     for state, given in law.states.items():
-        first = places.row_by_position_and_run[:1]
         at = values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
         start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
     return start
@@ -304,10 +257,7 @@ class Stepper:
         """Split steps from `s` to `after` where friction brings a state to rest or lets it go.
 
         The state begins them in the direction `way`; `ways` are the directions of all states that `after` results from.
-
-        Returns
-        -------
-        The states after the steps, and the directions of motion at their end.
+        Returns the states after the steps, and the directions of motion at their end.
         """
         motion, between, at_rest = self.motion, self.between, way == 0
 
@@ -325,15 +275,14 @@ class Stepper:
             return after, ways
         n_columns, some = ends.shape[1], np.flatnonzero(ends.any(axis=0))
         if n_columns > _MANY_COLUMNS and 2 * len(some) <= n_columns:
-            split = self._of_some(some)._split_at_transitions(
-                state,
-                way[:, some],
-                {name: values[:, some] for name, values in s.items()},
-                {name: values[:, some] for name, values in after.items()},
-                of_columns(begin, some),
-                of_columns(length, some),
-                {name: values[:, some] for name, values in ways.items()},
+            few = replace(
+                self,
+                between=self.between.mapped(lambda values: of_columns(values, some)),
+                gap=of_columns(self.gap, some),
             )
+            s, own, ends_of = ({name: v[:, some] for name, v in each.items()} for each in (s, after, ways))
+            begin, length = of_columns(begin, some), of_columns(length, some)
+            split = few._split_at_transitions(state, way[:, some], s, own, begin, length, ends_of)
             return _with_columns(after, some, split[0]), _with_columns(ways, some, split[1])
         first = margin_to_transition(s, begin)
         until = np.where(ends, _zero_of_straight_line(0.0, first, 1.0, last), 1.0)
@@ -352,10 +301,6 @@ class Stepper:
         anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
         return self._step_without_split(there, begin + until * length, (1 - until) * length, anew), anew
 
-    def _of_some(self, columns: IntArray) -> Stepper:
-        """Return the steps of some of the columns of the states' arrays."""
-        return replace(self, between=self.between.of_some(columns), gap=of_columns(self.gap, columns))
-
     def _step_without_split(
         self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
     ) -> dict[str, Any]:
@@ -366,20 +311,27 @@ class Stepper:
                 lambda at, share: self.motion.rates(at, *self.between(share), ways), s, begin, length, self.gap
             )
         width, given = self.gap * length, self.between(begin)
+        _, *later, end = method.terms
         rates = [self.motion.rates(s, *given, ways)]
-        for k, terms in enumerate(method.stages[1:], 1):
+        for k, terms in enumerate(later, 1):
             if method.c[k] != method.c[k - 1]:
                 given = self.between(begin + method.c[k] * length)
             rates.append(self.motion.rates(_advanced_states(s, width, terms, rates), *given, ways))
-        return _advanced_states(s, width, method.weights, rates)
+        return _advanced_states(s, width, end, rates)
 
 
-def step_in_part(stepper: Stepper, part: StepPart, s: dict[str, Any]) -> dict[str, Any]:
-    """Return the states, (n_samples, n_columns), after a part of some steps; other columns stay as they are."""
+def step_in_part(
+    motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, gap: FloatArray, s: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the states, (n_samples, n_columns), after a part of some steps; other columns stay as they are.
+
+    `gap` is the time of the gap in which each column's step lies, (1 or n_samples, n_columns).
+    """
     if part.columns is None:
-        return stepper.step(s, part.begin, part.length)
-    after = stepper.step({state: values[:, part.columns] for state, values in s.items()}, part.begin, part.length)
-    return _with_columns(s, part.columns, after)
+        return Stepper(motion, method, part.inputs, gap).step(s, part.begin, part.length)
+    stepper = Stepper(motion, method, part.inputs, of_columns(gap, part.columns))
+    some = {state: values[:, part.columns] for state, values in s.items()}
+    return _with_columns(s, part.columns, stepper.step(some, part.begin, part.length))
 
 
 def _with_columns(s: Mapping[str, Any], columns: IntArray, new: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,14 +23,21 @@ from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.recordings.plan import Plan
 from probewise.recordings.prediction import prediction_summary
-from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.binding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import STANDS_STILL, System, SystemChain, with_converged_step
-from probewise.systems.table import RunRecording, RunTable, column_error, covariate_of_column, relative_sds_of_column
+from probewise.systems.table import (
+    RunRecording,
+    RunTable,
+    column_error,
+    covariate_of_column,
+    median_sd_of_column,
+    relative_sds_of_column,
+    run_table_csv,
+)
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
@@ -107,24 +114,15 @@ def predict_system(
     prediction, with all effects of the model. For a run outside the recording, each sample draws an effect's value per
     run from a Student-t about the sample's values for the recorded runs, with their scatter as its width, and one
     degree of freedom more than there are runs; and so the `per_run` parameters, if three runs or more were recorded, in
-    the coordinate in which their prior is standard normal, else from their prior. Where no
-    time was recorded, a step at a row (`at_row`) counts the rows of the recording: those of a table that neither
-    begins with the recording's rows nor is a contiguous part of them, readings included, come after its end. A row that
-    lacks a number which the simulator or an effect needs has no prediction (NaN), and with a law the rows after it in
-    the run neither; effects that look back to it, such as a lag, take the number interpolated within the run. The
-    effect of a column that counts from its mean is 0 where the column is missing, as in the fit.
+    the coordinate in which their prior is standard normal, else from their prior. Where no time was recorded, a step at
+    a row (`at_row`) counts the rows of the recording: those of a table that neither begins with the recording's rows
+    nor is a contiguous part of them, readings included, come after its end. A row that lacks a number which the
+    simulator or an effect needs has no prediction (NaN), and with a law the rows after it in the run neither; effects
+    that look back to it, such as a lag, take the number interpolated within the run. The effect of a column that counts
+    from its mean is 0 where the column is missing, as in the fit.
 
-    Parameters
-    ----------
-    fitted
-        The fitted simulator.
-    table
-        The n_points rows to predict, with the columns that the simulator and the effects use: a table, a dict of
-        arrays, or a DataFrame.
-    rng
-        Random generator, for runs outside the recording.
-    progress
-        Called with the number of finished samples.
+    `table` is a RunTable, a dict of arrays, or a DataFrame of n_points rows, with the columns that the simulator and
+    the effects use; `rng` is for runs outside the recording.
 
     Raises
     ------
@@ -172,32 +170,20 @@ def predict_system(
             sd = fitted.noise_sd[first : first + per_block][there, None]
             mixture.add(mean[there], _noise_parameters(fitted, chain, block[there], mean[there], sd, own), between)
     if n_failed == n_samples:
-        rows = (
-            f" in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + own.first_line}"
-            if never.any()
-            else ""
-        )
-        raise ParameterError(
-            "simulate" if system.caller else "rates",
-            f"no finite reading{rows}",
-            "finite readings of all rows for some of the samples",
-        )
+        at = f"in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + own.first_line}"
+        found = f"no finite reading {at}" if never.any() else "no finite reading"
+        allowed = "finite readings of all rows for some of the samples"
+        raise ParameterError("simulate" if system.caller else "rates", found, allowed)
     if n_failed:
-        warnings.warn(
-            f"{n_failed} of {n_samples} samples are left out: the simulator gives no finite readings for them",
-            DoubtfulResultWarning,
-            stacklevel=2,
-        )
+        left_out = f"{n_failed} of {n_samples} samples are left out: the simulator gives no finite readings for them"
+        warnings.warn(left_out, DoubtfulResultWarning, stacklevel=2)
     mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         first_lost = int(np.argmax(lost)) + own.first_line
         rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {first_lost}"
-        warnings.warn(
-            f"{rows}: a number that they need is missing; where an effect looks back to it, it is interpolated",
-            DoubtfulResultWarning,
-            stacklevel=2,
-        )
+        why = "a number that they need is missing; where an effect looks back to it, it is interpolated"
+        warnings.warn(f"{rows}: {why}", DoubtfulResultWarning, stacklevel=2)
     return SystemPrediction(
         own, recording.readings, mean=mean, sd=sd, log_density=scores, n_samples=n_samples, n_failed=n_failed
     )
@@ -259,16 +245,10 @@ def _filled_table_and_unpredictable_mask(
 ) -> tuple[RunTable, BoolArray]:
     """Interpolate the missing cells that predictions need, and find the rows that cannot be predicted without them.
 
-    Returns
-    -------
-    The table with these cells interpolated within runs, for effects with a memory in the rows after, and the mask of
-    the rows without a prediction, (n_points,): those that lack a cell which the simulator or an effect needs, and those
-    for which the simulator alone gives none, as a law from there to the end of the run.
-
-    Raises
-    ------
-    ParameterError
-        If no row can be predicted.
+    Returns the table with these cells interpolated within runs, for effects with a memory in the rows after, and the
+    mask of the rows without a prediction, (n_points,): those that lack a cell which the simulator or an effect needs,
+    and those for which the simulator alone gives none, as a law from there to the end of the run. Raises ParameterError
+    if no row can be predicted.
     """
     few, lost = theta[:_FEW], np.zeros(len(table), dtype=np.bool_)
     lacking = _incomplete_input_columns(chain.system.simulator, table)
@@ -304,11 +284,8 @@ def _incomplete_input_columns(simulator: Simulator, table: RunTable) -> dict[str
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
     """Bind the effects of a fitted simulator to the runs of a table, in the order of `fitted.effects`.
 
-    Raises
-    ------
-    ParameterError
-        If a column that an effect reads is missing, time falls within a run and an effect depends on earlier times, or
-        this version has no such effect.
+    Raises ParameterError if a column that an effect reads is missing, time falls within a run and an effect depends on
+    earlier times, or this version has no such effect.
     """
     forms: Mapping[str, Any] = {}
     if fitted.known is not None:
@@ -318,11 +295,10 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
             table.require_rising_time()
         lacking = _column_names_read_by_effects(fitted, forms) - set(table.covariates)
         if lacking:
-            found = "missing or without numbers"
             allowed = (
                 f"numbers in this column, which an effect of the model reads; the table has {', '.join(table.columns)}"
             )
-            raise ParameterError(f"column {min(lacking)!r}", found, allowed)
+            raise ParameterError(f"column {min(lacking)!r}", "missing or without numbers", allowed)
     out = []
     for name in fitted.effects:
         if name in forms:
@@ -431,9 +407,7 @@ def _noise_parameters(
     seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
     declared = fitted.simulator.noise.sd
     if isinstance(declared, str) and fitted.known is not None:
-        values = fitted.known.table.covariates[declared]
-        typical = float(np.median(values[np.isfinite(values) & (values > 0)]))
-        sd = sd * relative_sds_of_column(table, declared, typical)
+        sd = sd * relative_sds_of_column(table, declared, median_sd_of_column(fitted.known.table, declared))
     noise = NoiseParameters(sd, np.zeros((1, 1)), seen=seen)
     for effect, columns in effects_with_columns(chain.effects, chain.system.n_params):
         if effect.stage is Stage.NOISE:
@@ -444,16 +418,7 @@ def _noise_parameters(
 def write_system_prediction(prediction: SystemPrediction, path: str | os.PathLike[str]) -> None:
     """Write all rows of the table in order as CSV, with `mean`, `sd` and `log_density`, in full precision.
 
-    Columns of the table with one of these names are overwritten.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Columns of the table with one of these names are overwritten. Raises FileError if the file cannot be written.
     """
-    predicted = {"mean": prediction.mean, "sd": prediction.sd, "log_density": prediction.log_density}
-    columns: dict[str, Sequence[str]] = {
-        name: [number_text(v) if values.dtype == np.float64 else str(v) for v in values.tolist()]
-        for name, values in {**prediction.table.columns, **predicted}.items()
-    }
-    write_text_atomically(path, csv_text(columns))
+    predicted = {name: getattr(prediction, name) for name in ("mean", "sd", "log_density")}
+    write_text_atomically(path, run_table_csv(prediction.table.with_columns(predicted)))

@@ -24,23 +24,8 @@ from probewise.systems.table import RunTable, read_run_table
 
 _A_RANGE = "(low, high) with low < high; None for an open end"
 _NAMES = (
-    "reading",
-    "unit",
-    "time",
-    "time_unit",
-    "run",
-    "parameters",
-    "per_run",
-    "controls",
-    "noise",
-    "simulate",
-    "states",
-    "rates",
-    "observe",
-    "hold",
-    "max_step_s",
-    "vectorized",
-    "extra",
+    *("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise", "simulate"),
+    *("states", "rates", "observe", "hold", "max_step_s", "vectorized", "extra"),
 )
 
 
@@ -70,10 +55,8 @@ Observe: TypeAlias = Callable[[Values, Values, Values], Any]
 Hold: TypeAlias = Literal["previous", "linear"]
 
 
-_OF_NOISE = (n for n, kind in EFFECTS.items() if getattr(kind, "stage", None) is Stage.NOISE)
-
-
-_TAKEN = (*_OF_NOISE, *RARE_EFFECTS, "unknown", "clean")
+_OF_NOISE = (name for name, kind in EFFECTS.items() if kind.stage is Stage.NOISE)
+_TAKEN = (*_OF_NOISE, *RARE_EFFECTS, "unknown", "clean")  # names that no effect of a user may have
 
 
 @dataclass(frozen=True)
@@ -101,13 +84,7 @@ class Noise:
 
     @classmethod
     def of(cls, given: object) -> Noise:
-        """Build from a user's dict with some of "sd", "step", "range", "zero"; a Noise is returned as it is.
-
-        Raises
-        ------
-        ParameterError
-            If it is anything else, or a value is out of range.
-        """
+        """Build from a user's dict with some of "sd", "step", "range", "zero"; a Noise is returned as it is."""
         if isinstance(given, Noise):
             return given
         if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
@@ -256,9 +233,8 @@ class Simulator:
         require_mapping("parameters", self.parameters, "the prior of each by name: {'tau_s': ('log', 1, 1000)}")
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
-        object.__setattr__(
-            self, "parameters", {n: parse_prior(f"parameters[{n!r}]", prior) for n, prior in self.parameters.items()}
-        )
+        priors = {name: parse_prior(f"parameters[{name!r}]", prior) for name, prior in self.parameters.items()}
+        object.__setattr__(self, "parameters", priors)
         object.__setattr__(self, "per_run", checked_texts("per_run", self.per_run, "names of parameters"))
         object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
         object.__setattr__(self, "noise", Noise.of(self.noise))
@@ -267,17 +243,15 @@ class Simulator:
             if name not in self.parameters:
                 raise ParameterError("per_run", name, f"a parameter: {', '.join(self.parameters)}")
         if self.per_run and self.run is None:
-            raise ParameterError(
-                "per_run", list(self.per_run), 'nothing, or run = "..." with the column that names the runs'
-            )
+            allowed = 'nothing, or run = "..." with the column that names the runs'
+            raise ParameterError("per_run", list(self.per_run), allowed)
         if self.law is not None:
             if self.time is None:
                 raise ParameterError("time", None, "the column of time, which rates are integrated over")
             for state, start in self.law.states.items():
                 if not (start in self.parameters if isinstance(start, str) else _is_finite_number(start)):
-                    raise ParameterError(
-                        f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}"
-                    )
+                    allowed = f"a number or a parameter: {', '.join(self.parameters)}"
+                    raise ParameterError(f"states[{state!r}]", start, allowed)
         own = {
             n: replace(e, prior=parse_prior(f"extra[{n!r}].prior", e.prior)) if isinstance(e, Extra) else e
             for n, e in self.extra.items()
@@ -316,12 +290,7 @@ def require_simulator(simulator: object) -> None:
 def parse_prior(what: str, given: object) -> Marginal:
     """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
 
-    `what` is its name in errors.
-
-    Raises
-    ------
-    ParameterError
-        If it is none of these, or has no mass.
+    Raises ParameterError if it is none of these, or has no mass; `what` is its name there.
     """
     allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
     if isinstance(given, Marginal):
@@ -380,74 +349,59 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
         hint = f"; was {like[0]} meant to be {error.name}?" if like else ""
         raise FileError(path, found, error.allowed + hint) from error
     except Exception as error:  # objects of the file may raise anything
-        raise FileError(
-            path,
-            f"what it says does not fit together ({message_of(error)})",
-            f"these names: {', '.join(_NAMES)}",
-        ) from error
+        found = f"what it says does not fit together ({message_of(error)})"
+        raise FileError(path, found, f"these names: {', '.join(_NAMES)}") from error
 
 
 def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
-    given = said.get("parameters")
-    if not isinstance(given, Mapping):
-        raise ParameterError("parameters", given, 'a dict from names to priors: {"gain": (0, 10)}')
+    def given(name: str, allowed: str, fits: Callable[[Any], bool], default: object = None) -> Any:
+        value = said.get(name, default)
+        if not fits(value):
+            raise ParameterError(name, value, allowed)
+        return value
+
+    def text_of(name: str) -> str:
+        return str(given(name, f'a text: {name} = "..."', lambda v: isinstance(v, str) and v != ""))
+
+    def function(name: str) -> Any:
+        return raising_exceptions(given(name, f"a function: def {name}(...)", callable))
+
+    def texts(name: str) -> tuple[str, ...]:
+        allowed = f'a list of names: {name} = ["..."]'
+        return tuple(
+            given(name, allowed, lambda v: not isinstance(v, str) and all(isinstance(each, str) for each in v), ())
+        )
+
+    def mapping(name: str, allowed: str, default: object = None) -> Any:
+        return given(name, allowed, lambda v: isinstance(v, Mapping), default)
+
+    parameters = mapping("parameters", 'a dict from names to priors: {"gain": (0, 10)}')
     law = None
     if "rates" in said or "states" in said:
-        states = said.get("states")
-        if not isinstance(states, Mapping):
-            raise ParameterError("states", states, 'a dict from states to where they start: {"temp_c": 20.0}')
         law = Law(
-            states,
-            _checked_function(said, "rates"),
-            _checked_function(said, "observe") if "observe" in said else None,
+            mapping("states", 'a dict from states to where they start: {"temp_c": 20.0}'),
+            function("rates"),
+            function("observe") if "observe" in said else None,
             said.get("hold", "previous"),
             said.get("max_step_s"),
         )
     return Simulator(
-        reading=_checked_text(said, "reading"),
-        unit=_checked_text(said, "unit"),
-        parameters={name: parse_prior(f"parameters[{name!r}]", prior) for name, prior in given.items()},
-        simulate=_checked_function(said, "simulate") if "simulate" in said else None,
+        reading=text_of("reading"),
+        unit=text_of("unit"),
+        parameters=parameters,
+        simulate=function("simulate") if "simulate" in said else None,
         law=law,
-        time=_checked_text(said, "time") if said.get("time") is not None else None,
-        time_unit=_checked_text(said, "time_unit") if "time_unit" in said else "s",
-        run=_checked_text(said, "run") if said.get("run") is not None else None,
-        per_run=_checked_texts(said, "per_run"),
-        controls=_checked_texts(said, "controls"),
-        noise=Noise.of(said.get("noise", {})),
-        extra={name: _parse_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
+        time=text_of("time") if said.get("time") is not None else None,
+        time_unit=text_of("time_unit") if "time_unit" in said else "s",
+        run=text_of("run") if said.get("run") is not None else None,
+        per_run=texts("per_run"),
+        controls=texts("controls"),
+        noise=said.get("noise", {}),
+        extra={name: _parse_extra(name, each) for name, each in mapping("extra", "a dict", {}).items()},
         vectorized=bool(said.get("vectorized", False)),
         source=printable(path.name),
         fingerprint=fingerprint_of_text(text),
     )
-
-
-def _checked_text(said: Mapping[str, Any], name: str) -> str:
-    value = said.get(name)
-    if not isinstance(value, str) or not value:
-        raise ParameterError(name, value, f'a text: {name} = "..."')
-    return value
-
-
-def _checked_texts(said: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    value = said.get(name, ())
-    if isinstance(value, str) or not all(isinstance(each, str) for each in value):
-        raise ParameterError(name, value, f'a list of names: {name} = ["..."]')
-    return tuple(value)
-
-
-def _checked_mapping(said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = said.get(name, {})
-    if not isinstance(value, Mapping):
-        raise ParameterError(name, value, "a dict")
-    return value
-
-
-def _checked_function(said: Mapping[str, Any], name: str) -> Any:
-    value = said.get(name)
-    if not callable(value):
-        raise ParameterError(name, value, f"a function: def {name}(...)")
-    return raising_exceptions(value)
 
 
 def _parse_extra(name: str, given: object) -> Extra:

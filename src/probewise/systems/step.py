@@ -45,45 +45,6 @@ _LATER = 1e-4  # of a step, for the rates' change with time: inputs between rows
 _DEARER = 1.5
 
 
-@dataclass(frozen=True, eq=False)
-class RowsInRuns:
-    """The rows of a table by position in its runs, for stepping all runs together; short runs repeat their last row.
-
-    Raises
-    ------
-    ParameterError
-        On first use, if time decreases within a run.
-    """
-
-    table: RunTable
-
-    @cached_property
-    def row_by_position_and_run(self) -> IntArray:
-        """Row of the table at each position of each run, (n_places, n_runs); after its end, a run's last row."""
-        self.table.require_rising_time()
-        by_run = self.table.rows_by_scan()
-        longest = max(len(rows) for rows in by_run)
-        return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
-
-    @cached_property
-    def gaps(self) -> FloatArray:
-        """Time from each position to the next, (n_places - 1, n_runs), in the unit of time."""
-        return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
-
-    @property
-    def typical_gap(self) -> float:
-        """Median time between two rows of a run that are not at the same time; 1 without any."""
-        return float(np.median(self.gaps[self.gaps > 0])) if (self.gaps > 0).any() else 1.0
-
-    @cached_property
-    def position_and_run_by_row(self) -> tuple[IntArray, IntArray]:
-        """Position in its run, and number of its run, of each row, (n_points,) each."""
-        place = np.empty(len(self.table), dtype=np.int64)
-        for rows in self.table.rows_by_scan():
-            place[rows] = np.arange(len(rows))
-        return place, self.table.scan
-
-
 Rates = Callable[[Mapping[str, Any], Any], Mapping[str, Any]]
 """Rate of each state, from states (n_samples, n_runs) and a share of the gap between two rows."""
 
@@ -97,18 +58,10 @@ class Rosenbrock:
         return 2 * len(_ALPHA) + 2 * n_states + 1
 
     def advanced(self, rates: Rates, s: Mapping[str, Any], begin: Any, length: Any, gap: FloatArray) -> dict[str, Any]:
-        """Return the states after a step.
+        """Return the states after a step from `s`, (n_samples, n_runs) each, by name.
 
-        Parameters
-        ----------
-        rates
-            The law's rates.
-        s
-            States at the beginning by name, (n_samples, n_runs) each.
-        begin, length
-            Where the step begins and how long it is, as shares of the gap: numbers, or one for each run.
-        gap
-            Time from row to row, (1 or n_samples, n_runs).
+        `begin` and `length` are shares of the `gap`, the time from row to row, (1 or n_samples, n_runs): numbers, or
+        one for each run.
         """
         names, shape = list(s), np.broadcast_shapes(gap.shape, *(np.shape(values) for values in s.values()))
         n = len(names)
@@ -118,14 +71,9 @@ class Rosenbrock:
 
         def rates_at(states: FloatArray, share: Any) -> FloatArray:
             found = rates(dict(zip(names, states, strict=True)), share)
-            out = np.empty_like(states)
-            for k, name in enumerate(names):
-                out[k] = found[name]
-            return out
+            return np.stack([np.broadcast_to(found[name], shape) for name in names])
 
-        start = np.empty((n, *shape))
-        for k, name in enumerate(names):
-            start[k] = s[name]
+        start = np.stack([np.broadcast_to(s[name], shape) for name in names])
         first = rates_at(start, begin)
         size = np.maximum(np.abs(start), np.abs(step * first))
         nudge = _NUDGE * np.maximum(size, np.maximum(_LEAST_SIZE * size.max(axis=0), _TINY))
@@ -154,7 +102,6 @@ RODAS = Rosenbrock()
 
 
 def _with_weighted(first: FloatArray, weights: tuple[float, ...], terms: list[FloatArray]) -> FloatArray:
-    """Return a value plus the weighted sum of terms."""
     out = first.copy()
     for weight, term in zip(weights, terms, strict=True):
         out += weight * term
@@ -192,18 +139,9 @@ class RungeKutta:
     c: tuple[float, ...]
 
     @cached_property
-    def stages(self) -> tuple[Terms, ...]:
-        """For each stage, (index, weight) of the earlier stages whose rates lead to it."""
-        return tuple(map(_nonzero_terms, self.a))
-
-    @cached_property
-    def weights(self) -> Terms:
-        """(Index, weight) of the stages whose rates lead to the end of the step."""
-        return _nonzero_terms(self.b)
-
-
-def _nonzero_terms(weights: tuple[float, ...]) -> Terms:
-    return tuple((k, weight) for k, weight in enumerate(weights) if weight)
+    def terms(self) -> tuple[Terms, ...]:
+        """The earlier stages whose rates lead to each stage, then those whose rates lead to the end of the step."""
+        return tuple(tuple((k, w) for k, w in enumerate(weights) if w) for weights in (*self.a, self.b))
 
 
 FOURTH_ORDER = RungeKutta(((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))
@@ -215,89 +153,110 @@ N_LONGER = 3
 
 @cache
 def eighth_order_method() -> RungeKutta:
-    """Return the method of eighth order.
-
-    Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 1993, section II.10.
-    """
+    """Return the method of Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 1993, section II.10."""
     from scipy.integrate import DOP853  # takes long, and laws alone need it
 
     a = tuple(tuple(row[:k].tolist()) for k, row in enumerate(DOP853.A))
     return RungeKutta(a, tuple(DOP853.B.tolist()), tuple(DOP853.C.tolist()))
 
 
-@dataclass(frozen=True, eq=False)
-class StepSchedule:
-    """The number of steps in each gap between rows, (n_gaps,), and the method that takes the steps."""
+def cheapest_steps(n_steps: IntArray) -> tuple[IntArray, RungeKutta]:
+    """Return these numbers of fourth-order steps in each gap, (n_gaps,), or a third of eighth order, and the method.
 
-    n_steps: IntArray
-    method: RungeKutta | Rosenbrock
-
-    @classmethod
-    def from_fourth_order_steps(cls, n_steps: IntArray) -> StepSchedule:
-        """Return a schedule of these numbers of fourth-order steps, (n_gaps,), or a third as many of eighth order.
-
-        The third is rounded up in each gap. All gaps have the same order: the eighth if it costs at most 1.5 times as
-        many evaluations in all, as where most gaps need several steps.
-        """
-        fewer = np.asarray(-(-n_steps // N_LONGER), dtype=np.int64)
-        if N_LONGER * fewer.sum() <= _DEARER * n_steps.sum():
-            return cls(fewer, eighth_order_method())
-        return cls(n_steps, FOURTH_ORDER)
+    The third is rounded up in each gap. All gaps have the same order: the eighth if it costs at most 1.5 times as many
+    evaluations in all, as where most gaps need several steps.
+    """
+    fewer = np.asarray(-(-n_steps // N_LONGER), dtype=np.int64)
+    if N_LONGER * fewer.sum() <= _DEARER * n_steps.sum():
+        return fewer, eighth_order_method()
+    return n_steps, FOURTH_ORDER
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Integration steps over a table, each taken in all runs together; position k is the k-th row of every run.
+    """Integration steps over the rows of a table, in all its runs together; position k is the k-th row of every run.
 
     No step is longer than `max_step`, in the unit of time, at fourth order. The method is linearly implicit if `stiff`,
     else explicit.
     """
 
-    places: RowsInRuns
-    max_step: float
+    table: RunTable
+    max_step: float = np.inf
     stiff: bool = False
 
     @cached_property
-    def schedule(self) -> StepSchedule:
-        """Number of steps from each row of a run to the next, the same in all runs, and the method."""
-        longest = self.places.gaps.max(axis=1, initial=0.0)
-        n_steps = np.asarray(np.maximum(np.ceil(longest / self.max_step - 1e-9), 1), dtype=np.int64)
-        return StepSchedule(n_steps, RODAS) if self.stiff else StepSchedule.from_fourth_order_steps(n_steps)
+    def row_by_position_and_run(self) -> IntArray:
+        """Row of the table at each position of each run, (n_places, n_runs); after its end, a run's last row.
+
+        Raises ParameterError if time decreases within a run.
+        """
+        self.table.require_rising_time()
+        by_run = self.table.rows_by_scan()
+        longest = max(len(rows) for rows in by_run)
+        return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
 
     @cached_property
-    def gap_of_step(self) -> IntArray:
-        """Number of the gap in which each step lies, (n_steps,); gap k is between rows k and k + 1 of every run."""
-        return np.repeat(np.arange(len(self.schedule.n_steps)), self.schedule.n_steps)
-
-    @cached_property
-    def n_steps_before_position(self) -> IntArray:
-        """Number of steps from the first row of a run to its row at each position, (n_places,)."""
-        return np.concatenate([[0], np.cumsum(self.schedule.n_steps)])
+    def position_by_row(self) -> IntArray:
+        """Position of each row in its run, (n_points,)."""
+        place = np.empty(len(self.table), dtype=np.int64)
+        for rows in self.table.rows_by_scan():
+            place[rows] = np.arange(len(rows))
+        return place
 
     @property
     def n_runs(self) -> int:
         """Number of runs."""
-        return int(self.places.row_by_position_and_run.shape[1])
+        return int(self.row_by_position_and_run.shape[1])
 
     @cached_property
-    def begin_share_of_gap(self) -> FloatArray:
-        """Share of its gap between rows at which each step begins, (n_steps * n_runs,), ordered by step, then run."""
+    def gaps(self) -> FloatArray:
+        """Time from each position to the next, (n_places - 1, n_runs), in the unit of time."""
+        return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
+
+    @property
+    def typical_gap(self) -> float:
+        """Median time between two rows of a run that are not at the same time; 1 without any."""
+        return float(np.median(self.gaps[self.gaps > 0])) if (self.gaps > 0).any() else 1.0
+
+    @cached_property
+    def _n_steps_and_method(self) -> tuple[IntArray, RungeKutta | Rosenbrock]:
+        longest = self.gaps.max(axis=1, initial=0.0)
+        n_steps = np.asarray(np.maximum(np.ceil(longest / self.max_step - 1e-9), 1), dtype=np.int64)
+        return (n_steps, RODAS) if self.stiff else cheapest_steps(n_steps)
+
+    @property
+    def n_steps(self) -> IntArray:
+        """Number of steps in each gap, from a position to the next, the same in all runs, (n_places - 1,)."""
+        return self._n_steps_and_method[0]
+
+    @property
+    def method(self) -> RungeKutta | Rosenbrock:
+        """The method that takes the steps."""
+        return self._n_steps_and_method[1]
+
+    @cached_property
+    def gap_of_step(self) -> IntArray:
+        """Number of the gap in which each step lies, (n_steps,); gap k is between rows k and k + 1 of every run."""
+        return np.repeat(np.arange(len(self.n_steps)), self.n_steps)
+
+    @cached_property
+    def n_steps_before_position(self) -> IntArray:
+        """Number of steps from the first row of a run to its row at each position, (n_places,)."""
+        return np.concatenate([[0], np.cumsum(self.n_steps)])
+
+    @cached_property
+    def begin_and_length(self) -> tuple[FloatArray, FloatArray]:
+        """Shares of its gap at which each step begins, and that it takes, (n_steps * n_runs,), by step, then run."""
         gap = self.gap_of_step
-        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.schedule.n_steps[gap]
-        return np.repeat(share, self.n_runs)
-
-    @cached_property
-    def length_share_of_gap(self) -> FloatArray:
-        """Share of its gap between rows that each step takes, (n_steps * n_runs,), ordered by step, then run."""
-        return np.repeat(1.0 / self.schedule.n_steps[self.gap_of_step], self.n_runs)
+        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps[gap]
+        return np.repeat(share, self.n_runs), np.repeat(1.0 / self.n_steps[gap], self.n_runs)
 
     def states_at_rows(self, states: FloatArray) -> FloatArray:
         """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""
-        place, run = self.places.position_and_run_by_row
-        return np.asarray(states[:, :, self.n_steps_before_position[place], run])
+        return np.asarray(states[:, :, self.n_steps_before_position[self.position_by_row], self.table.scan])
 
 
 @lru_cache(maxsize=16)
 def steps_for_table(table: RunTable, max_step: float, *, stiff: bool = False) -> Steps:
     """Return the `Steps` of an integration over a table."""
-    return Steps(RowsInRuns(table), max_step, stiff)
+    return Steps(table, max_step, stiff)

@@ -20,11 +20,11 @@ from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
-from probewise.systems.calls import Caller, IntegrationTally, user_function_error
-from probewise.systems.law import LawWithEffects, evaluations_per_step, integrate_readings, readings_of_states
+from probewise.systems.calls import Caller, IntegrationTally, take_samples, user_function_error
+from probewise.systems.law import LawWithEffects, evaluations_per_step, integrate_states, readings_of_states
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.simulator import Simulator
-from probewise.systems.step import RowsInRuns, Steps, steps_for_table
+from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import RunTable, relative_sds_of_column
 
 _N_STARTS = 8
@@ -40,22 +40,17 @@ class System:
 
     Parameters
     ----------
-    simulator
-        The user's simulator.
-    runs
-        Names of the runs.
-    max_step
-        Largest integration step at fourth order, in the unit of time, if there is a law.
-    stiff
-        Whether the law is integrated by a linearly implicit method.
+    simulator, runs
+        The user's simulator, and the names of the runs.
+    max_step, stiff
+        Largest integration step at fourth order, in the unit of time, if there is a law; and whether it is integrated
+        by a linearly implicit method.
     caller
         Caller of `simulate`, if there is no law.
     first
         Standard-normal coordinates of an earlier fit, (n_params,), from which fits start.
-    tally
-        Counts of a law's evaluations, and of samples at which it raises an error.
-    trajectories
-        Cache of trajectories of the law, from which nearby ones are solved.
+    tally, trajectories
+        Counts of a law's evaluations and failures, and cache of its trajectories, from which nearby ones are solved.
     limited
         Whether predictions are limited to the declared range of the instrument (`limited_to_range`).
     slack
@@ -98,15 +93,14 @@ class System:
             If `simulate` raises an error at a trial call and no other call gives a finite reading, or a law raises at
             every one.
         """
-        declared = simulator.noise.sd
+        declared, taken = simulator.noise.sd, (simulator.reading, simulator.time, simulator.run)
         if isinstance(declared, str) and declared not in table.covariates:
-            raise ParameterError(
-                'noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}"
-            )
-        settable = [name for name in table.columns if name not in (simulator.reading, simulator.time, simulator.run)]
+            allowed = f"a number, or a column of numbers: {', '.join(table.covariates)}"
+            raise ParameterError('noise["sd"]', declared, allowed)
         for name in simulator.controls:
             if name not in table.columns:
-                raise ParameterError("controls", name, f"a column that can be set: {', '.join(settable)}")
+                settable = ", ".join(name for name in table.columns if name not in taken)
+                raise ParameterError("controls", name, f"a column that can be set: {settable}")
         if not columns_without_reading(simulator, table):
             allowed = "a column besides the reading, such as the time or the number of each row"
             raise ParameterError("columns", list(table.columns), allowed)
@@ -131,7 +125,7 @@ class System:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or RowsInRuns(table).typical_gap, stiff=stiff)
+        system = replace(bare, max_step=simulator.law.max_step_s or Steps(table).typical_gap, stiff=stiff)
         system.require_working_law(table)
         return system
 
@@ -142,12 +136,7 @@ class System:
     def require_working_law(self, table: RunTable) -> None:
         """Raise an error unless the law integrates to finite readings at some point of the prior.
 
-        Raises
-        ------
-        FileError
-            If it raises an error at all points that are tried.
-        ParameterError
-            If there is no finite reading at any of them.
+        A FileError if it raises an error at all points that are tried, a ParameterError if no reading is finite.
         """
         columns, law = columns_without_reading(self.simulator, table), self.simulator.law
         assert law is not None
@@ -156,7 +145,8 @@ class System:
         for z in self.starts:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
-                readings.append(integrate_readings(LawWithEffects(law), self.steps(table), parameters, columns))
+                states = integrate_states(law, self.steps(table), parameters, columns)
+                readings.append(readings_of_states(law, states, parameters, columns))
             except ProbewiseError:
                 raise
             except Exception as error:
@@ -356,15 +346,9 @@ class SystemChain:
         def law_and_inputs_of_samples(
             samples: IntArray,
         ) -> tuple[LawWithEffects, dict[str, FloatArray], dict[str, NDArray[Any]]]:
-            def values_of_samples(values: Any) -> Any:
-                return values[samples] if np.ndim(values) == 2 and len(values) > 1 else values
-
             motion = LawWithEffects(law, between_rows=self._between_rows(theta[samples]))
-            return (
-                self._apply_stage(Stage.RATE, motion, theta[samples], plan),
-                {name: values_of_samples(values) for name, values in parameters.items()},
-                {name: values_of_samples(values) for name, values in of_rates.items()},
-            )
+            motion = self._apply_stage(Stage.RATE, motion, theta[samples], plan)
+            return motion, take_samples(parameters, samples), take_samples(of_rates, samples)
 
         try:
             states, cost = integrate_from_known_trajectories(
@@ -384,20 +368,12 @@ class SystemChain:
                 system.tally.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
 
-        def values_of_sample(values: Any, k: int) -> Any:
-            return values[min(k, len(values) - 1)][None] if np.ndim(values) == 2 else values
-
-        each = [
-            self._integrated_readings(
-                {name: values_of_sample(values, k) for name, values in parameters.items()},
-                {name: values_of_sample(values, k) for name, values in columns.items()},
-                {name: values_of_sample(values, k) for name, values in of_rates.items()},
-                theta[k : k + 1],
-                plan,
-            )
-            for k in range(len(theta))
-        ]
-        return np.concatenate(each)
+        of_all = parameters, columns, of_rates
+        each = (
+            self._integrated_readings(*(take_samples(values, k) for values in of_all), theta[k], plan)
+            for k in (slice(k, k + 1) for k in range(len(theta)))
+        )
+        return np.concatenate([*each])
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
@@ -445,9 +421,7 @@ class SystemChain:
 
 def _act_between_rows(effect: AnyEffect) -> Callable[[BetweenRows, FloatArray], BetweenRows] | None:
     """Return what an effect does between the rows, if it does anything there that its act at the rows does not say."""
-    act = getattr(effect, "act", None)
-    found: Callable[[BetweenRows, FloatArray], BetweenRows] | None = getattr(act, "between_rows", None)
-    return found
+    return cast(Any, getattr(getattr(effect, "act", None), "between_rows", None))
 
 
 STANDS_STILL = 0.02
@@ -465,23 +439,11 @@ def with_converged_step(
 ) -> System:
     """Return a system with a step so short that halving it changes predictions by a tolerance (rms) at most.
 
-    Where a linearly implicit method needs less than half the evaluations, the system is `stiff`.
-
-    Parameters
-    ----------
-    system
-        The system; one without a law is returned as it is.
-    table
-        The rows.
-    theta
-        Parameters of the system and of the effects, (n_samples, n_params); samples without finite predictions do
-        not count, unless half the step makes them finite.
-    effects
-        Effects added to the law.
-    tolerance
-        Tolerance, in the unit of a reading.
-    or_finest
-        Return the finest step within reach, instead of an error, if predictions converge but still change by more.
+    Where a linearly implicit method needs less than half the evaluations, the system is `stiff`; one without a law is
+    returned as it is. `theta` are parameters of the system and of the `effects` added to its law, (n_samples,
+    n_params); samples without finite predictions do not count, unless half the step makes them finite. The `tolerance`
+    is in the unit of a reading. With `or_finest`, the finest step within reach is returned, instead of an error, if
+    predictions converge but still change by more.
 
     Raises
     ------
@@ -496,7 +458,7 @@ def with_converged_step(
         cost = _cost_of_integration(found, table)
     except ParameterError as error:
         found, cost = error, math.inf
-    stiff = replace(system, max_step=max(system.max_step, system.steps(table).places.typical_gap), stiff=True)
+    stiff = replace(system, max_step=max(system.max_step, system.steps(table).typical_gap), stiff=True)
     if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, table):
         try:
             return _halved_until_still(stiff, table, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
@@ -517,13 +479,7 @@ def _halved_until_still(
     or_finest: bool = False,
     most: float = math.inf,
 ) -> System:
-    """Return a system with the step halved as `with_converged_step` says, by its own method.
-
-    Raises
-    ------
-    ParameterError
-        If predictions still change with 4,096 more steps than rows in the longest run, or at a cost above `most`.
-    """
+    """Return a system with the step halved as `with_converged_step` says, by its own method, at a cost of `most`."""
     now = system
     coarse, before = now.chain(table, effects).predict(theta, table), np.inf
     while True:
@@ -554,11 +510,11 @@ def _cost_of_integration(system: System, table: RunTable) -> float:
     """Return the number of evaluations of the rates, of all samples and runs together."""
     law = system.simulator.law
     assert law is not None
-    schedule = system.steps(table).schedule
-    return float(schedule.n_steps.sum() * evaluations_per_step(LawWithEffects(law), schedule.method))
+    steps = system.steps(table)
+    return float(steps.n_steps.sum() * evaluations_per_step(LawWithEffects(law), steps.method))
 
 
 def _has_affordable_steps(system: System, table: RunTable) -> bool:
     """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
     steps = system.steps(table)
-    return bool(steps.schedule.n_steps.sum() <= _MOST_STEPS + len(steps.places.row_by_position_and_run))
+    return bool(steps.n_steps.sum() <= _MOST_STEPS + len(steps.row_by_position_and_run))

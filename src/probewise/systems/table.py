@@ -27,12 +27,8 @@ from probewise.recordings.times import times_to_numbers
 _ONE_RUN = "all"
 _OF_COLUMN = "column:"
 _FILE = "file"
-
-
 # Covariates of a diagnosis that are no columns: of a table, and of a light sensor's recording, which it treats apart.
 _NOT_COLUMNS = frozenset({"time", "row", "run", "level", "previous"})
-
-
 _OF_LIGHT_SENSOR = frozenset({"scan", "place", "slope", "direction", "orientation", "edge_distance"})
 
 
@@ -88,7 +84,7 @@ class RunTable:
                 values, note = times_to_numbers(name, values, self.time_unit)
                 if note:
                     object.__setattr__(self, "notes", (*self.notes, note))
-            columns[name] = _column_of_names(name, values) if name == self.run else _checked_column(name, values)
+            columns[name] = _checked_column(name, values, are_names=name == self.run)
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -126,23 +122,17 @@ class RunTable:
         return self.first_row + np.arange(float(len(self)))
 
     @cached_property
-    def _run_numbers_and_names(self) -> tuple[IntArray, tuple[str, ...]]:
-        if self.run is None:
-            return np.zeros(len(self), dtype=np.int64), (_ONE_RUN,)
-        texts = self.columns[self.run].tolist()
-        names = tuple(dict.fromkeys(texts))
-        number = {name: k for k, name in enumerate(names)}
-        return np.array([number[text] for text in texts], dtype=np.int64), names
-
-    @property
-    def scan(self) -> IntArray:
-        """Number of each row's run, (n_points,), from 0 in the order in which the runs begin."""
-        return self._run_numbers_and_names[0]
-
-    @property
     def scan_names(self) -> tuple[str, ...]:
         """Names of the runs, in the order in which they begin; "all" for a table without a run column."""
-        return self._run_numbers_and_names[1]
+        return (_ONE_RUN,) if self.run is None else tuple(dict.fromkeys(self.columns[self.run].tolist()))
+
+    @cached_property
+    def scan(self) -> IntArray:
+        """Number of each row's run, (n_points,), from 0 in the order in which the runs begin."""
+        if self.run is None:
+            return np.zeros(len(self), dtype=np.int64)
+        number = {name: k for k, name in enumerate(self.scan_names)}
+        return np.array([number[text] for text in self.columns[self.run].tolist()], dtype=np.int64)
 
     @cached_property
     def columns_as_given(self) -> Mapping[str, NDArray[Any]]:
@@ -288,26 +278,18 @@ def column_error(
     return ParameterError(f"{column} in row {k + first}", str(cells[k]), allowed)
 
 
-def _column_of_names(name: str, values: Any) -> NDArray[Any]:
-    array = np.asarray(_with_missing(values))
-    if array.ndim != 1:
-        raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one name for each row")
-    if array.dtype.kind == "U" and not array.flags.writeable:
-        return array
-    texts = np.array([text_of_name(value) for value in array.tolist()], dtype=np.str_)
-    texts.flags.writeable = False
-    return texts
-
-
-def _checked_column(name: str, values: Any) -> NDArray[Any]:
+def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
+    """Return a column as read-only floats or texts; names of runs are texts."""
     array = np.asarray(_with_missing(values))
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
+    if are_names and array.dtype.kind == "U" and not array.flags.writeable:
+        return array
     if array.dtype == object and all(value is None or isinstance(value, Real | Decimal) for value in array.tolist()):
-        array = array.astype(np.float64)  # None is missing, NaN
-    if array.dtype.kind in "biuf":
+        array = array if are_names else array.astype(np.float64)  # None is missing, NaN
+    if array.dtype.kind in "biuf" and not are_names:
         return read_only_floats(array)
-    texts = np.array([str(value) for value in array.tolist()])
+    texts = np.array([text_of_name(v) if are_names else str(v) for v in array.tolist()], dtype=np.str_)
     texts.flags.writeable = False
     return texts
 
@@ -357,12 +339,7 @@ def read_run_table(
 
 def run_table_csv(table: RunTable) -> str:
     """Return a table as CSV text, with numbers in full precision."""
-    return csv_text(
-        {
-            name: [number_text(v) if values.dtype == np.float64 else str(v) for v in values.tolist()]
-            for name, values in table.columns.items()
-        }
-    )
+    return csv_text({name: [_text(value) for value in values.tolist()] for name, values in table.columns.items()})
 
 
 def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:
@@ -371,16 +348,8 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
     A column that a later table lacks is missing there; one that only a later table has is left out. Without a column of
     runs, each of several tables is one run.
 
-    Parameters
-    ----------
-    tables
-        One or more, with the same time and run.
-    sources
-        Name of each in messages.
-
-    Returns
-    -------
-    The table, and notes on missing and omitted columns and on renamed runs.
+    `tables`, one or more, have the same time and run; `sources` are their names in messages. Returns the table, and
+    notes on missing and omitted columns and on renamed runs.
 
     Raises
     ------
@@ -454,8 +423,7 @@ def _distinct_run_names(tables: Sequence[RunTable], sources: Sequence[str], *, n
     for table, source in zip(tables, sources, strict=True):
         names: tuple[str, ...] = table.scan_names if named else (source,)
         own: dict[str, str] = {}
-        for name in names:
-            # A new name must not be one of this table's own either, which follows unchanged.
+        for name in names:  # a new name must not be one of this table's own either, which follows unchanged
             own[name] = unused_name(name, taken | set(own.values()) | (set(names) - {name}))
         taken |= set(own.values())
         out.append(own)
@@ -464,17 +432,19 @@ def _distinct_run_names(tables: Sequence[RunTable], sources: Sequence[str], *, n
 
 def unused_name(name: str, taken: Iterable[str]) -> str:
     """Return the name, with a number appended if it is among those taken."""
-    known = set(taken)
-    numbered = (f"{name} ({k})" for k in itertools.count(2))
-    return next(n for n in itertools.chain([name], numbered) if n not in known)
+    known, new, k = set(taken), name, 2
+    while new in known:
+        new, k = f"{name} ({k})", k + 1
+    return new
 
 
 def _same_tables(first: RunTable, second: RunTable) -> bool:
-    same_shape = len(first) == len(second) and first.columns.keys() == second.columns.keys()
-    return same_shape and all(_equal_columns(values, second.columns[name]) for name, values in first.columns.items())
-
-
-def _equal_columns(first: NDArray[Any], second: NDArray[Any]) -> bool:
-    if first.dtype == np.float64 and second.dtype == np.float64:
-        return bool(np.array_equal(first, second, equal_nan=True))
-    return [str(v) for v in first.tolist()] == [str(v) for v in second.tolist()]
+    if len(first) != len(second) or first.columns.keys() != second.columns.keys():
+        return False
+    pairs = [(values, second.columns[name]) for name, values in first.columns.items()]
+    return all(
+        np.array_equal(a, b, equal_nan=True)
+        if a.dtype == b.dtype == np.float64
+        else [*map(str, a.tolist())] == [*map(str, b.tolist())]
+        for a, b in pairs
+    )

@@ -33,8 +33,8 @@ from probewise.diagnosis.templates import (
 )
 from probewise.effects import NUISANCES, NamedEffect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.noise import CorrelatedNoise, Quantisation, RandomWalk, lattice_step
-from probewise.effects.priors import SharedScalePrior
 from probewise.errors import NotConvergedError
+from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Recording
 
 # Nats that are expected between two hypotheses, below which readings do not tell them apart: the contract's odds of 20

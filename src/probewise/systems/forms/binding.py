@@ -29,6 +29,7 @@ WORDS: Mapping[str, str] = MappingProxyType(READING_WORDS | INPUT_WORDS | PARAME
 """A noun phrase for each form, with places for its targets."""
 
 
+_WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
 _IN_ORDER = frozenset({"offset_step", "gain_step", "steps", "hysteresis", "backlash", "lag", "delay", "input_delay"})
 
 
@@ -54,9 +55,6 @@ def _second_wave(form: Form) -> Form:
     shorter = replace(period, high=max(0.5 * period.high, 1.1 * period.low))
     entries = form.entries[form.entries[:, 0, 1] < shorter.high]
     return replace(again, parameters={**form.marginals, "period": shorter}, entries=entries)
-
-
-_WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
 
 
 def sorting_column(about: ReferenceFit) -> str | None:

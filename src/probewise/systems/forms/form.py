@@ -13,8 +13,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import Act, Effect, Fixed, Say, StepEffect, VariantMasks, WaveEffect, thinned
-from probewise.effects.priors import HeavyTailedPrior
-from probewise.priors import Uniform
+from probewise.priors import HeavyTailedPrior, Uniform
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.table import RunTable
 
@@ -96,6 +95,11 @@ class BlockForm(StepForm):
         priors = [self._variants[k].prior for k in chosen]
         drawn = [prior.from_unit_cube(rng.random((1, 3)))[0, 1:] for prior in priors]
         return np.concatenate([theta[:, :1], drawn], axis=1)
+
+
+def says_value(text: str, unit: str = "") -> Say:
+    """Return the sentence of an effect of one parameter: a text with {value} in place of the value with its sd."""
+    return lambda mean, sd: text.replace("{value}", value_with_sd(mean[0], sd[0], unit))
 
 
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:

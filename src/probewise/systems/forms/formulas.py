@@ -22,7 +22,6 @@ from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Form, StepForm, Wa
 from probewise.systems.forms.modulations import (
     frequency_prior,
     origin_in_words,
-    rounded_to_spread,
     text_rounded_to_spread,
     time_origin,
     trial_frequencies_in_time,
@@ -210,8 +209,12 @@ def _varying_columns_by_name(about: ReferenceFit) -> dict[str, FloatArray]:
     return {c: v for c, v in kept.items() if np.isfinite(v).all() and varies(v)}
 
 
+def _rounded_mean(values: FloatArray) -> float:
+    return float(text_rounded_to_spread(float(np.mean(values)), float(np.std(values)), 6))
+
+
 def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _ScaledVariable:
-    middle = rounded_to_spread(float(np.mean(values)), float(np.std(values)), 6) if centred else 0.0
+    middle = _rounded_mean(values) if centred else 0.0
     points = switch_points(values)
     has_sides = bool(points.size and points[0] < middle < points[-1])
     return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0, has_sides)
@@ -440,7 +443,7 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
 def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Yield changes of the reading that saturate with a dose: the integral of |column - mean|, or |column|."""
     table, spread = about.table, float(np.std(values))
-    centre = rounded_to_spread(float(np.mean(values)), spread, 6)
+    centre = _rounded_mean(values)
     origins = {f"|{name} - {text_rounded_to_spread(centre, spread)}|": centre}
     if values.min() >= 0 or values.max() <= 0:
         origins[f"|{name}|"] = 0.0

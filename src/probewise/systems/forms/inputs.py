@@ -12,7 +12,7 @@ from probewise._words import value_with_sd
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActInTime, Form, WaveForm
+from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActInTime, Form, WaveForm, says_value
 from probewise.systems.forms.modulations import (
     max_n_trial_frequencies,
     origin_in_words,
@@ -21,11 +21,10 @@ from probewise.systems.forms.modulations import (
     trial_frequencies,
 )
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
-from probewise.systems.forms.reference import ReferenceFit, clipping_levels
+from probewise.systems.forms.reference import ReferenceFit, clipped, clipping_levels
 from probewise.systems.law_inputs import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 
-_N_SIZES = 9
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
 _MOST_FREQUENCIES = 600
 _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
@@ -33,9 +32,6 @@ _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, 
 _LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend is a part of a slower wave
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
-
-InWords = Callable[[str], str]
-"""Function of a size in words; returns a sentence."""
 
 Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
 """Function of a column (n_points,) or (n_samples, n_points), parameters and the table; returns the true column."""
@@ -46,15 +42,11 @@ def driving_columns(about: ReferenceFit) -> list[str]:
     own, table = about.system.simulator, about.table
     out = []
     for name, values in table.covariates.items():
-        if name == own.reading or name == own.noise.sd or not varies(values):
-            continue
-        spread = float(np.nanstd(values))
-        rms = about.rms_change_in_sds(
-            Stage.INPUT, _column_changer(name, _column_with_offset), np.array([[_NUDGE * spread]])
-        )
-        wave = about.rms_change_in_sds(Stage.INPUT, _column_changer(name, _scaled_column), np.array([[_NUDGE]]))
-        if max(float(rms[0]), float(wave[0])) > 0:
-            out.append(name)
+        if name not in (own.reading, own.noise.sd) and varies(values):
+            nudges = (_column_with_offset, _NUDGE * float(np.nanstd(values))), (_scaled_column, _NUDGE)
+            acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
+            if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
+                out.append(name)
     return out
 
 
@@ -65,9 +57,13 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
     table = about.table
     if table.time is not None:
         origin = time_origin(table)
-        act = _column_changer(table.time, _clock_scaler(origin))
-        says = "the true time is the recorded time times (1 + a), a ="
-        for form in _amplitude_form(about, "clock_drift", act, 1e-5, "1", lambda a: f"{says} {a}", "time"):
+
+        def scaled_clock(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+            return np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
+
+        act = _column_changer(table.time, scaled_clock)
+        says = "the true time is the recorded time times (1 + a), a = {value}"
+        for form in _amplitude_form(about, "clock_drift", act, 1e-5, "1", says, "time"):
             yield replace(form, counted_from=origin_in_words(table.time, origin, about.time_unit))
 
 
@@ -75,38 +71,24 @@ def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
     values, unit, along = about.table.covariates[name], about.time_unit, covariate_of_column(name)
     spread, span = float(np.nanstd(values)), float(np.nanmax(values)) - float(np.nanmin(values))
     true = f"the true {name} is the recorded {name}"
-    act = _column_changer(name, _column_with_offset)
-    yield from _amplitude_form(
-        about, f"input_offset:{name}", act, 1e-4 * spread, name, lambda a: f"{true} plus {a}", along
-    )
-    act = _column_changer(name, _scaled_column)
-    yield from _amplitude_form(
-        about, f"input_gain:{name}", act, 1e-4, "1", lambda a: f"{true} times (1 + a), a = {a}", along
-    )
+
+    def of(kind: str, change: Change) -> tuple[ReferenceFit, str, Act]:
+        return about, f"{kind}:{name}", _column_changer(name, change)
+
+    offset, gain = f"{true} plus {{value}}", f"{true} times (1 + a), a = {{value}}"
+    yield from _amplitude_form(*of("input_offset", _column_with_offset), 1e-4 * spread, name, offset, along)
+    yield from _amplitude_form(*of("input_gain", _scaled_column), 1e-4, "1", gain, along)
     yield from _clipped_column_form(about, name)
     if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * span:  # if larger, it is an offset
-        act = _column_changer(name, _column_with_dead_zone)
-        yield from _size_form(
-            about, f"dead_zone:{name}", act, span, name, lambda w: f"{name} has no effect within {w} of 0", along
-        )
+        within = f"{name} has no effect within {{value}} of 0"
+        yield from _size_form(*of("dead_zone", _column_with_dead_zone), span, name, within, along)
     if _moves_both_ways(values, about.table):
-        act = _column_changer(name, column_with_play)
-        yield from _size_form(
-            about, f"backlash:{name}", act, span, name, lambda w: f"{name} has {w} of play", "previous", along
-        )
+        play = f"{name} has {{value}} of play"
+        yield from _size_form(*of("backlash", column_with_play), span, name, play, "previous", along)
     yield from _periodic_error_form(about, name)
     if about.table.has_varying_time:
-        act, says = _column_delayer(about, name), f"{name} acts with a delay of"
-        for form in _size_form(
-            about,
-            f"input_delay:{name}",
-            act,
-            about.duration,
-            unit,
-            lambda tau: f"{says} {tau} {unit}",
-            "previous",
-            along,
-        ):
+        own = (about, f"input_delay:{name}", _column_delayer(about, name), about.duration, unit)
+        for form in _size_form(*own, f"{name} acts with a delay of {{value}} {unit}", "previous", along):
             yield replace(form, needs_rising_time=True)
 
 
@@ -116,11 +98,6 @@ def _column_with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> Fl
 
 def _scaled_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(c * (1 + theta[:, :1]))
-
-
-def _clock_scaler(origin: float) -> Change:
-    """Return the function that scales times about the origin by 1 + a: a clock that runs fast or slow."""
-    return lambda c, theta, table: np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
 
 
 def _column_changer(name: str, change: Change) -> Act:
@@ -138,39 +115,19 @@ def _column_delayer(about: ReferenceFit, name: str) -> Act:
 
 
 def _amplitude_form(
-    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: InWords, *along: str
+    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: str, *along: str
 ) -> Iterator[Form]:
-    form = Form(
-        name,
-        Stage.INPUT,
-        {"a": AMPLITUDE},
-        units=(unit,),
-        covariates=along,
-        act=act,
-        entries=np.ones((1, 1, 1)),
-        says=lambda mean, sd: says(value_with_sd(mean[0], sd[0], "")),
-    )
-    yield from about.scaled(form, guess)
+    own = (name, Stage.INPUT, {"a": AMPLITUDE}, (unit,), along, act, np.ones((1, 1, 1)))
+    yield from about.scaled(Form(*own, says_value(says)), guess)
 
 
 def _size_form(
-    about: ReferenceFit, name: str, act: Act, most: float, unit: str, says: InWords, *along: str
+    about: ReferenceFit, name: str, act: Act, most: float, unit: str, says: str, *along: str
 ) -> Iterator[Form]:
     """Yield a form of one size without a sign, log-uniform up to half of `most`; none if no size is plausible."""
-    prior = about.log_uniform_size_prior(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
-    if prior is not None:
-        yield Form(
-            name,
-            Stage.INPUT,
-            {"tau_s" if name.startswith("input_delay:") else "width": prior},
-            units=(unit,),
-            covariates=along,
-            act=act,
-            entries=np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None],
-            says=lambda mean, sd: says(value_with_sd(mean[0], sd[0], "")),
-            amplitudes=(),
-            absent={0: 0.0},
-        )
+    parameter = "tau_s" if name.startswith("input_delay:") else "width"
+    tried = most * np.geomspace(1e-7, 0.5, 40)
+    return about.sized(name, Stage.INPUT, parameter, unit, along, act, tried, says_value(says))
 
 
 def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -178,27 +135,16 @@ def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     if ends is None:
         return
 
-    def clip(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        level = theta[:, :1]
-        return np.asarray(np.where(level > ends.least_ceiling, np.minimum(c, level), np.maximum(c, level)))
-
-    act = _column_changer(name, clip)
+    act = _column_changer(name, lambda c, theta, table: clipped(c, theta[:, :1], ends.least_ceiling))
     if np.nanmax(about.rms_change_in_sds(Stage.INPUT, act, ends.trial_levels[:, None]), initial=0.0) > 0.05:
-        yield Form(
-            f"input_saturation:{name}",
-            Stage.INPUT,
-            {"level": ends.prior},
-            units=(name,),
-            covariates=(covariate_of_column(name),),
-            act=act,
-            entries=ends.trial_levels[:, None, None],
-            amplitudes=(),
-            says=lambda m, s: (
-                f"{name} {'rises' if m[0] > ends.least_ceiling else 'falls'} no further than "
-                f"{value_with_sd(m[0], s[0], '')}"
-            ),
-            absent={0: ends.level_out_of_reach},
-        )
+
+        def says(mean: FloatArray, sd: FloatArray) -> str:
+            way = "rises" if mean[0] > ends.least_ceiling else "falls"
+            return f"{name} {way} no further than {value_with_sd(mean[0], sd[0], '')}"
+
+        along, bank = (covariate_of_column(name),), ends.trial_levels[:, None, None]
+        own = (f"input_saturation:{name}", Stage.INPUT, {"level": ends.prior}, (name,), along, act, bank, says)
+        yield Form(*own, amplitudes=(), absent={0: ends.level_out_of_reach})
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -256,10 +202,7 @@ def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> Fl
 
 
 def mean_of_delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Return a held column delayed by a dead time, (n_samples, n_points): at each row its mean until the next row.
-
-    The delayed column has at any time the value that was held one dead time earlier.
-    """
+    """Return a held column delayed by a dead time, (n_samples, n_points): at each row its mean until the next row."""
     values = np.atleast_2d(c)
     out = np.array(np.broadcast_to(values, (max(len(values), len(theta)), values.shape[1])))
     by = theta[:, 0]

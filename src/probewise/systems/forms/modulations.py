@@ -12,9 +12,8 @@ import numpy as np
 from probewise._arrays import FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import PHASE, ChangePoints, sine_and_cosine_entries
-from probewise.effects.priors import SharedScalePrior
 from probewise.effects.reference import is_far_from_zero
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.priors import LogUniform, Marginal, SharedScalePrior, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import (
     AMPLITUDE,
@@ -66,13 +65,8 @@ def origin_in_words(name: str | None, origin: float, unit: str = "") -> str:
     return f"{name} counts from {origin:.12g} {unit}".rstrip() if origin else ""
 
 
-def rounded_to_spread(value: float, spread: float, least: int) -> float:
-    """Round a number to `least` significant digits, or to more if that would move it by a twentieth of the spread."""
-    return float(text_rounded_to_spread(value, spread, least))
-
-
 def text_rounded_to_spread(value: float, spread: float, least: int = 4) -> str:
-    """Return the text of a number rounded as by `rounded_to_spread`."""
+    """Return a number as text, to `least` digits, or to more if that would move it by a twentieth of the spread."""
     beyond = math.ceil(math.log10(abs(value) / spread)) if value and spread > 0 else 0
     return f"{value:.{min(max(least, 2 + beyond), _ALL)}g}"
 
@@ -182,20 +176,13 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `form` returns its form, of amplitude 1, from the quantity's name and unit; `between_rows` what a parameter of some
-    name does between the rows of a law, where that is not as the law's `hold` says.
+    `form` returns its form, of amplitude 1, from the quantity's name and unit, with the form's name, stage and act;
+    `between_rows` what a parameter of some name does between the rows of a law, where that is not as its `hold` says.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
-    form: Callable[[str, str], Form]
+    form: Callable[..., Form]
     between_rows: Callable[[str], ActBetween] | None = None
-
-
-def _unbound(value: Any, theta: FloatArray, table: RunTable) -> Any:
-    raise NotImplementedError  # `modulated_form` says on what it acts
-
-
-_SINGLE = ("", Stage.OFFSET, {"a": AMPLITUDE})
 
 
 def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
@@ -203,14 +190,14 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
     origin = time_origin(table)
     return Modulation(
         at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
-        form=lambda what, unit: Form(
-            *_SINGLE,
+        form=lambda what, unit, **own: Form(
+            parameters={"a": AMPLITUDE},
             units=(f"{unit or '1'}/{time_unit}",),
             covariates=("time",),
-            act=_unbound,
             entries=np.ones((1, 1, 1)),
             says=lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {time_unit}",
             counted_from=origin_in_words(table.time, origin, time_unit),
+            **own,
         ),
         between_rows=lambda name: lambda between, theta: between.with_drift(name, theta[:, :1]),
     )
@@ -221,13 +208,13 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
     middle, per = float(np.nanmean(table.covariates[name])), unit_of_name(name) or "unit"
     return Modulation(
         at_rows=lambda theta, rows: np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle)),
-        form=lambda what, unit: Form(
-            *_SINGLE,
+        form=lambda what, unit, **own: Form(
+            parameters={"a": AMPLITUDE},
             units=(f"{unit or '1'} per {name}",),
             covariates=(covariate_of_column(name),),
-            act=_unbound,
             entries=np.ones((1, 1, 1)),
             says=lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
+            **own,
         ),
     )
 
@@ -242,7 +229,7 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
         change_points = replace(change_points, border=float(ends[0][0]))
     first, last = change_points.at[0], change_points.at[-1]
 
-    def form(what: str, unit: str) -> Form:
+    def form(what: str, unit: str, **own: Any) -> Form:
         def says(mean: FloatArray, sd: FloatArray) -> str:
             def at(k: int) -> str:  # of rows, a point between two, counted from 0
                 row = f"row {int(mean[k]) + 3} of the table (the header is row 1)"
@@ -252,16 +239,15 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
             return f"{what} jumps by {value_with_sd(mean[0], sd[0], unit)} at {at(-1)} and {then}"
 
         place, of_place = ("row", "row") if by_row else ("s", time_unit)
-        never, middle, along = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last), ("row",) if by_row else ("time",)
+        own |= {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
+        never, middle = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last)
+        size: dict[str, Marginal] = {"a": AMPLITUDE}
         begin: dict[str, Marginal] = {f"at_{place}": Uniform(first, last)}
-        if may_end:
-            priors: dict[str, Marginal] = {"a": AMPLITUDE, f"until_{place}": never, **begin}
-            block = ("", Stage.OFFSET, priors, (unit, of_place, of_place), along, _unbound)
-            return BlockForm(
-                *block, np.array([[[1.0, first - 1.5, middle]]]), says, change_points=change_points, never=never
-            )
-        step = ("", Stage.OFFSET, {"a": AMPLITUDE, **begin}, (unit, of_place), along, _unbound)
-        return StepForm(*step, np.array([[[1.0, middle]]]), says, change_points=change_points)
+        if not may_end:
+            entries = np.array([[[1.0, middle]]])
+            return StepForm(parameters=size | begin, units=(unit, of_place), entries=entries, **own)
+        priors, entries = size | {f"until_{place}": never} | begin, np.array([[[1.0, first - 1.5, middle]]])
+        return BlockForm(parameters=priors, units=(unit, of_place, of_place), entries=entries, never=never, **own)
 
     def jump_in_time(parameter: str) -> ActBetween:
         return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
@@ -283,22 +269,20 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
         values = np.concatenate([theta, np.zeros((len(theta), 1))], axis=1)
         return np.asarray(values[:, at[rows.scan]])
 
-    def form(what: str, unit: str) -> Form:
+    def form(what: str, unit: str, **own: Any) -> Form:
         def says(mean: FloatArray, sd: FloatArray) -> str:
             far = int(np.argmax(np.abs(mean)))
             by = value_with_sd(mean[far], sd[far], unit)
             return f"{what} differs from run to run, most in run {names[far]}: by {by}"
 
         return Form(
-            "",
-            Stage.OFFSET,
-            {f"values[{name}]": AMPLITUDE for name in names},
+            parameters={f"values[{name}]": AMPLITUDE for name in names},
             units=(unit,) * len(names),
             covariates=("run",),
-            act=_unbound,
             entries=np.eye(len(names))[None, :, :],
             says=says,
             amplitudes=tuple(range(len(names))),
+            **own,
         )
 
     return Modulation(at_rows, form)
@@ -315,9 +299,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
 
     return Modulation(
         at_rows,
-        lambda what, unit: WaveForm(
-            name="",
-            stage=Stage.OFFSET,
+        lambda what, unit, **own: WaveForm(
             parameters={
                 "a": POSITIVE,
                 "hz": frequency_prior(np.append(frequencies, peaks.highest)),
@@ -325,7 +307,6 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
             },
             units=(unit, f"1/{time_unit}", "rad"),
             covariates=("time",),
-            act=_unbound,
             entries=sine_and_cosine_entries(1.0, frequencies),
             says=lambda mean, sd: (
                 f"{what} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], unit)} and a period of "
@@ -333,6 +314,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
             ),
             counted_from=origin_in_words(table.time, origin, time_unit),
             suggested=peaks.at,
+            **own,
         ),
     )
 
@@ -353,9 +335,8 @@ def modulated_form(
     Several values have one scale in common, unless they are so many that a single one could not differ much more than
     the others within the bounds of a coordinate.
     """
-    plain = how.form(what, unit)
-    bound = replace(plain, name=name, stage=stage, act=act, covariates=(*plain.covariates, *covariates))
-    for form in about.scaled(bound, guess):
+    bound = how.form(what, unit, name=name, stage=stage, act=act)
+    for form in about.scaled(replace(bound, covariates=(*bound.covariates, *covariates)), guess):
         if not 1 < len(form.amplitudes) <= _MOST_OF_ONE_SCALE:
             yield form
             continue

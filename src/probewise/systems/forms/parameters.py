@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
-from probewise._words import unit_of_name, value_with_sd
+from probewise._words import unit_of_name
 from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ActInTime, Form, flag
+from probewise.systems.forms.form import Act, ActInTime, Form, flag, says_value
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
@@ -38,33 +37,33 @@ _QUARTILES = np.array([0.25, 0.75])
 def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each way in which a parameter may vary: drift, step, one value per run, with a column."""
     system, table = about.system, about.table
-    own = system.simulator
+    simulator = system.simulator
     values = system.parameters(about.theta, table)
     over: dict[str, Modulation] = {}
     if table.has_varying_time:
         over["drifts"] = linear_drift_modulation(table, about.time_unit)
     over["steps"] = change_point_step_modulation(table, about.time_unit)
-    columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and varies(v)]
-    for name in own.parameters:
-        guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(own.parameters[name].from_unit(_QUARTILES))))
+    columns = [c for c, v in table.covariates.items() if c not in (simulator.reading, simulator.noise.sd) and varies(v)]
+    for name in simulator.parameters:
+        guess = 1e-4 * (
+            float(np.abs(values[name]).max()) or float(np.ptp(simulator.parameters[name].from_unit(_QUARTILES)))
+        )
         each = dict(over)
-        if name not in own.per_run and about.can_fit_value_per_run:
+        if name not in simulator.per_run and about.can_fit_value_per_run:
             each["differs"] = value_per_run_modulation(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
             act = _parameter_shifter(name, how)
             if how.between_rows is not None:
                 act = ActInTime(act, how.between_rows(name))
-            yield from modulated_form(
-                about, f"{kind}:{name}", Stage.PARAMETER, how, act, size, name, unit_of_name(name)
-            )
+            own = (Stage.PARAMETER, how, act, size, name, unit_of_name(name))
+            yield from modulated_form(about, f"{kind}:{name}", *own)
         for column in columns:
             how = column_proportional_modulation(column, table)
             size, act = guess / float(np.nanstd(table.covariates[column])), _parameter_shifter(name, how)
-            for form in modulated_form(
-                about, f"depends:{name}:{column}", Stage.PARAMETER, how, act, size, name, unit_of_name(name)
-            ):
-                is_scale = isinstance(own.parameters[name], LogUniform)
+            is_scale = isinstance(simulator.parameters[name], LogUniform)
+            own = (Stage.PARAMETER, how, act, size, name, unit_of_name(name))
+            for form in modulated_form(about, f"depends:{name}:{column}", *own):
                 yield _linear_or_by_factor(about, form, name, how) if is_scale else form
 
 
@@ -130,19 +129,7 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
         rms = about.rms_change_in_sds(Stage.PARAMETER, act, values[:, None])
         seen = np.isfinite(rms) & (rms > _UNSEEN)
         if seen.any():
-            yield Form(
-                name,
-                Stage.PARAMETER,
-                {"value": extra.prior},
-                units=("",),
-                covariates=("level", "time", "row"),
-                act=act,
-                entries=values[seen][:, None, None],
-                amplitudes=(),
-                says=partial(_filled, extra.says),
-                absent={0: extra.null},
-            )
-
-
-def _filled(says: str, mean: FloatArray, sd: FloatArray) -> str:
-    return says.replace("{value}", value_with_sd(mean[0], sd[0], ""))
+            priors, along = {"value": extra.prior}, ("level", "time", "row")
+            entries, absent = values[seen][:, None, None], {0: extra.null}
+            own = (name, Stage.PARAMETER, priors, ("",), along, act, entries, says_value(extra.says))
+            yield Form(*own, amplitudes=(), absent=absent)

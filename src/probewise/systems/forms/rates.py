@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +25,6 @@ from probewise.systems.forms.modulations import (
 from probewise.systems.forms.reference import ReferenceFit, clipping_levels
 from probewise.systems.law import LawWithEffects, Limit
 
-_N_SIZES = 9
 _NO_SHARE = 1e-9  # of what a bound stops: none
 
 
@@ -85,16 +84,9 @@ def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> I
             return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], '')}"
         return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], '')}"
 
-    form = Form(
-        name,
-        Stage.RATE,
-        {"a": AMPLITUDE},
-        units=(f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}",),
-        covariates=(f"state:{other}", "time"),
-        act=act,
-        entries=np.ones((1, 1, 1)),
-        says=says,
-    )
+    unit = f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}"
+    along, entries = (f"state:{other}", "time"), np.ones((1, 1, 1))
+    form = Form(name, Stage.RATE, {"a": AMPLITUDE}, (unit,), along, act, entries, says)
     largest = float(np.nanmax(np.abs(about.states[other]))) or 1.0
     yield from about.scaled(form, trial_rate(about, state) / largest**degree)
 
@@ -104,24 +96,14 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
         return value.with_friction(state, theta[:, :1])
 
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
-    prior = about.log_uniform_size_prior(Stage.RATE, act, _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31))
-    if prior is not None:
-        entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
-        yield Form(
-            f"friction:{state}",
-            Stage.RATE,
-            {"a": prior},
-            units=(unit,),
-            covariates=(f"state:{state}", "level"),
-            act=act,
-            entries=entries,
-            amplitudes=(),
-            says=lambda mean, sd: (
-                f"dry friction slows {state} by {value_with_sd(mean[0], sd[0], '')} per {about.time_unit}, "
-                "and holds it at rest"
-            ),
-            absent={0: 0.0},
-        )
+    tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
+    along = f"state:{state}", "level"
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size = value_with_sd(mean[0], sd[0], "")
+        return f"dry friction slows {state} by {size} per {about.time_unit}, and holds it at rest"
+
+    return about.sized(f"friction:{state}", Stage.RATE, "a", unit, along, act, tried, says)
 
 
 def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
@@ -167,8 +149,12 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > ends.least_ceiling else "falls"
-        spilling = _spilling_in_words(others, mean, sd)
-        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}{spilling}"
+        taken = (
+            f"; {other} takes up {value_with_sd(mean[k], sd[k], '')} of the rest"
+            for k, other in enumerate(others, 1)
+            if mean[k] > _NO_SHARE
+        )
+        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}{''.join(taken)}"
 
     def variant(taking: str | None) -> Form:
         shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
@@ -189,21 +175,9 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
     alone = variant(None)
     if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
         # Downstream only: states that drive each other, as an angle and its rate, are no vessels.
-        into = [
-            other
-            for other in others
-            if about.state_drives_rate(state, other) and not about.state_drives_rate(other, state)
-        ]
+        drives = about.state_drives_rate
+        into = [other for other in others if drives(state, other) and not drives(other, state)]
         yield replace(alone, alternatives=tuple(variant(other) for other in into))
-
-
-def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:
-    """Return a phrase on the states that take up what a bound stops; `mean` holds its level, then their shares."""
-    return "".join(
-        f"; {other} takes up {value_with_sd(mean[k], sd[k], '')} of the rest"
-        for k, other in enumerate(others, 1)
-        if mean[k] > _NO_SHARE
-    )
 
 
 def trial_rate(about: ReferenceFit, state: str) -> float:

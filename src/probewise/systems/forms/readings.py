@@ -12,11 +12,10 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
-from probewise.effects.priors import HeavyTailedPrior
 from probewise.effects.reading import decaying_sum
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, Act, Fixed, Form, flag
+from probewise.systems.forms.form import AMPLITUDE, Act, Fixed, Form, flag, says_value
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
@@ -26,10 +25,9 @@ from probewise.systems.forms.modulations import (
     sinusoid_modulation,
     value_per_run_modulation,
 )
-from probewise.systems.forms.reference import ReferenceFit, switch_points
+from probewise.systems.forms.reference import N_SIZES, ReferenceFit, clipped, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
-_N_SIZES = 9
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
 _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
@@ -56,7 +54,7 @@ def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def late_forms(about: ReferenceFit) -> Iterator[Form]:
-    """Yield the forms of a reading that comes late: `lag` and `delay`."""
+    """Yield the forms of a reading that comes late, `lag` and `delay`, with a smooth variant where rows tell it."""
     reading, unit = about.system.simulator.reading, about.time_unit
     for name, act, tried, says in (
         ("lag", lagged_readings, np.geomspace(0.02, 200.0, 33), f"{reading} lags with a time constant of"),
@@ -67,36 +65,18 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
             return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
 
         prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.median_gap * tried)
-        if prior is not None:
-            yield _with_smooth_variant(about, name, act, prior, says, unit)
-
-
-def _with_smooth_variant(
-    about: ReferenceFit, name: str, act: Act, prior: LogUniform, says: str, time_unit: str
-) -> Form:
-    sizes = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)
-
-    def variant(smooth: bool) -> Form:
-        value, prior_of_flag = flag(smooth, odds=_ODDS_OF_SMOOTH if smooth else 1.0)
-        return Form(
-            name,
-            Stage.LAG,
-            {"tau_s": prior, _SMOOTH: prior_of_flag},
-            units=(time_unit, "1"),
-            covariates=("previous",),
-            act=act,
-            entries=np.stack([sizes, np.full(_N_SIZES, value)], axis=1)[:, None, :],
-            says=lambda mean, sd: f"{says} {value_with_sd(mean[0], sd[0], time_unit)}",
-            amplitudes=(),
-            absent={0: 0.0},
-            needs_rising_time=True,
-        )
-
-    at_rows, smooth = variant(False), variant(True)
-    value = about.predicted[None, :]
-    apart = act(value, at_rows.entries[:, 0], about.table) - act(value, smooth.entries[:, 0], about.table)
-    size = np.sqrt(np.nansum(apart[:, about.has_reading] ** 2, axis=1)) / about.sd
-    return replace(at_rows, alternatives=(smooth,)) if size.max() > _APART else at_rows
+        if prior is None:
+            continue
+        sizes, variants = np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES), []
+        for is_smooth in (False, True):
+            value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
+            priors, bank = {"tau_s": prior, _SMOOTH: of_flag}, np.stack([sizes, np.full(N_SIZES, value)], axis=1)
+            own = (name, Stage.LAG, priors, (unit, "1"), ("previous",), act, bank[:, None, :])
+            sentence = says_value(f"{says} {{value}}", unit)
+            variants.append(Form(*own, sentence, amplitudes=(), absent={0: 0.0}, needs_rising_time=True))
+        first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
+        apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
+        yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
 
 
 def lagged_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -295,7 +275,7 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     form = Form(f"friction:{name}", Stage.OFFSET, priors, (unit, name), along, act, bank, says)
     for sign in about.scaled(form, about.sd):
         if low < high:
-            bank = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, _N_SIZES))
+            bank = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, N_SIZES))
             smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=bank)
             sign = replace(sign, alternatives=(smooth,))
         yield sign
@@ -321,22 +301,16 @@ def _settling_form(about: ReferenceFit) -> Iterator[Form]:
         return np.asarray(value + theta[:, :1] * np.exp(-time_since_start_of_run(table) / theta[:, 1:2]))
 
     prior = settling_time_prior(about)
-    taus = np.geomspace(prior.low * 1.5, 0.5 * prior.high, _N_SIZES)
+    bank = single_column_bank(1.0, np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES))
     unit, time_unit, reading = about.reading_unit, about.time_unit, about.system.simulator.reading
-    settling = Form(
-        "settling",
-        Stage.OFFSET,
-        {"a": AMPLITUDE, "tau_s": prior},
-        units=(unit, time_unit),
-        covariates=("time", "run"),
-        act=act,
-        entries=single_column_bank(1.0, taus),
-        says=lambda mean, sd: (
-            f"{reading} is off by {value_with_sd(mean[0], sd[0], unit)} at the start of each run, and settles "
-            f"with a time constant of {value_with_sd(mean[1], sd[1], time_unit)}"
-        ),
-    )
-    yield from about.scaled(settling, 1.0)
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, tau = value_with_sd(mean[0], sd[0], unit), value_with_sd(mean[1], sd[1], time_unit)
+        return f"{reading} is off by {size} at the start of each run, and settles with a time constant of {tau}"
+
+    priors: dict[str, Marginal] = {"a": AMPLITUDE, "tau_s": prior}
+    own = ("settling", Stage.OFFSET, priors, (unit, time_unit), ("time", "run"), act, bank, says)
+    yield from about.scaled(Form(*own), 1.0)
 
 
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
@@ -367,19 +341,13 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
     unit, reading = about.reading_unit, about.system.simulator.reading
-    yield Form(
-        "hysteresis",
-        Stage.HYSTERESIS,
-        {"a": about.amplitude_prior(about.sd)},
-        units=(unit,),
-        covariates=("previous",),
-        act=act,
-        entries=np.full((1, 1, 1), about.sd),
-        says=lambda mean, sd: (
-            f"{reading} reads {value_with_sd(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} "
-            "while it rises than while it falls"
-        ),
-    )
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, way = value_with_sd(2 * abs(mean[0]), 2 * sd[0], unit), "more" if mean[0] > 0 else "less"
+        return f"{reading} reads {size} {way} while it rises than while it falls"
+
+    priors, bank = {"a": about.amplitude_prior(about.sd)}, np.full((1, 1, 1), about.sd)
+    yield Form("hysteresis", Stage.HYSTERESIS, priors, (unit,), ("previous",), act, bank, says)
 
 
 def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, BoolArray]:
@@ -415,20 +383,16 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
         return np.asarray(value + theta[:, :1] * (high - low) * (bent - share))
 
     unit, reading = about.reading_unit, about.system.simulator.reading
-    nonlinearity = Form(
-        "nonlinearity",
-        Stage.BEND,
-        {"a": AMPLITUDE, "power": LogUniform(0.4, 5.0)},
-        units=("1", "1"),
-        covariates=("level",),
-        act=act,
-        entries=single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0])),
-        says=lambda mean, sd: (
-            f"{reading} has a bent response, y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at "
-            f"{high:.4g} {unit}, a = {value_with_sd(mean[0], sd[0], '')}, power = {value_with_sd(mean[1], sd[1], '')}"
-        ),
-    )
-    yield from about.scaled(nonlinearity, about.sd / (high - low))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        a, power = (value_with_sd(mean[k], sd[k], "") for k in (0, 1))
+        bend = f"y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at {high:.4g} {unit}"
+        return f"{reading} has a bent response, {bend}, a = {a}, power = {power}"
+
+    priors: dict[str, Marginal] = {"a": AMPLITUDE, "power": LogUniform(0.4, 5.0)}
+    bank = single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0]))
+    own = ("nonlinearity", Stage.BEND, priors, ("1", "1"), ("level",), act, bank, says)
+    yield from about.scaled(Form(*own), about.sd / (high - low))
 
 
 def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
@@ -442,37 +406,25 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     # Outside the declared range are no readings of the quantity, such as 9999 for an error.
     least, most = (float(end(readings[within] if within.any() else readings)) for end in (np.min, np.max))
 
-    # Clipped readings end at the limit: a limit in the upper half of their range is a ceiling, in the lower half a
-    # floor.
-    middle = 0.5 * (least + most)
-
-    def clip(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        level = theta[:, :1]
-        return np.where(level > middle, np.minimum(value, level), np.maximum(value, level))
-
-    top, bottom = max(high, most), min(low, least)
-    span = top - bottom
-    depths = np.geomspace(0.005, 0.9, 16)
+    # Clipped readings end at the limit: in the upper half of their range it is a ceiling, in the lower half a floor.
+    middle, top, bottom = 0.5 * (least + most), max(high, most), min(low, least)
+    span, depths = top - bottom, np.geomspace(0.005, 0.9, 16)
     ceilings, floors = top - span * depths, bottom + span * depths
     levels = np.concatenate([ceilings[ceilings > middle], floors[floors < middle]])
     if not levels.size:
         return
     unit, reading = about.reading_unit, about.system.simulator.reading
-    yield Form(
-        "saturation",
-        Stage.SATURATION,
-        {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
-        units=(unit,),
-        covariates=("level",),
-        act=clip,
-        entries=levels[:, None, None],
-        amplitudes=(),
-        says=lambda mean, sd: (
-            f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than "
-            f"{value_with_sd(mean[0], sd[0], unit)}"
-        ),
-        absent={0: float(top + 1e3 * span)},
-    )
+
+    def clip(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return clipped(value, theta[:, :1], middle)
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        way = "rises" if mean[0] > middle else "falls"
+        return f"{reading} {way} no further than {value_with_sd(mean[0], sd[0], unit)}"
+
+    priors, absent = {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)}, {0: float(top + 1e3 * span)}
+    own = ("saturation", Stage.SATURATION, priors, (unit,), ("level",), clip, levels[:, None, None], says)
+    yield Form(*own, amplitudes=(), absent=absent)
 
 
 READING_WORDS = {

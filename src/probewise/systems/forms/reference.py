@@ -17,7 +17,7 @@ from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
-from probewise.systems.forms.form import POSITIVE, Act, Form
+from probewise.systems.forms.form import POSITIVE, Act, Form, Say
 from probewise.systems.law import integrate_states
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
@@ -35,6 +35,7 @@ _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings ch
 _TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
 _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
+N_SIZES = 9  # in the bank of a form of one size
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
 
 
@@ -50,9 +51,8 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
     codes = [_codes_of_equal_cells(values) for values in inputs]
     group = np.unique(np.stack([*codes, np.zeros(len(table), dtype=np.int64)]), axis=1, return_inverse=True)[1].ravel()
     there = np.flatnonzero(np.isfinite(readings))
-    if (
-        np.count_nonzero(np.diff(group[there])) >= np.unique(group[there]).size
-    ):  # equal rows apart: by a jump or a drift
+    n_changes = np.count_nonzero(np.diff(group[there]))
+    if n_changes >= np.unique(group[there]).size:  # equal rows are apart: by a jump or a drift
         return 1.0
     sizes = np.bincount(group[there])
     ties = np.unique(np.stack([group[there], readings[there]]), axis=1, return_counts=True)[1]
@@ -122,6 +122,11 @@ class ClippingLevels:
     def level_out_of_reach(self) -> float:
         """A level far above all values: a ceiling without effect."""
         return self.top + (self.high - self.low)
+
+
+def clipped(values: FloatArray, level: FloatArray, least_ceiling: float) -> FloatArray:
+    """Return values clipped at levels, which broadcast: a ceiling above `least_ceiling`, otherwise a floor."""
+    return np.where(level > least_ceiling, np.minimum(values, level), np.maximum(values, level))
 
 
 def clipping_levels(values: FloatArray) -> ClippingLevels | None:
@@ -347,6 +352,24 @@ class ReferenceFit:
                 name = form.prior.names[k]
                 priors[name] = self.amplitude_prior(typical, positive=priors[name] is POSITIVE)
             yield replace(form, parameters=priors, entries=at_size(typical))
+
+    def sized(
+        self,
+        name: str,
+        stage: Stage,
+        parameter: str,
+        unit: str,
+        covariates: tuple[str, ...],
+        act: Act,
+        tried: FloatArray,
+        says: Say,
+    ) -> Iterator[Form]:
+        """Yield a form of one size without a sign, log-uniform over those `tried` that are plausible; none without."""
+        prior = self.log_uniform_size_prior(stage, act, tried)
+        if prior is not None:
+            entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES)[:, None, None]
+            own = (name, stage, {parameter: prior}, (unit,), covariates, act, entries, says)
+            yield Form(*own, amplitudes=(), absent={0: 0.0})
 
     def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
         """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""

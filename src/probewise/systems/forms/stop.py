@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -14,7 +14,6 @@ from probewise.effects import Extent, NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan, Recording
-from probewise.sensor import Stage
 from probewise.sensor.stages import NoiseParameters
 
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
@@ -41,7 +40,6 @@ class MeterStop(NoiseEffect):
     unit: str = ""
 
     name: ClassVar[str] = "saturation"
-    stage: ClassVar[Stage] = Stage.NOISE
     units: ClassVar[tuple[str, ...]] = ("reading",)
     covariates: ClassVar[tuple[str, ...]] = ("level",)
     amplitudes: ClassVar[tuple[int, ...]] = ()
@@ -86,16 +84,12 @@ def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading")
     unless the meter saturates after the noise. None also if rounding is too coarse to tell, or if that end was
     declared.
     """
-    rows = _RowsInTurn.of(recording)
-    for is_ceiling in (True, False) if rows.are_fine else ():
-        level, stands = rows.extreme_and_mask(is_ceiling)
+
+    def is_stop(rows: _RowsInTurn, stands: BoolArray) -> bool:
         elsewhere = rows.steps[~stands[1:][rows.in_turn]]
-        if _is_declared_end(level, recording) or np.mean(elsewhere == 0) > _OFTEN:
-            continue
-        if stands.sum() >= _LEAST_IN_ALL and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN:
-            unit = recording.plan.instrumentation.unit
-            return MeterStop(level, is_ceiling, reading, unit), recording.readings == level
-    return None
+        return np.mean(elsewhere == 0) <= _OFTEN and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN
+
+    return next(_stops_and_masks(recording, reading, is_stop), None)
 
 
 def possible_meter_stops_and_masks(
@@ -106,14 +100,24 @@ def possible_meter_stops_and_masks(
     Few other readings may have an exact equal. Lost readings look alike: only a fit tells whether the signal is beyond
     (`is_signal_beyond`). A declared end is no stop.
     """
-    rows = _RowsInTurn.of(recording)
-    for is_ceiling in (True, False) if rows.are_fine else ():
-        level, stands = rows.extreme_and_mask(is_ceiling)
+
+    def is_stop(rows: _RowsInTurn, stands: BoolArray) -> bool:
         n_each = np.unique(rows.readings[~stands], return_counts=True)[1]
-        alike = n_each[n_each > 1].sum() / max(n_each.sum(), 1)
-        if _is_declared_end(level, recording) or alike > _OFTEN or stands.sum() < _LEAST_IN_ALL:
-            continue
-        yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), recording.readings == level
+        return bool(n_each[n_each > 1].sum() / max(n_each.sum(), 1) <= _OFTEN)
+
+    return _stops_and_masks(recording, reading, is_stop)
+
+
+def _stops_and_masks(
+    recording: Recording, reading: str, is_stop: Callable[[_RowsInTurn, BoolArray], bool]
+) -> Iterator[tuple[MeterStop, BoolArray]]:
+    rows, unit = _RowsInTurn.of(recording), recording.plan.instrumentation.unit
+    for is_ceiling in (True, False) if rows.are_fine else ():
+        level = float(rows.readings.max() if is_ceiling else rows.readings.min())
+        stands, there = rows.readings == level, recording.readings == level
+        is_declared = recording.censored[there].any()
+        if stands.sum() >= _LEAST_IN_ALL and not is_declared and is_stop(rows, stands):
+            yield MeterStop(level, is_ceiling, reading, unit), there
 
 
 def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
@@ -145,16 +149,6 @@ class _RowsInTurn:
         """Whether readings are so many and so fine that equal ones tell of a stop."""
         typical = float(np.median(self.steps)) if self.steps.size else 0.0
         return len(self.readings) > _LEAST_IN_ALL and typical > 0 and lattice_step(self.readings) <= _FINE * typical
-
-    def extreme_and_mask(self, is_ceiling: bool) -> tuple[float, BoolArray]:
-        """Return the largest or smallest reading, and the mask of those that equal it, (n_readings,)."""
-        level = float(self.readings.max() if is_ceiling else self.readings.min())
-        return level, self.readings == level
-
-
-def _is_declared_end(level: float, recording: Recording) -> bool:
-    """Return whether a reading is at a declared end, to within rounding."""
-    return bool(recording.censored[recording.readings == level].any())
 
 
 def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:

@@ -120,7 +120,7 @@ def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_pri
     found = method.updated(replace(now, particles=(leader, other)), two, rng=rng).particles[1]
     assert found.asleep == sleeps
     if sleeps:
-        assert found.weighted.theta is other.weighted.theta
+        np.testing.assert_array_equal(found.weighted.theta, other.weighted.theta)
         assert found.log_z == pytest.approx(other.log_z + kinds[1].problem(two).perfect_log_likelihood)
     else:
         assert found.searched_at == 2

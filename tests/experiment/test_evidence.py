@@ -103,3 +103,26 @@ def test_kinds_searched_just_now_are_not_searched_again_before_a_run_ends(doubti
     assert all(p.searched_at == 1 for p in once.particles)
     again = method.reconsidered(once, recording.take(np.arange(1)), rng=rng)
     assert all(a is b for a, b in zip(again.particles, once.particles, strict=True))
+
+
+@pytest.mark.parametrize(("behind", "sleeps"), [(60.0, True), (3.0, False)])
+def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_prior_when_it_wakes(
+    doubting, behind, sleeps
+):
+    """Asleep its evidence is as if every reading had been predicted exactly: it can only be overrated."""
+    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "nonlinearity")]
+    method, rng = replace(doubting, n_live=100).inference_method, np.random.default_rng(1)
+    recording = journal(doubting, 3)
+    now = method.updated(prior_posterior(kinds, 1000, rng=rng), recording.take(np.arange(1)), rng=rng)
+    leader, other = now.particles
+    other = replace(other, weighted=replace(other.weighted, log_z=leader.log_z - behind), searched_at=1, asleep=True)
+    two = recording.take(np.arange(2))
+    found = method.updated(replace(now, particles=(leader, other)), two, rng=rng).particles[1]
+    assert found.asleep == sleeps
+    if sleeps:
+        np.testing.assert_array_equal(found.weighted.theta, other.weighted.theta)
+        assert found.log_z == pytest.approx(other.log_z + kinds[1].problem(two).perfect_log_likelihood)
+    else:
+        assert found.searched_at == 2
+        right = nested_sampling_from_scratch(kinds[1].problem(two), n_live=400, rng=rng)
+        assert found.log_z == pytest.approx(right.log_z, abs=0.3 + 2 * right.log_z_error)

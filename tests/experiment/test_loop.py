@@ -3,9 +3,6 @@
 import math
 import os
 import runpy
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
-from probewise.experiment import Exploration, OneScan, arm_over, begin, explore, inquire, loop, read_journal, step
+from probewise.experiment import OneScan, arm_over, begin, explore, inquire, loop, read_journal, step
 from probewise.experiment.stopping import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
@@ -24,7 +21,7 @@ from probewise.inquiry.smc import prior_particles
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 from probewise.scene.scenes import HypothesisScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
+from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
 
 COARSE = Grid(400.0, 300.0, 14, 10)
@@ -39,6 +36,14 @@ def found():
     """One run of the soft sensor, shared by the tests that only look at it."""
     small = runpy.run_path(str(Path(__file__).with_name("conftest.py")))
     return run(small["QuickArm"](), small["small_experiment"](), rng=rng()), small
+
+
+@pytest.fixture(scope="module")
+def two_readings(small_for_all, tmp_path_factory):
+    """The journal of a run of two readings."""
+    journal = tmp_path_factory.mktemp("two") / "journal.jsonl"
+    run(small_for_all.arm(), small_for_all.experiment(), rng=rng(), max_readings=2, journal=journal)
+    return journal
 
 
 def test_the_robot_finds_the_circle_to_the_precision_it_states(found):
@@ -59,21 +64,15 @@ def test_each_step_holds_what_its_reading_taught(found):
         assert len(np.unique(info.samples, axis=0)) == 20
         assert 0 <= info.map.highest_utility <= math.log2(50)
         assert np.isfinite([info.bits, info.log_z, info.p_value, info.posterior.log_z_error]).all()
+        assert info.p_value > 1e-6
+        best = info.map.grid.places_mm[info.map.best_mask]
+        assert info.next_pose is None or [info.next_pose.x_mm, info.next_pose.y_mm] in best.tolist()
+    last = result.last  # whose samples are drawn from the posterior: within five standard errors
+    assert (np.abs(last.samples.mean(axis=0) - last.mean) < 5 * last.sd / math.sqrt(20)).all()
+    np.testing.assert_array_equal(result.recording().readings, [r.value for r in result.readings])
     poses = [info.next_pose for info in result.steps]
     assert poses[-1] is None
     assert poses[:-1] == [info.reading.pose for info in result.steps[1:]]
-
-
-def test_the_next_place_is_one_of_the_best_of_the_map(found):
-    for info in found[0].steps[:-1]:
-        best = info.map.grid.places_mm[info.map.best_mask]
-        assert [info.next_pose.x_mm, info.next_pose.y_mm] in best.tolist()
-
-
-def test_the_samples_shown_are_drawn_from_the_posterior(found):
-    """Mean of 20 samples within 5 standard errors of the weighted mean."""
-    last = found[0].last
-    assert (np.abs(last.samples.mean(axis=0) - last.mean) < 5 * last.sd / math.sqrt(20)).all()
 
 
 def test_bits_agree_with_the_entropy_of_the_posterior_samples(found):
@@ -93,11 +92,6 @@ def test_the_summary_gives_bits_and_the_papers_count(found):
     assert f"{result.last.bits / len(result.steps):.2f} per reading" in text
     assert "radius_mm" in text
     assert result.steps[0].summary().startswith("reading 1: ")
-
-
-def test_the_readings_become_a_recording(found):
-    result, _ = found
-    np.testing.assert_array_equal(result.recording().readings, [r.value for r in result.readings])
 
 
 def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
@@ -249,33 +243,6 @@ def test_a_run_that_ended_at_max_readings_can_be_extended(small, found, tmp_path
     assert longer.readings == found[0].readings
 
 
-KILLED = """
-import runpy, sys
-import numpy as np
-from probewise.experiment import explore
-small = runpy.run_path(sys.argv[1])
-arm = small["QuickArm"](die_at=4)
-for info in explore(arm, small["small_experiment"](), rng=np.random.default_rng(2013), journal=sys.argv[2]):
-    sys.stdout.write(f"{info.number}\\n")
-"""
-
-
-@pytest.mark.slow
-def test_a_process_that_is_killed_loses_no_reading(small, found, tmp_path):
-    """SIGKILL while the fourth reading is being taken; the fifth is never asked for before the fourth is on disk."""
-    journal = tmp_path / "journal.jsonl"
-    conftest = str(Path(__file__).with_name("conftest.py"))
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, conftest, str(journal)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    assert len(read_journal(journal).entries) == 3
-    arm = small.arm()
-    resumed = run(arm, small.experiment(), rng=rng(), journal=journal)
-    assert len(arm.poses) == len(found[0].steps) - 3
-    assert all(same(a, b) for a, b in zip(found[0].steps, resumed.steps, strict=True))
-
-
 def test_a_run_killed_while_it_infers_keeps_the_reading_just_taken(small, found, tmp_path, monkeypatch):
     journal = tmp_path / "journal.jsonl"
     steps = explore(small.arm(), small.experiment(), rng=rng(), journal=journal)
@@ -296,33 +263,20 @@ def test_a_run_killed_while_it_infers_keeps_the_reading_just_taken(small, found,
 
 
 @pytest.mark.parametrize(
-    ("change", "named"),
+    ("change", "options", "error", "says"),
     [
-        ({"n_samples": 40}, "options"),
-        ({"noise_sd": 2.0}, "options"),
-        ({"blur_mm": 9.0}, "sensor"),
-        ({"grid": Grid(400.0, 300.0, 41, 31)}, "field"),
+        ({"n_samples": 40}, {}, FileError, "other settings: .*options"),
+        ({"noise_sd": 2.0}, {}, FileError, "other settings: .*options"),
+        ({"blur_mm": 9.0}, {}, FileError, "other settings: .*sensor"),
+        ({"grid": Grid(400.0, 300.0, 41, 31)}, {}, FileError, "other settings: .*field"),
+        ({}, {"rng": rng(5)}, FileError, "seed '2013' there, '5' here"),
+        ({}, {"max_readings": 1}, ParameterError, r"max_readings is 1; allowed: the 2 readings the journal holds"),
+        ({}, {"max_readings": 0}, ParameterError, "max_readings"),
     ],
 )
-def test_a_journal_of_other_settings_is_not_resumed(small, tmp_path, change, named):
-    journal = tmp_path / "journal.jsonl"
-    run(small.arm(), small.experiment(), rng=rng(), max_readings=1, journal=journal)
-    with pytest.raises(FileError, match=f"other settings: .*{named}"):
-        explore(small.arm(), small.experiment(**change), rng=rng(), journal=journal)
-
-
-def test_a_journal_of_another_seed_is_not_resumed(small, tmp_path):
-    journal = tmp_path / "journal.jsonl"
-    run(small.arm(), small.experiment(), rng=rng(), max_readings=1, journal=journal)
-    with pytest.raises(FileError, match="seed '2013' there, '5' here"):
-        explore(small.arm(), small.experiment(), rng=rng(5), journal=journal)
-
-
-def test_a_journal_with_more_readings_than_allowed_says_so(small, tmp_path):
-    journal = tmp_path / "journal.jsonl"
-    run(small.arm(), small.experiment(), rng=rng(), max_readings=2, journal=journal)
-    with pytest.raises(ParameterError, match=r"max_readings is 1; allowed: the 2 readings the journal holds"):
-        explore(small.arm(), small.experiment(), rng=rng(), max_readings=1, journal=journal)
+def test_a_journal_of_another_run_is_not_resumed(small, two_readings, change, options, error, says):
+    with pytest.raises(error, match=says):
+        explore(small.arm(), small.experiment(**change), **{"rng": rng(), "journal": two_readings, **options})
 
 
 def test_a_broken_link_leaves_a_journal_to_resume_from(small, found, tmp_path):
@@ -382,10 +336,6 @@ def test_readings_that_no_hypothesis_allows_are_flagged_and_never_nan(small):
     assert np.isfinite(result.last.mean).all()
 
 
-def test_a_fitting_run_is_not_flagged(found):
-    assert all(info.p_value > 1e-6 for info in found[0].steps)
-
-
 @pytest.mark.parametrize(
     ("reading_range", "step", "value", "fits"),
     [
@@ -429,16 +379,8 @@ def test_a_space_that_excludes_the_reading_altogether_is_an_error(small):
 def test_an_option_out_of_range_is_refused_by_name(small, change):
     with pytest.raises(ParameterError, match=next(iter(change))):
         small.experiment(**change)
-
-
-def test_a_model_of_another_shape_is_refused(small):
     with pytest.raises(ParameterError, match=r"model\.names"):
         small.experiment(model=small.sensor(names=("x_mm", "y_mm")))
-
-
-def test_max_readings_below_one_is_refused(small):
-    with pytest.raises(ParameterError, match="max_readings"):
-        explore(small.arm(), small.experiment(), rng=rng(), max_readings=0)
 
 
 def test_a_growing_scan_has_the_student_t_of_one_data_set():
@@ -507,18 +449,6 @@ def test_a_set_of_shapes_stops_on_the_lengths_of_the_most_probable(small):
     assert experiment.may_stop(known, {"circle": 0.99, "rectangle": 0.01})
     assert not experiment.may_stop(known, {"circle": 0.6, "rectangle": 0.4})
     assert not experiment.may_stop(known * 5, {"circle": 0.99, "rectangle": 0.01})
-
-
-def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
-    field = Field(400.0, 300.0)
-    circle = Circle(field, (40.0, 100.0), inside=True)
-    model = NaiveSensor(FixedLevels(10.0, 60.0), HypothesisScene(circle))
-    result = run(
-        small.arm(sensor=small.sensor(0.0)), small.experiment(shape=circle, model=model), rng=rng(), max_readings=3
-    )
-    assert isinstance(result, Exploration)
-    assert all(info.map.highest_utility <= 1.0 + 1e-5 for info in result.steps)
-    assert Pose(result.readings[0].pose.x_mm, result.readings[0].pose.y_mm) == result.readings[0].pose
 
 
 @pytest.mark.slow
@@ -675,19 +605,14 @@ def test_the_only_place_within_reach_is_read_while_it_tells_something(small):
     assert result.steps[0].map.highest_utility > result.steps[2].map.highest_utility > 0
 
 
-def test_a_run_stops_when_the_only_place_within_reach_has_told_all(small):
-    """A sensor that says yes or no, and has said it."""
+def test_a_run_stops_when_the_only_place_within_reach_has_told_all_and_is_refused_where_it_tells_nothing(small):
+    """A sensor that says yes or no, and has said it; and no circle of the prior near that place."""
     arm = small.arm(sensor=small.sensor(0.0), reach_mm=30.0)
     result = run(arm, small.experiment(blur_mm=0.0, grid=ONE_PLACE), rng=rng(), max_readings=20)
     assert len(arm.poses) == 1
     assert result.stop_reason.startswith("the only reading within reach promises nothing more, 0: none would tell")
     assert "the widest length is known to" in result.stop_reason
-
-
-def test_an_only_place_that_tells_nothing_is_refused(small):
-    """No circle of the prior comes near the one place within reach."""
-    far = small.circle(width_mm=80.0, radius_mm=(20.0, 40.0))
-    arm = small.arm(reach_mm=30.0)
+    far, arm = small.circle(width_mm=80.0, radius_mm=(20.0, 40.0)), small.arm(reach_mm=30.0)
     with pytest.raises(ParameterError, match="no reading within reach is expected to tell anything"):
         run(arm, small.experiment(shape=far, grid=ONE_PLACE), rng=rng())
     assert arm.poses == []

@@ -35,8 +35,8 @@ from probewise.experiment.inquire import (
     INFORMATION,
     NAMES,
     ArmReachAndTravel,
-    OutlineReadingDistances,
     expected_bits_about_left_out_effect,
+    far_side,
     predict_readings_and_utilities,
     utilities_near_end,
 )
@@ -389,16 +389,12 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     missing = [
         replace(r, value=math.nan, pose=Pose(2 * x - r.pose.x_mm, 2 * y - r.pose.y_mm)) for r in on_edge
     ]  # on the far side, without a value
-    outline = OutlineReadingDistances.from_region(
+    far, shows_it = far_side(
         utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge, *missing)
     )
-    assert outline is not None
-    far = outline.far_side_design
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
     tried = np.concatenate([opposite, [[x, y]]])
-    assert outline.leaves_no_far_side_mask(tried).tolist() == (
-        [True, False, False] if asked_deg else [True, True, True]
-    )
+    assert shows_it(tried).tolist() == ([True, False, False] if asked_deg else [True, True, True])
     if asked_deg is None:
         assert far is None
         return

@@ -63,13 +63,10 @@ def arm_error_in_posterior(
     likely_shape: str,
     rng: np.random.Generator,
 ) -> ArmError | None:
-    """Compute by how much the error of the arm's geometry moves and widens the posterior of the shape.
+    """Compute by how much the error of the arm's geometry moves and widens the posterior of the shape; None: not known.
 
     `theta` (n_samples, n_params) are samples of the shape given the readings, `kinds` the same posterior kind by kind;
-    `mean`, `sd` (n_params,) and `likely_shape` are as in `Step`; `rng` draws one error for each sample.
-
-    Return the effect, or None if the arm's error is not known. ParameterError if the arm does not reach a place of a
-    reading.
+    `mean`, `sd` (n_params,) and `likely_shape` are as in `Step`. ParameterError if the arm does not reach a reading.
     """
     arm = experiment.fitted_arm
     if arm is None:

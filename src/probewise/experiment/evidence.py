@@ -64,14 +64,16 @@ def with_evidence_from_prior(
     raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
     matters, asleep = raised > _MATTERS, np.array([p.asleep for p in now.particles])
     doubtful = np.array([p.is_doubtful for p in now.particles])
-    unsure = doubtful | np.array([p.searched_at == -math.inf for p in now.particles])
+    searched_at = np.array([p.searched_at for p in now.particles])
+    unsure = doubtful | (searched_at == -math.inf)
     due = asleep & matters
     if at_end:
         due |= unsure & (now.doubts_sensor | (raised > _HAS_A_SAY))
     else:
         due |= doubtful & (matters | (raised[doubtful].sum() > 0.5))
         if now.doubts_sensor and possible and now.left_out[""] < 0.5:
-            due[np.flatnonzero(unsure)[np.argsort(-raised[unsure], kind="stable")[:_PER_READING]]] = True
+            others = np.flatnonzero(unsure & ~due)
+            due[others[np.lexsort((-raised[others], searched_at[others]))[:_PER_READING]]] = True
     particles = list(now.particles)
     for k in np.flatnonzero(due).tolist():
         own, kind, problem = particles[k], now.kinds[k], problems[k]

@@ -275,8 +275,8 @@ def utilities_near_end(
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities
     mean = (given.weight @ given.theta[:, experiment.shape_columns])[None] / given.weight.sum()
-    outline = OutlineReadingDistances.from_region(given, experiment.shape.region(mean), readings)
-    far = () if outline is None or outline.far_side_design is None else (outline.far_side_design,)
+    unseen, shows_far_side = far_side(given, experiment.shape.region(mean), readings)
+    far = () if unseen is None else (unseen,)
     rows = _candidate_designs(experiment, given, utilities, theta, readings, rng)
     rows = np.union1d(rows, far).astype(np.int64)
     plan = _plan_from_arm_to_candidates(given, rows, readings)
@@ -285,9 +285,7 @@ def utilities_near_end(
     )
     n_repeats = given.designs.n_repeats[given.rows[rows]]
     names = np.array([kind.left_out for kind, own in zip(kinds.kinds, theta, strict=True) for _ in own])
-    seen = np.ones(len(rows), dtype=np.bool_)
-    if outline is not None:
-        seen = outline.leaves_no_far_side_mask(_places_mm(given)[rows])
+    seen = shows_far_side(_places_mm(given)[rows])
 
     def map_of(some: IntArray, utility: FloatArray, label: str) -> UtilityMap:
         """Return the utility map with these values, (n,), for some available designs and 0 for the others."""
@@ -477,62 +475,36 @@ def _expected_bits_by_cells(
     return np.asarray(bits)
 
 
-@dataclass(frozen=True, eq=False)
-class OutlineReadingDistances:
-    """The part of a probable shape's outline within reach, and distances from the readings taken near this outline.
+def far_side(
+    given: UtilityInput, region: Region, readings: Sequence[Reading]
+) -> tuple[int | None, Callable[[FloatArray], BoolArray]]:
+    """Return the design on the side of one region that no reading has seen, and which places would show that side.
 
-    `edge_mm` (n, 2) are places on the outline, `nearest` (n,) the index of the available design nearest to each, and
-    `apart_mm` (n,) its distance from the nearest reading at the outline, infinite if there is none. `spacing_mm` is
-    that of the grid, `diameter_mm` that of the outline within reach.
+    The design is the available one at the place on the outline within reach that is farthest from the readings at the
+    outline: None if one of these is nearer to that place than 0.75 of the diameter. The function marks places, (n, 2)
+    -> (n,), at which one more reading would leave none. A reading farther than one spacing of the grid from the outline
+    has seen nothing of it. Of a region that is no ellipse or polygon, or out of reach, there is no far side.
     """
+    there, grid = _places_mm(given), given.designs.grid
+    spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
+    edge = outlines(region)[0] if isinstance(region, EllipseRegion | PolygonRegion) else np.empty((0, 2))
+    away = np.linalg.norm(edge[:, None] - there, axis=2)
+    within = away.min(axis=1, initial=np.inf) <= spacing
+    if not within.any():
+        return None, lambda places_mm: np.ones(len(places_mm), dtype=np.bool_)
+    edge, nearest = edge[within], away.argmin(axis=1)[within]
+    most = _FAR * float(np.linalg.norm(edge[:, None] - edge, axis=2).max())
 
-    edge_mm: FloatArray
-    nearest: IntArray
-    apart_mm: FloatArray
-    spacing_mm: float
-    diameter_mm: float
+    def distances(places_mm: FloatArray) -> FloatArray:
+        """Return the distance of each place on the outline from readings, (n_edge, n), infinite for those elsewhere."""
+        apart = np.linalg.norm(edge[:, None] - places_mm, axis=2)
+        return np.where(apart.min(axis=0) <= _AT_EDGE * spacing, apart, np.inf)
 
-    @classmethod
-    def from_region(cls, given: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
-        """Build from one region and the readings so far; None if that is no ellipse or polygon, or out of reach."""
-        if not isinstance(region, EllipseRegion | PolygonRegion):
-            return None
-        edge = outlines(region)[0]
-        grid = given.designs.grid
-        spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
-        away = np.linalg.norm(edge[:, None] - _places_mm(given), axis=2)
-        within = away.min(axis=1) <= spacing
-        if not within.any():
-            return None
-        edge, nearest = edge[within], away.argmin(axis=1)[within]
-        diameter = float(np.linalg.norm(edge[:, None] - edge, axis=2).max())
-        unread = cls(edge, nearest, np.full(len(edge), np.inf), spacing, diameter)
-        # A missing reading has seen nothing.
-        taken = _places_of([reading for reading in readings if not math.isnan(reading.value)])
-        apart = unread.nearest_reading_distances_if_read_at(taken).min(axis=1, initial=np.inf)
-        return cls(edge, nearest, apart, spacing, diameter)
-
-    def nearest_reading_distances_if_read_at(self, places_mm: FloatArray) -> FloatArray:
-        """Return `apart_mm` with one more reading at each of these places, (n_places, 2) -> (n, n_places).
-
-        A place farther than one spacing of the grid from the outline changes nothing.
-        """
-        apart = np.linalg.norm(self.edge_mm[:, None] - places_mm, axis=2)
-        at_edge = apart.min(axis=0) <= _AT_EDGE * self.spacing_mm
-        return np.asarray(np.minimum(np.where(at_edge, apart, np.inf), self.apart_mm[:, None]))
-
-    @property
-    def far_side_design(self) -> int | None:
-        """Index of the available design at the place on the outline farthest from the readings at the outline.
-
-        None if a reading at the outline is nearer to that place than 0.75 of the diameter.
-        """
-        farthest = int(self.apart_mm.argmax())
-        return int(self.nearest[farthest]) if self.apart_mm[farthest] > _FAR * self.diameter_mm else None
-
-    def leaves_no_far_side_mask(self, places_mm: FloatArray) -> BoolArray:
-        """Mark places at which one more reading would leave `far_side_design` None, (n_places, 2) -> (n_places,)."""
-        return np.asarray(self.nearest_reading_distances_if_read_at(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
+    taken = _places_of([reading for reading in readings if not math.isnan(reading.value)])
+    read = distances(taken).min(axis=1, initial=np.inf)
+    farthest = int(read.argmax())
+    far = int(nearest[farthest]) if read[farthest] > most else None
+    return far, lambda places_mm: np.minimum(distances(places_mm), read[:, None]).max(axis=0) <= most
 
 
 def _places_mm(given: UtilityInput) -> FloatArray:

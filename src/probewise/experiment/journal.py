@@ -132,10 +132,7 @@ def covariates_with_height(reading: Reading) -> Mapping[str, float]:
 def read_journal(path: str | Path) -> Journal:
     """Read a journal, even if its writer was killed at any time.
 
-    Raises
-    ------
-    FileError
-        If the file is missing, is not a journal of this version, or is damaged before its last line.
+    FileError if the file is missing, is not a journal of this version, or is damaged before its last line.
     """
     raw = read_bytes(checked_path("path", path), "a journal written by this package")
     *lines, tail = raw.split(b"\n")

@@ -111,11 +111,8 @@ def step(
 ) -> tuple[ExplorationState, Step]:
     """Update the posterior with one reading, and choose the next.
 
-    `max_readings` is the number of readings at which the run ends, `max_missing` that of missing ones (NaN) in a row;
-    None: no limit. `rng` is the random generator of this step.
-
-    Return the state after the reading, with the next pose, and the result of this step. ParameterError if the reading
-    is outside the sensor's range; NotConvergedError if no hypothesis could have given these readings.
+    The run ends at `max_readings` readings, or `max_missing` missing ones (NaN) in a row; None: no limit.
+    ParameterError if the reading is outside the sensor's range; NotConvergedError if no hypothesis could have given it.
     """
     experiment.readout.require_in_range(reading.value)
     readings = (*state.readings, reading)
@@ -206,48 +203,36 @@ def explore(
     """Let the robot find the shape: yield one `Step` per reading until the target precision (paper, section 2).
 
     `Exploration(experiment, tuple(explore(...)))` is the whole run. A generator that is not exhausted keeps its journal
-    locked until the generator is closed.
+    locked until the generator is closed. A `DoubtfulResultWarning` says once, and the notes of every step after that
+    too, if the arm reads at another height than that of the sensor's calibration, without `heights_mm`.
 
     Parameters
     ----------
     instrument
         The instrument, already entered (`with arm:`), or your own object with `measure(pose)`, see
         `probewise.arm.as_instrument`.
-    experiment
-        The experiment: shape, sensor model, stopping rule.
     rng
         Generator whose seed sequence gives the run's seed, as a child; each reading's seed is a child of that. So one
         seed determines the whole run, and a resumed run continues bit for bit as if it had not been interrupted.
-    max_readings
-        Largest number of readings.
     journal
         File with one JSON line per measurement. If it exists, the run resumes: its readings are taken from the journal
         instead of the instrument, and their steps are yielded again with `replayed` set. A simulated instrument must be
         in the state after the last of them: read the journal, place the instrument, and pass the journal as read.
-        Missing folders are created.
     about
         Further entries of the journal's first line, such as the sensor and the hidden shape of a simulated field; a
         resumed run must agree with them (except for names of arm and file, see `require_same_settings`).
 
     Raises
     ------
-    ReachError
-        If no place of the grid is reachable.
+    ReachError, NotConvergedError
+        If no place of the grid is reachable; if no hypothesis could have given the readings.
     FileError
         If the journal is damaged, belongs to a run with other settings, or is written to by another process.
     ParameterError
         If the journal holds more than `max_readings` readings, no place is more informative than others, or the
         instrument does not declare that it can turn or lift its sensor as the experiment may choose.
-    NotConvergedError
-        If no hypothesis could have given the readings.
     LinkError
         If the instrument fails, or returns a reading out of range, or with an impossible `led` or `height_mm`.
-
-    Warns
-    -----
-    DoubtfulResultWarning
-        Once, if the arm reads at another height than that of the sensor's calibration, without `heights_mm`; the notes
-        of every step after that say so too.
     """
     require_measures("instrument", instrument)
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
@@ -290,7 +275,8 @@ def _yield_steps(
     doubt = _doubt_about_height(experiment, getattr(instrument, "read_height_mm", None))
     if doubt is not None:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
-    with _journal_writer(path, before, settings) as writer:
+    new = contextlib.nullcontext() if path is None else JournalWriter.begin(path, settings)
+    with new if before is None else JournalWriter.resume(before) as writer:
         stopped = False
         while not stopped:
             number = len(state.readings) + 1
@@ -364,14 +350,6 @@ def _require_possible_reading(experiment: Experiment, reading: Reading) -> None:
         require_possible_commands(experiment.problem([reading]).recording.plan)
     except ParameterError as error:
         raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
-
-
-def _journal_writer(
-    path: Path | None, before: Journal | None, settings: Mapping[str, Any]
-) -> contextlib.AbstractContextManager[JournalWriter | None]:
-    if before is not None:
-        return JournalWriter.resume(before)
-    return contextlib.nullcontext() if path is None else JournalWriter.begin(path, settings)
 
 
 def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:

@@ -64,14 +64,11 @@ class Step(ShowsItself):
     names, mean, sd
         Names of the shape's parameters, their posterior means and sds, each (n_params,). For a set of shapes: given the
         most probable shape, with NaN for parameters of other shapes.
-    shapes
-        Probability of each shape of a set, by its name; empty for a single shape.
-    samples
-        Shapes drawn from the posterior, (n_samples, n_params).
-    map
-        Utility of each possible next reading.
-    next_pose
-        Next pose; None when the run is over.
+    shapes, samples
+        Probability of each shape of a set, by its name (empty for a single shape); shapes drawn from the posterior,
+        (n_samples, n_params).
+    map, next_pose, stop_reason
+        Utility of each possible next reading; the next pose, or None and the reason why the run ends here.
     bits
         Information gained so far: prior minus posterior differential entropy of all parameters. With `trust` below 1,
         the information about the effect left out and its parameters is added, so this exceeds that about the shape.
@@ -89,14 +86,8 @@ class Step(ShowsItself):
         The posterior of every kind of hypotheses, with odds as in `left_out`.
     chance_off
         Probability that a length is off by three times the sd of the stopping rule.
-    stop_reason
-        Reason why the run ends here, or None.
-    notes
-        Warnings on this step.
-    replayed
-        Whether the reading comes from a journal.
-    pace
-        Pace of the run so far.
+    notes, replayed, pace
+        Warnings on this step; whether the reading comes from a journal; pace of the run so far.
     arm_error
         Effect of the arm's own error; None far from the end of a run, or if that error is not known.
     unexplained
@@ -178,15 +169,7 @@ def stop_reason_with_checks(steps: Sequence[Step]) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class Exploration(ShowsItself):
-    """A whole run: its steps, why it ended, what it found.
-
-    Attributes
-    ----------
-    experiment, steps
-        The configuration, and the result of each reading.
-    hidden
-        The true shape, if it is known.
-    """
+    """A whole run: its configuration and its steps; `hidden` is the true shape, if it is known."""
 
     experiment: Experiment
     steps: tuple[Step, ...]

@@ -37,21 +37,7 @@ _ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a posterior says.
-
-    Attributes
-    ----------
-    mean, sd, shapes
-        Mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape, see `Step`.
-    may_stop, chance_off
-        Whether the stopping rule is met, arm included; probability that a length is off by three times its sd.
-    p_value, notes
-        p-value of the best hypothesis, None if it was not tested; warnings.
-    unexplained
-        With what the residuals of the best hypothesis change, in words; "" if they show no trend.
-    arm_error
-        Effect of the arm's own error; None far from the end of a run, or if that error is not known.
-    """
+    """What a posterior says, as in `Step`; and whether the stopping rule is met, arm included (`may_stop`)."""
 
     mean: FloatArray
     sd: FloatArray

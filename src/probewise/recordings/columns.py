@@ -192,10 +192,13 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
     cells = _names_per_reading("scan", names, n_points)
     if "" in cells and any(cells):
         raise ParameterError(f"scan[{cells.index('')}]", "", A_SCAN)
-    starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
-    begins = np.zeros(n_points, dtype=np.int64)
-    begins[starts[1:]] = 1
-    return np.cumsum(begins), tuple(cells[k] for k in starts)
+    return codes_and_names_of_runs(cells)
+
+
+def codes_and_names_of_runs(cells: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the number of each cell's run of equal cells, from 0, (n_cells,), and what is in each run."""
+    begins = np.fromiter((k == 0 or cells[k] != cells[k - 1] for k in range(len(cells))), dtype=np.bool_)
+    return np.cumsum(begins) - 1, tuple(cells[k] for k in np.flatnonzero(begins))
 
 
 def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:

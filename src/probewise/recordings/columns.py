@@ -16,8 +16,7 @@ from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.patterns import PATTERNS, Pattern
 from probewise.recordings.table import number_text
 
-_A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
-_THE_ONLY = "pattern"  # name of a single pattern that was given without one
+A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
 """Names of a table's columns that are no covariates; SESSION is none either."""
 SESSION = "session"
@@ -214,25 +213,12 @@ def no_session_mask(session: FloatArray, scan: IntArray) -> BoolArray:
     return np.asarray(~(whole & (session == session[first][which.reshape(-1)])))
 
 
-def patterns_by_name(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
-    """Return patterns by name; a single pattern lies under every reading.
-
-    Raises ParameterError if there is none, or one is not a pattern.
-    """
-    by_name = patterns if isinstance(patterns, Mapping) else {_THE_ONLY: patterns}
-    if not by_name:
-        allowed = f"what lay under the sensor, by name: {{'edge': HalfPlane(...), ...}}, or {_A_PATTERN}"
-        raise ParameterError("patterns", patterns, allowed)
-    require_patterns(by_name)
-    return dict(by_name)
-
-
 def require_patterns(patterns: Mapping[str, Pattern]) -> None:
     """Raise ParameterError unless every value is a pattern; a dict of a pattern's fields is the usual mistake."""
     for name, pattern in patterns.items():
         require_kind("a name in patterns", name, str, "a text")
         if not isinstance(pattern, PATTERNS):
-            raise ParameterError(f"patterns[{name!r}]", pattern, _A_PATTERN)
+            raise ParameterError(f"patterns[{name!r}]", pattern, A_PATTERN)
 
 
 def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:

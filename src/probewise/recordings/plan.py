@@ -25,6 +25,7 @@ from probewise._kinds import checked_finite_number, checked_whole, require_kind,
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
+    A_PATTERN,
     A_SESSION,
     SESSION,
     TableLike,
@@ -35,7 +36,6 @@ from probewise.recordings.columns import (
     numbers_per_reading,
     numeric_covariates_and_notes,
     pattern_codes,
-    patterns_by_name,
     require_patterns,
     scan_codes_and_names,
     selected_row_numbers,
@@ -210,7 +210,11 @@ class Plan:
         n_points = len(x)
         turns = numbers_per_reading("orientation_rad", orientation_rad, n_points)
         warn_of_likely_degrees("orientation_rad", turns)
-        described = patterns_by_name(patterns)
+        described = dict(patterns) if isinstance(patterns, Mapping) else {"pattern": patterns}
+        if not described:
+            allowed = f"what lay under the sensor, by name: {{'edge': HalfPlane(...), ...}}, or {A_PATTERN}"
+            raise ParameterError("patterns", patterns, allowed)
+        require_patterns(described)
         code, scan_names = scan_codes_and_names(scan, n_points)
         number = numbers_per_reading("session", 0.0 if session is None else session, n_points)
         if (wrong := no_session_mask(number, code)).any():

@@ -16,8 +16,7 @@ from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.patterns import PATTERNS, Pattern
 from probewise.recordings.table import number_text
 
-_A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
-_THE_ONLY = "pattern"  # name of a single pattern that was given without one
+A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
 """Names of a table's columns that are no covariates; SESSION is none either."""
 SESSION = "session"
@@ -192,10 +191,13 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
     cells = _names_per_reading("scan", names, n_points)
     if "" in cells and any(cells):
         raise ParameterError(f"scan[{cells.index('')}]", "", A_SCAN)
-    starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
-    begins = np.zeros(n_points, dtype=np.int64)
-    begins[starts[1:]] = 1
-    return np.cumsum(begins), tuple(cells[k] for k in starts)
+    return codes_and_names_of_runs(cells)
+
+
+def codes_and_names_of_runs(cells: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the number of each cell's run of equal cells, from 0, (n_cells,), and what is in each run."""
+    begins = np.fromiter((k == 0 or cells[k] != cells[k - 1] for k in range(len(cells))), dtype=np.bool_)
+    return np.cumsum(begins) - 1, tuple(cells[k] for k in np.flatnonzero(begins))
 
 
 def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:
@@ -211,25 +213,12 @@ def no_session_mask(session: FloatArray, scan: IntArray) -> BoolArray:
     return np.asarray(~(whole & (session == session[first][which.reshape(-1)])))
 
 
-def patterns_by_name(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
-    """Return patterns by name; a single pattern lies under every reading.
-
-    Raises ParameterError if there is none, or one is not a pattern.
-    """
-    by_name = patterns if isinstance(patterns, Mapping) else {_THE_ONLY: patterns}
-    if not by_name:
-        allowed = f"what lay under the sensor, by name: {{'edge': HalfPlane(...), ...}}, or {_A_PATTERN}"
-        raise ParameterError("patterns", patterns, allowed)
-    require_patterns(by_name)
-    return dict(by_name)
-
-
 def require_patterns(patterns: Mapping[str, Pattern]) -> None:
     """Raise ParameterError unless every value is a pattern; a dict of a pattern's fields is the usual mistake."""
     for name, pattern in patterns.items():
         require_kind("a name in patterns", name, str, "a text")
         if not isinstance(pattern, PATTERNS):
-            raise ParameterError(f"patterns[{name!r}]", pattern, _A_PATTERN)
+            raise ParameterError(f"patterns[{name!r}]", pattern, A_PATTERN)
 
 
 def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:

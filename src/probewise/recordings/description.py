@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -14,17 +15,7 @@ import numpy as np
 from probewise.errors import FileError, ParameterError, shortened
 from probewise.recordings.images import is_file_name_without_path, read_image
 from probewise.recordings.io import parse_json_file_text, read_text
-from probewise.recordings.patterns import (
-    Disc,
-    HalfPlane,
-    Image,
-    Pattern,
-    Polygon,
-    Quadrant,
-    Ramp,
-    Stripes,
-    Uniform,
-)
+from probewise.recordings.patterns import PATTERNS, Image, Pattern
 from probewise.recordings.plan import Instrumentation
 from probewise.recordings.table import LARGEST
 
@@ -89,16 +80,7 @@ def _shortened_json(value: object) -> str:
     return shortened(json.dumps(value, ensure_ascii=False, default=str), 60)
 
 
-_KINDS: dict[str, type[Pattern]] = {
-    "uniform": Uniform,
-    "half_plane": HalfPlane,
-    "quadrant": Quadrant,
-    "disc": Disc,
-    "polygon": Polygon,
-    "stripes": Stripes,
-    "ramp": Ramp,
-    "image": Image,
-}
+_KINDS: dict[str, type[Pattern]] = {re.sub("(?<=.)(?=[A-Z])", "_", kind.__name__).lower(): kind for kind in PATTERNS}
 _KIND_OF = {pattern: kind for kind, pattern in _KINDS.items()}
 _A_PICTURE = "the name of a PNG or .npy file in the same folder, without a path"
 # What a field of a pattern may hold in the file, by the field's type.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import operator
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,6 +22,7 @@ from probewise.recordings.columns import (
     A_SESSION,
     SESSION,
     a_command,
+    codes_and_names_of_runs,
     is_commanded,
     led_cell,
     no_session_mask,
@@ -44,13 +44,11 @@ PathLike = str | os.PathLike[str]
 def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     """Read a recording: NAME.csv, and NAME.json beside it.
 
-    Missing readings become NaN, readings outside the declared range keep their value; both are
-    counted in the notes and are not `usable`. `progress` is called as rows are read.
-
-    Raises FileError if either file cannot be used; it names the file, row and column, what was found and what is
-    allowed.
+    Missing readings become NaN, readings outside the declared range keep their value; both are counted in the notes and
+    are not `usable`. `progress` is called as rows are read. Raises FileError if either file cannot be used; it names
+    the file, row and column, what was found and what is allowed.
     """
-    plan, readings, notes = _read_with_json(_checked_csv_path(path), progress)
+    plan, readings, notes = _read_with_json(path, progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -64,22 +62,13 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
 
 
 def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
-    """Read a plan, or the plan of a recording.
-
-    Raises FileError if either file cannot be used; it names the file, row and column, what was found and what is
-    allowed.
-    """
-    return _read_with_json(_checked_csv_path(path), progress)[0]
+    """Read a plan, or the plan of a recording; raises as `read_recording`."""
+    return _read_with_json(path, progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
-    """Read a plan or a recording: return the plan, and the readings (n_points,) or None.
-
-    Raises FileError if either file cannot be used; it names the file, row and column, what was found and what is
-    allowed.
-    """
-    plan, readings, _ = _read_with_json(_checked_csv_path(path), progress)
-    return plan, readings
+    """Read a plan or a recording: return the plan, and the readings (n_points,) or None; raises as `read_recording`."""
+    return _read_with_json(path, progress)[:2]
 
 
 def write_recording(recording: Recording, path: PathLike) -> None:
@@ -90,7 +79,7 @@ def write_recording(recording: Recording, path: PathLike) -> None:
     """
     require_recording(recording)
     inst = recording.plan.instrumentation
-    largest = math.inf if inst.min is not None and inst.max is not None else LARGEST
+    largest = math.inf if len(inst.declared_ends) == 2 else LARGEST
     readings = _number_cells("readings", recording.readings, largest)
     _write_with_json(recording.plan, checked_path("path", path), plan_columns(recording.plan) | {"reading": readings})
 
@@ -120,7 +109,10 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         raise ParameterError(
             "scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in the order they were taken"
         )
-    names = _scan_names_made_distinct(plan)
+    names: dict[int, str] = {}
+    for k in np.unique(plan.scan).tolist():  # one like the scan's before gains a word, as a file would join the two
+        again = bool(names) and plan.scan_names[k] == names[max(names)]
+        names[k] = plan.scan_names[k] + " (again)" * again
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
@@ -132,14 +124,6 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     if len({plan.sessions[k] for k in names} if plan.sessions else ()) > 1:
         columns[SESSION] = [str(plan.sessions[k]) for k in plan.scan]
     return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
-
-
-def _checked_csv_path(path: object) -> Path:
-    """Return a file name as a Path; raise ParameterError for anything else: a table in memory is the usual mistake."""
-    allowed = (
-        "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"
-    )
-    return checked_path("path", path, allowed)
 
 
 def _degree_cells(angles_rad: FloatArray) -> list[str]:
@@ -155,25 +139,11 @@ def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> li
     return [number_text(value) for value in values.tolist()]
 
 
-def _scan_names_made_distinct(plan: Plan) -> dict[int, str]:
-    """Return the scans' names by number; one like the scan's before gains " (again)", as a file would join the two."""
-    names: dict[int, str] = {}
-    last = ""
-    for k in np.unique(plan.scan):
-        name = plan.scan_names[k]
-        if names and name == last:
-            name += " (again)"
-        names[int(k)] = last = name
-    return names
-
-
 def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
     """Write the images, the description, then the table, each atomically."""
     if path.suffix.lower() == ".json":
         raise ParameterError("path", str(path), "the name of the CSV; the JSON goes beside it")
-    used = {name for name, _ in plan.rows_by_pattern()}
-    unknown = sorted(used - set(plan.patterns))
-    if unknown:
+    if unknown := sorted({name for name, _ in plan.rows_by_pattern()} - set(plan.patterns)):
         raise ParameterError("pattern", unknown[0], "a pattern that plan.patterns describes")
     text = description_text(plan.instrumentation, plan.patterns)
     images = _images_by_file(plan.patterns)
@@ -203,8 +173,11 @@ def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
     return images
 
 
-def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
+def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
     """Read a table and its description: the plan, the readings or None, and notes."""
+    # A table in memory is the usual mistake.
+    allowed = "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), "
+    path = checked_path("path", path, allowed + "Recording.from_arrays(...)")
     if path.suffix.lower() == ".json":
         raise FileError(path, "this is a description", "the name of the CSV beside it")
     known = ("x_mm", "y_mm", "reading")
@@ -225,9 +198,8 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
         notes.append(f"time_s runs backwards at row {table.rows[int(back[0]) + 1]}")
     if "orientation_rad" in table.columns:
         raise FileError(path, "it is in radians", "orientation_deg, in degrees", row=1, column="orientation_rad")
-    orientation_deg = (
-        table.column_of_numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
-    )
+    turned = "orientation_deg" in table.columns
+    orientation_deg = table.column_of_numbers("orientation_deg") if turned else np.zeros(len(table))
     covariates = _covariate_columns(table, description.instrumentation.controls, notes)
     session = covariates.pop(SESSION, np.zeros(len(table)))
     if (wrong := no_session_mask(session, scan)).any():
@@ -248,8 +220,11 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
         sessions=sessions_of_scans(session, scan),
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
-    readings = _readings_column(table, description) if "reading" in table.columns else None
-    return plan, readings, notes
+    if "reading" not in table.columns:
+        return plan, None, notes
+    # With a declared range a huge number is only unusable; without one it would spoil every sum.
+    largest = None if len(plan.instrumentation.declared_ends) == 2 else LARGEST
+    return plan, table.column_of_numbers("reading", missing=True, largest=largest), notes
 
 
 def _notes_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> list[str]:
@@ -263,13 +238,6 @@ def _notes_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> li
     ]
 
 
-def _readings_column(table: CSVTable, description: Description) -> FloatArray:
-    inst = description.instrumentation
-    # With a declared range a huge number is only unusable; without one it would spoil every sum.
-    bounded = inst.min is not None and inst.max is not None
-    return table.column_of_numbers("reading", missing=True, largest=None if bounded else LARGEST)
-
-
 def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
     """Return each row's scan number and the scans' names; every change of name begins a new scan.
 
@@ -280,9 +248,7 @@ def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str,
     cells = table.columns["scan"]
     if "" in cells and any(cells):
         raise FileError(table.path, "the cell is empty", A_SCAN, row=table.rows[cells.index("")], column="scan")
-    changes = np.fromiter(map(operator.ne, cells[1:], cells), dtype=np.int64, count=len(cells) - 1)
-    scan = np.concatenate([[0], np.cumsum(changes)])
-    return scan, tuple(cells[k] for k in (0, *(np.flatnonzero(changes) + 1)))
+    return codes_and_names_of_runs(cells)
 
 
 def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArray:

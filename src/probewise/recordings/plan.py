@@ -25,6 +25,7 @@ from probewise._kinds import checked_finite_number, checked_whole, require_kind,
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
+    A_PATTERN,
     A_SESSION,
     SESSION,
     TableLike,
@@ -35,7 +36,6 @@ from probewise.recordings.columns import (
     numbers_per_reading,
     numeric_covariates_and_notes,
     pattern_codes,
-    patterns_by_name,
     require_patterns,
     scan_codes_and_names,
     selected_row_numbers,
@@ -114,11 +114,9 @@ class Plan:
 
     def __post_init__(self) -> None:
         if len(self.sessions) not in (0, len(self.scan_names)):
-            allowed = f"one number per scan ({len(self.scan_names)}), or none"
-            raise ParameterError("sessions", self.sessions, allowed)
-        object.__setattr__(
-            self, "sessions", tuple(checked_whole("sessions", each, least=0, most=None) for each in self.sessions)
-        )
+            raise ParameterError("sessions", self.sessions, f"one number per scan ({len(self.scan_names)}), or none")
+        sessions = tuple(checked_whole("sessions", each, least=0, most=None) for each in self.sessions)
+        object.__setattr__(self, "sessions", sessions)
         for name in ("scan_names", "pattern_names"):
             names: object = getattr(self, name)
             if isinstance(names, str) or not all(isinstance(n, str) for n in getattr(self, name)):
@@ -212,7 +210,11 @@ class Plan:
         n_points = len(x)
         turns = numbers_per_reading("orientation_rad", orientation_rad, n_points)
         warn_of_likely_degrees("orientation_rad", turns)
-        described = patterns_by_name(patterns)
+        described = dict(patterns) if isinstance(patterns, Mapping) else {"pattern": patterns}
+        if not described:
+            allowed = f"what lay under the sensor, by name: {{'edge': HalfPlane(...), ...}}, or {A_PATTERN}"
+            raise ParameterError("patterns", patterns, allowed)
+        require_patterns(described)
         code, scan_names = scan_codes_and_names(scan, n_points)
         number = numbers_per_reading("session", 0.0 if session is None else session, n_points)
         if (wrong := no_session_mask(number, code)).any():
@@ -277,18 +279,13 @@ class Plan:
         """Select rows (numbers, truth values or a slice), in the given order (scans and patterns keep their names)."""
         rows = selected_row_numbers(rows, len(self))
         kept = np.unique(self.scan[rows])
-        return Plan(
-            x_mm=self.x_mm[rows],
-            y_mm=self.y_mm[rows],
-            orientation_rad=self.orientation_rad[rows],
-            time_s=self.time_s[rows],
+        taken = {name: getattr(self, name)[rows] for name in ("x_mm", "y_mm", "orientation_rad", "time_s", "pattern")}
+        return replace(
+            self,
+            **taken,
             scan=np.searchsorted(kept, self.scan[rows]),
             scan_names=tuple(self.scan_names[k] for k in kept),
-            pattern=self.pattern[rows],
-            pattern_names=self.pattern_names,
-            patterns=self.patterns,
             covariates={name: values[rows] for name, values in self.covariates.items()},
-            instrumentation=self.instrumentation,
             sessions=tuple(self.sessions[k] for k in kept) if self.sessions else (),
         )
 
@@ -500,10 +497,8 @@ class Recording(ShowsItself):
         ok = np.isfinite(self.readings)
         ok[list(self.left_out)] = False
         with np.errstate(invalid="ignore"):
-            if inst.min is not None:
-                ok &= self.readings >= inst.min
-            if inst.max is not None:
-                ok &= self.readings <= inst.max
+            ok &= self.readings >= (-np.inf if inst.min is None else inst.min)
+            ok &= self.readings <= (np.inf if inst.max is None else inst.max)
         return ok
 
     def notes_on_unusable_readings(self) -> tuple[str, ...]:
@@ -516,10 +511,8 @@ class Recording(ShowsItself):
 
     def summary(self) -> str:
         """Summarise the recording in one line: numbers of readings, and notes."""
-        n_usable, unit = int(self.usable.sum()), self.plan.instrumentation.unit
-        first = (
-            f"{len(self)} readings in {unit}, {n_usable} usable" if unit else f"{len(self)} readings, {n_usable} usable"
-        )
+        unit = self.plan.instrumentation.unit
+        first = f"{len(self)} readings{f' in {unit}' if unit else ''}, {int(self.usable.sum())} usable"
         return "; ".join([first, *self.notes])
 
     def with_readings(self, readings: FloatArray) -> Self:

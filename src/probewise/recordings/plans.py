@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,18 +35,8 @@ PATTERNS: dict[str, Pattern] = {
 ORIENTATIONS_DEG = (0, 90, 180, 270)
 QUADRANTS = ("quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d")
 _FULL_BATTERY_MV, _DRAIN_MV_PER_S = 8300.0, 0.12
-
-
-@dataclass(frozen=True)
-class _Scan:
-    """One scan: places (n, 2), patterns (one, or one per reading), seconds per reading, seconds before its first."""
-
-    name: str
-    places_mm: FloatArray
-    patterns: Sequence[str]
-    orientation_deg: float
-    reading_s: float
-    before_s: float
+# Name, places (n, 2), patterns (one, or one per reading), degrees, seconds from one reading to the next.
+_Scan: TypeAlias = tuple[str, FloatArray, tuple[str, ...], float, float]
 
 
 def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
@@ -59,9 +50,9 @@ def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
     sensor between scans, or to change the pattern.
     """
     line = _line_places(-50, 50, 1)
-    scans = [_Scan(f"edge_{deg}", line, ("boundary",), deg, reading_s, break_s) for deg in ORIENTATIONS_DEG]
-    scans.append(_Scan("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s, break_s))
-    return _plan_of_scans(scans)
+    scans: list[_Scan] = [(f"edge_{deg}", line, ("boundary",), deg, reading_s) for deg in ORIENTATIONS_DEG]
+    scans.append(("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s))
+    return _plan_of_scans(scans, break_s)
 
 
 def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
@@ -77,17 +68,15 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
     out, flat = _line_places(-50, 50, 1), _line_places(-40, 40, 8)
     scans: list[_Scan] = []
     for deg in ORIENTATIONS_DEG:
-        back_s = reading_s / 2 if deg >= 180 else reading_s
         scans += [
-            _Scan(f"edge_{deg}_out", out, ("boundary",), deg, reading_s, break_s),
-            _Scan(f"edge_{deg}_back", out[::-1], ("boundary",), deg, back_s, break_s),
-            _Scan(f"white_{deg}", flat, ("white",), deg, reading_s, break_s),
-            _Scan(f"black_{deg}", flat, ("black",), deg, reading_s, break_s),
+            (f"edge_{deg}_out", out, ("boundary",), deg, reading_s),
+            (f"edge_{deg}_back", out[::-1], ("boundary",), deg, reading_s / 2 if deg >= 180 else reading_s),
+            (f"white_{deg}", flat, ("white",), deg, reading_s),
+            (f"black_{deg}", flat, ("black",), deg, reading_s),
         ]
-    along_y = _line_places(60, -60, -2)[:, ::-1] + [-5.0, 0.0]
-    scans.append(_Scan("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s, break_s))
-    scans.append(_Scan("disc_y", along_y, ("disc",), 0, reading_s, break_s))
-    return _plan_of_scans(scans)
+    scans.append(("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s))
+    scans.append(("disc_y", _line_places(60, -60, -2)[:, ::-1] + [-5.0, 0.0], ("disc",), 0, reading_s))
+    return _plan_of_scans(scans, break_s)
 
 
 def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
@@ -117,30 +106,24 @@ def _battery_mv(time_s: FloatArray) -> FloatArray:
     return _FULL_BATTERY_MV - _DRAIN_MV_PER_S * time_s
 
 
-def _plan_of_scans(scans: Sequence[_Scan]) -> Plan:
+def _plan_of_scans(scans: Sequence[_Scan], break_s: float) -> Plan:
     """Join scans to a plan, with the time of each reading and the battery's voltage."""
-    intervals = [np.full(len(s.places_mm), s.reading_s) for s in scans]
-    for scan, interval in zip(scans[1:], intervals[1:], strict=True):
-        interval[0] = scan.before_s
-    time_s = np.round(np.cumsum(np.concatenate(intervals)), 3)
-    places = np.concatenate([s.places_mm for s in scans])
-    counts = [len(s.places_mm) for s in scans]
-    # A scan over one pattern lists it once.
-    named = [
-        name
-        for scan, n in zip(scans, counts, strict=True)
-        for name in (scan.patterns if len(scan.patterns) == n else [scan.patterns[0]] * n)
-    ]
-    patterns = {name: pattern for name, pattern in PATTERNS.items() if name in named}
-    codes = {name: k for k, name in enumerate(patterns)}
+    names, places, named, turns_deg, paces_s = zip(*scans, strict=True)
+    counts = [len(each) for each in places]
+    intervals = np.repeat(np.array(paces_s, dtype=np.float64), counts)
+    intervals[np.cumsum(counts)[:-1]] = break_s
+    time_s = np.round(np.cumsum(intervals), 3)
+    x_mm, y_mm = np.concatenate(places).T
+    under = [name for own, n in zip(named, counts, strict=True) for name in (own if len(own) == n else own * n)]
+    patterns = {name: pattern for name, pattern in PATTERNS.items() if name in under}
     return Plan(
-        x_mm=places[:, 0],
-        y_mm=places[:, 1],
-        orientation_rad=np.repeat([math.radians(s.orientation_deg) for s in scans], counts),
+        x_mm=x_mm,
+        y_mm=y_mm,
+        orientation_rad=np.repeat([math.radians(deg) for deg in turns_deg], counts),
         time_s=time_s,
         scan=np.repeat(np.arange(len(scans)), counts),
-        scan_names=tuple(s.name for s in scans),
-        pattern=np.array([codes[name] for name in named]),
+        scan_names=names,
+        pattern=np.array([list(patterns).index(name) for name in under]),
         pattern_names=tuple(patterns),
         patterns=patterns,
         covariates={"battery_mv": np.round(_battery_mv(time_s))},

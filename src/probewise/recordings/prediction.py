@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 
@@ -33,25 +34,17 @@ class Prediction(ShowsItself):
     readings: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        readings = (
-            read_only_floats(self.readings)
-            if np.size(self.readings)
-            else read_only_floats(np.full(len(self.plan), np.nan))
-        )
-        if readings.shape != (len(self.plan),):
-            raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), one per row")
-        object.__setattr__(self, "readings", readings)
-        for name in ("mean", "sd", "log_density"):
+        if not np.size(self.readings):
+            object.__setattr__(self, "readings", np.full(len(self.plan), np.nan))
+        for name in ("readings", "mean", "sd", "log_density"):
             values = read_only_floats(getattr(self, name))
             if values.shape != (len(self.plan),):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(self.plan)},), one per row")
-            if name != "log_density":
-                require_finite(name, values)
-            elif np.isinf(values).any():
-                raise ParameterError(
-                    name, float(values[np.isinf(values)][0]), "finite numbers, or NaN without a reading"
-                )
             object.__setattr__(self, name, values)
+        require_finite("mean", self.mean)
+        require_finite("sd", self.sd)
+        if np.isinf(self.log_density).any():
+            raise ParameterError("log_density", math.inf, "finite numbers, or NaN without a reading")
         if np.any(self.sd <= 0):
             raise ParameterError("sd", float(self.sd.min()), "greater than 0")
 

@@ -8,6 +8,7 @@ A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. It m
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, singledispatch
 from itertools import pairwise
@@ -187,7 +188,6 @@ class UniformRegion(RegionBatch):
         return np.repeat(self.level[:, None], len(points_mm), axis=1)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels, the level: (n_regions, n_points)."""
         return self.albedo(centers_mm)
 
 
@@ -204,24 +204,21 @@ class HalfPlaneRegion(RegionBatch):
         broadcast_and_freeze_fields(self, normal_rad=(), offset_mm=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        return np.where(self._signed_distance(points_mm) > 0, self.inside, self.outside)
+        return np.where(self.signed_distance_mm(*points_mm.T) > 0, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
-        share = share_inside_half_plane(
-            self._signed_distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm
-        )
-        return self.outside + (self.inside - self.outside) * share
+        away, turn = self.signed_distance_mm(*centers_mm.T), self.normal_rad[:, None] - turn_rad
+        return self.outside + (self.inside - self.outside) * share_inside_half_plane(away, turn, pixel_mm)
 
-    def _signed_distance(self, points_mm: FloatArray) -> FloatArray:
+    def signed_distance_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Return the distance from the edge, positive inside; places broadcast with (n_regions, 1)."""
         normal = self.normal_rad[:, None]
-        return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.offset_mm[:, None]
+        return x_mm * np.cos(normal) + y_mm * np.sin(normal) - self.offset_mm[:, None]
 
 
 @edge_distance.register
 def _edge_distance_of_half_plane(region: HalfPlaneRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    normal = region.normal_rad[:, None]
-    return np.abs(np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.offset_mm[:, None])
+    return np.abs(region.signed_distance_mm(x_mm, y_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +267,6 @@ class PolygonRegion(RegionBatch):
         return np.where(_count_ray_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         share = share_inside_polygon(self.edges_mm, centers_mm, pixel_mm, turn_rad)
         return self.outside + (self.inside - self.outside) * share
 
@@ -380,7 +376,6 @@ class QuadrantRegion(RegionBatch):
         return np.where(beyond.all(axis=-1), self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         reach = pixel_mm + max(1.0, float(np.abs(centers_mm[None] - self.corner_mm[:, None]).max(initial=0.0)))
         x, y = self.corner_mm[:, 0], self.corner_mm[:, 1]
         far_x, far_y = x + 2 * reach * self.direction[:, 0], y + 2 * reach * self.direction[:, 1]
@@ -418,12 +413,12 @@ class EllipseRegion(RegionBatch):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
-        p, q = self._unit_circle_coordinates(points_mm)
+        p, q = self.unit_circle_coordinates(*points_mm.T)
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, the edge taken as straight: (n_regions, n_points)."""
-        p, q = self._unit_circle_coordinates(centers_mm)
+        p, q = self.unit_circle_coordinates(*centers_mm.T)
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         level = np.hypot(p, q)
         # Gradient of the level sqrt(p^2 + q^2); it is zero only at the centre, far from the edge.
@@ -434,11 +429,10 @@ class EllipseRegion(RegionBatch):
         share = share_inside_half_plane(distance, angle - turn_rad, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
-    def _unit_circle_coordinates(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return coordinates in which the edge is the unit circle, each (n_regions, n_points)."""
+    def unit_circle_coordinates(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return coordinates in which the edge is the unit circle; places broadcast with (n_regions, 1)."""
         cosine, sine = np.cos(self.angle_rad)[:, None], np.sin(self.angle_rad)[:, None]
-        dx = points_mm[:, 0] - self.center_mm[:, :1]
-        dy = points_mm[:, 1] - self.center_mm[:, 1:]
+        dx, dy = x_mm - self.center_mm[:, :1], y_mm - self.center_mm[:, 1:]
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         return (cosine * dx + sine * dy) / a, (cosine * dy - sine * dx) / b
 
@@ -464,10 +458,8 @@ def _outlines_of_ellipse(region: EllipseRegion, *, n_vertices: int = 96) -> list
 
 @edge_distance.register
 def _edge_distance_of_ellipse(region: EllipseRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
-    dx, dy = x_mm - region.center_mm[:, :1], y_mm - region.center_mm[:, 1:]
-    p, q = (cosine * dx + sine * dy) / a, (cosine * dy - sine * dx) / b
+    p, q = region.unit_circle_coordinates(x_mm, y_mm)
     level = np.hypot(p, q)
     steepness = np.where(level > 1e-12, np.hypot(p / a, q / b) / np.maximum(level, 1e-12), 1 / np.minimum(a, b))
     return np.asarray(np.abs(level - 1) / steepness)
@@ -494,13 +486,12 @@ class StripesRegion(RegionBatch):
             raise ParameterError("duty", self.duty.tolist(), "0 to 1")
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        share = self._position_along_normal(points_mm) / self.period_mm[:, None]
+        share = self.position_along_normal_mm(*points_mm.T) / self.period_mm[:, None]
         return np.where(share - np.floor(share) < self.duty[:, None], self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         period = self.period_mm[:, None]
-        along = self._position_along_normal(centers_mm)
+        along = self.position_along_normal_mm(*centers_mm.T)
         along = along - period * np.floor(along / period)
         angle = self.normal_rad[:, None] - turn_rad
         share = np.zeros_like(along)
@@ -512,15 +503,15 @@ class StripesRegion(RegionBatch):
             share -= share_inside_half_plane(along - start - self.duty[:, None] * period, angle, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
-    def _position_along_normal(self, points_mm: FloatArray) -> FloatArray:
+    def position_along_normal_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Return how far places are from the first stripe's edge; they broadcast with (n_regions, 1)."""
         normal = self.normal_rad[:, None]
-        return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.phase_mm[:, None]
+        return x_mm * np.cos(normal) + y_mm * np.sin(normal) - self.phase_mm[:, None]
 
 
 @edge_distance.register
 def _edge_distance_of_stripes(region: StripesRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    normal, period = region.normal_rad[:, None], region.period_mm[:, None]
-    along = np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.phase_mm[:, None]
+    period, along = region.period_mm[:, None], region.position_along_normal_mm(x_mm, y_mm)
     edges = (along, along - region.duty[:, None] * period)
     from_rise, from_fall = (np.abs(edge - period * np.round(edge / period)) for edge in edges)
     has_edges = (region.duty > 0) & (region.duty < 1)
@@ -572,7 +563,11 @@ class ImageRegion:
         return 1
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        return self._albedo_at(points_mm[:, 0], points_mm[:, 1])[None]
+        n_rows, n_columns = self.values.shape
+        column, up = (np.floor((points_mm - self.origin_mm) / self.pixel_mm).astype(np.int64)).T
+        row = n_rows - 1 - up
+        within = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
+        return np.where(within, self.values[np.where(within, row, 0), np.where(within, column, 0)], 0.0)[None]
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, (1, n_points): exact if unturned, else by eight strips."""
@@ -591,10 +586,9 @@ class ImageRegion:
             right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
             bottom, top = centers_mm[:, 1] + low, centers_mm[:, 1] + high
             near, far = centers_mm[:, 0] + left, centers_mm[:, 0] + right
-            total += self._albedo_integral_to_lower_left(far, top) - self._albedo_integral_to_lower_left(near, top)
-            total -= self._albedo_integral_to_lower_left(far, bottom) - self._albedo_integral_to_lower_left(
-                near, bottom
-            )
+            integral = self._albedo_integral_to_lower_left
+            total += integral(far, top) - integral(near, top)
+            total -= integral(far, bottom) - integral(near, bottom)
             area += (right - left) * (high - low)
         return (total / area)[None]
 
@@ -615,14 +609,6 @@ class ImageRegion:
         lower = (1 - u) * table[i, j] + u * table[i, j + 1]
         upper = (1 - u) * table[i + 1, j] + u * table[i + 1, j + 1]
         return np.asarray(((1 - v) * lower + v * upper) * self.pixel_mm**2)
-
-    def _albedo_at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        n_rows, n_columns = self.values.shape
-        column = np.floor((x_mm - self.origin_mm[0]) / self.pixel_mm).astype(np.int64)
-        row = n_rows - 1 - np.floor((y_mm - self.origin_mm[1]) / self.pixel_mm).astype(np.int64)
-        within = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
-        found = self.values[np.where(within, row, 0), np.where(within, column, 0)]
-        return np.where(within, found, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -652,15 +638,15 @@ class RegionsOfMixedKinds(RegionBatch):
         return [(rows, part) for rows, part in pairs if rows.size]
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        out = np.empty((self.n_regions, len(points_mm)))
-        for rows, part in self.rows_and_regions():
-            out[rows] = part.albedo(points_mm)
-        return out
+        return self._joined(len(points_mm), lambda part: part.albedo(points_mm))
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        out = np.empty((self.n_regions, len(centers_mm)))
+        return self._joined(len(centers_mm), lambda part: part.coverage(centers_mm, pixel_mm, turn_rad))
+
+    def _joined(self, n_points: int, of: Callable[[Region], FloatArray]) -> FloatArray:
+        out = np.empty((self.n_regions, n_points))
         for rows, part in self.rows_and_regions():
-            out[rows] = part.coverage(centers_mm, pixel_mm, turn_rad)
+            out[rows] = of(part)
         return out
 
 

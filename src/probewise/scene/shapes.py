@@ -7,7 +7,7 @@ one short class: a frozen dataclass with `prior` and `region`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Protocol, runtime_checkable
@@ -131,16 +131,17 @@ class PlacedPrior:
         return margin, size - margin
 
 
-def _require_bounds_fit_field(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
-    """Raise ParameterError unless 0 < low < high and, with `reach`, both sides of the field exceed 2 * reach * high."""
+def _require_bounds_fit_field(shape: Circle | Ellipse | Rectangle | RegularPolygon, name: str, reach: float) -> None:
+    """Raise ParameterError unless 0 < low < high and, kept inside, both sides of the field exceed 2 * reach * high."""
+    field, bounds = shape.field, getattr(shape, name)
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
     if not 0 < low < high < math.inf:
         raise ParameterError(name, bounds, "0 < low < high, finite")
-    if reach is not None and 2 * (reach_mm := reach * high) >= min(field.width_mm, field.height_mm):
+    if shape.inside and 2 * reach * high >= min(field.width_mm, field.height_mm):
         raise ParameterError(
-            f"{shape}(inside=True)",
-            f"up to {2 * reach_mm:g} mm wide",
+            f"{type(shape).__name__}(inside=True)",
+            f"up to {2 * reach * high:g} mm wide",
             f"less than the field's {field.width_mm:g} x {field.height_mm:g} mm (or inside=False)",
         )
 
@@ -164,8 +165,7 @@ class Circle:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        reach = 1.0 if self.inside else None
-        _require_bounds_fit_field("Circle", "radius_mm", self.radius_mm, self.field, reach=reach)
+        _require_bounds_fit_field(self, "radius_mm", 1.0)
 
     @cached_property
     def prior(self) -> PlacedPrior:
@@ -230,8 +230,7 @@ class Ellipse:
     symmetry_turn: ClassVar[SymmetryTurn] = SymmetryTurn(np.pi, angle=4)
 
     def __post_init__(self) -> None:
-        reach = 1.0 if self.inside else None
-        _require_bounds_fit_field("Ellipse", "semi_axes_mm", self.semi_axes_mm, self.field, reach=reach)
+        _require_bounds_fit_field(self, "semi_axes_mm", 1.0)
 
     @cached_property
     def prior(self) -> PlacedPrior:
@@ -269,8 +268,7 @@ class Rectangle:
     symmetry_turn: ClassVar[SymmetryTurn] = SymmetryTurn(np.pi / 2, angle=4, swapped=(2, 3))
 
     def __post_init__(self) -> None:
-        reach = 1 / math.sqrt(2) if self.inside else None
-        _require_bounds_fit_field("Rectangle", "sides_mm", self.sides_mm, self.field, reach=reach)
+        _require_bounds_fit_field(self, "sides_mm", 1 / math.sqrt(2))
 
     @cached_property
     def prior(self) -> PlacedPrior:
@@ -299,8 +297,7 @@ class RegularPolygon:
 
     def __post_init__(self) -> None:
         checked_whole("n_sides", self.n_sides, least=3)
-        reach = 1.0 if self.inside else None
-        _require_bounds_fit_field("RegularPolygon", "radius_mm", self.radius_mm, self.field, reach=reach)
+        _require_bounds_fit_field(self, "radius_mm", 1.0)
 
     @cached_property
     def prior(self) -> PlacedPrior:
@@ -319,12 +316,9 @@ class RegularPolygon:
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build the polygons of the hypotheses, one per row of theta (n_samples, 4)."""
-        corners = self._unit_corners() * theta[:, None, 2:3]
-        return _turned_polygon(theta[:, :2], corners, theta[:, 3])
-
-    def _unit_corners(self) -> FloatArray:
         t = 2 * np.pi * np.arange(self.n_sides) / self.n_sides
-        return np.stack([np.cos(t), np.sin(t)], axis=-1)
+        corners = np.stack([np.cos(t), np.sin(t)], axis=-1) * theta[:, None, 2:3]
+        return _turned_polygon(theta[:, :2], corners, theta[:, 3])
 
 
 def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: FloatArray) -> PolygonRegion:
@@ -372,31 +366,32 @@ class _AnyOfPrior:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         u = checked_columns(u, self.names)
-        ends = np.concatenate([[0.0], np.cumsum(self.weights)])
         theta = np.empty_like(u)
-        theta[:, 0] = np.interp(u[:, 0], ends, np.arange(len(ends)))
-        which = self.shape_index(theta)
-        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
-            values = shape.prior.from_unit_cube(u[:, columns])
-            # Every shape fills its own columns; the selected shape fills the shared ones.
-            own = columns > len(self.shared)
-            theta[:, columns[own]] = values[:, own]
-            taken = which == k
-            theta[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
+        theta[:, 0] = np.interp(u[:, 0], self._ends, np.arange(len(self._ends)))
+        self._fill(theta, self.shape_index(theta), [shape.prior.from_unit_cube for shape in self.shapes.values()], u)
         return theta
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        ends = np.concatenate([[0.0], np.cumsum(self.weights)])
         u = np.empty_like(theta)
-        u[:, 0] = np.interp(theta[:, 0], np.arange(len(ends)), ends)
-        which = self.shape_index(theta)
-        for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns_by_shape, strict=True)):
-            values = shape.prior.to_unit_cube(theta[:, columns])
-            own = columns > len(self.shared)
-            u[:, columns[own]] = values[:, own]
-            taken = which == k
-            u[np.ix_(taken, columns[~own])] = values[np.ix_(taken, ~own)]
+        u[:, 0] = np.interp(theta[:, 0], np.arange(len(self._ends)), self._ends)
+        self._fill(u, self.shape_index(theta), [shape.prior.to_unit_cube for shape in self.shapes.values()], theta)
         return u
+
+    @cached_property
+    def _ends(self) -> FloatArray:
+        return np.concatenate([[0.0], np.cumsum(self.weights)])
+
+    def _fill(
+        self, out: FloatArray, which: IntArray, maps: Sequence[Callable[[FloatArray], FloatArray]], values: FloatArray
+    ) -> None:
+        """Fill the columns of `out`, (n_samples, n_params), but the first with each shape's map of `values`."""
+        for k, (mapped_by, columns) in enumerate(zip(maps, self.columns_by_shape, strict=True)):
+            mapped = mapped_by(values[:, columns])
+            # Every shape fills its own columns; the selected shape fills the shared ones.
+            own = columns > len(self.shared)
+            out[:, columns[own]] = mapped[:, own]
+            taken = which == k
+            out[np.ix_(taken, columns[~own])] = mapped[np.ix_(taken, ~own)]
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         which = self.shape_index(theta)

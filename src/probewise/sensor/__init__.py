@@ -5,11 +5,7 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 """
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
-from probewise.sensor.commanded import (
-    COMMANDED,
-    footprint_at_height_ratio,
-    with_declared_height_commanded,
-)
+from probewise.sensor.commanded import COMMANDED, with_declared_height_commanded
 from probewise.sensor.discrete import mean_albedo_by_pixels
 from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bend_coefficients, free_form_theta, is_free_form
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians
@@ -64,7 +60,6 @@ __all__ = [
     "Stage",
     "View",
     "bend_coefficients",
-    "footprint_at_height_ratio",
     "footprint_of",
     "free_form_theta",
     "is_free_form",

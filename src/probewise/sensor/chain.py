@@ -167,23 +167,20 @@ class Chain:
         or a height is commanded of a `DiscreteSSF`.
         """
         plan = self.plan_at_calibrated_height(plan)
-        at_once = self._n_hypotheses_at_once(theta, plan)
+        at_once = len(theta)
+        if any(effect.stage == Stage.FOOTPRINT for effect in self.effects):  # fewer, for memory
+            at_once = max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
         if at_once < len(theta):
             blocks = (theta[first : first + at_once] for first in range(0, len(theta), at_once))
             return np.concatenate([self.predict(block, plan) for block in blocks])
         view = self.simulated_view(theta, plan)
-        plain = not self.effects and not has_commanded_height_or_led(plan)
-        return (
-            self._readings_without_effects(view.seen, theta)
-            if plain
-            else self.readings_from_simulated_view(view, theta, plan)
-        )
-
-    def _n_hypotheses_at_once(self, theta: FloatArray, plan: Plan) -> int:
-        """Return how many hypotheses to predict in one block: fewer, for memory, with effects on the footprint."""
-        if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
-            return len(theta)
-        return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
+        if self.effects or has_commanded_height_or_led(plan):
+            return self.readings_from_simulated_view(view, theta, plan)
+        i_min, i_max = self._levels_from_theta(theta)
+        reading = view.seen if len(view.seen) == len(theta) else np.repeat(view.seen, len(theta), axis=0)
+        reading *= i_max - i_min
+        reading += i_min
+        return reading
 
     def readings_from_simulated_view(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
         """Compute readings from a result of `simulated_view`, (n_samples, n_points): the stages from SEEN on.
@@ -203,18 +200,6 @@ class Chain:
     def _levels_from_theta(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         n_ssf = len(self.ssf.names)
         return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
-
-    def _readings_without_effects(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
-        """Compute readings from R where no effect acts; overwrites `seen`."""
-        i_min, i_max = self._levels_from_theta(theta)
-        reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)
-        reading *= i_max - i_min
-        reading += i_min
-        return reading
-
-    def white_fraction(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return the white fraction R seen before effects at stage SEEN or later, (n_samples or 1, n_points)."""
-        return self.simulated_view(theta, plan).seen
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> View:
         """Return the sensor's view of the scene: the stages of `predict` before SEEN, with their effects."""
@@ -292,7 +277,7 @@ class Chain:
         start = NoiseParameters(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
             return start
-        start = replace(start, seen=self.white_fraction(theta, plan))
+        start = replace(start, seen=self.simulated_view(theta, plan).seen)
         noise: NoiseParameters = self._stage_applier(theta, plan)(Stage.NOISE, start)
         return noise
 
@@ -358,11 +343,7 @@ class RegionsAndPoses:
     @cached_property
     def rows_and_regions_outside_batches(self) -> list[tuple[IntArray, Region]]:
         """The other regions, not in `straight_batches`, as pairs of row indices and region, split by orientation."""
-        taken = (
-            np.concatenate([part.rows for part in self.straight_batches])
-            if self.straight_batches
-            else np.empty(0, dtype=np.int64)
-        )
+        taken = [row for part in self.straight_batches for row in part.rows.tolist()]
         return [
             (group, region)
             for rows, region in self.rows_and_regions

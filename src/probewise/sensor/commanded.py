@@ -91,23 +91,15 @@ def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint
     return footprint if ratio is None else _scaled_footprint(footprint, ratio[None, :])
 
 
-def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footprint:
-    """Scale the footprint by h/h0, (n_samples or 1, n_points), and divide its brightness by the square.
-
-    Ratios are clipped to 0.1 to 10.
-    """
-    # A fit may try heights that no arm can take: the result only has to stay finite.
-    return _scaled_footprint(footprint, np.clip(ratio, 0.1, 10.0))
-
-
 def footprint_at_added_height(footprint: Footprint, added: FloatArray, plan: Plan) -> Footprint:
     """Scale the footprint for a height `added` to the commanded one, in h0, (n_samples or 1, n_points).
 
     The given footprint is that at the commanded height h, so it is scaled by (h + added h0) / h; h0 is the
-    description's.
+    description's, and the factor is clipped to 0.1 to 10.
     """
     commanded = height_ratio(plan)
-    return footprint_at_height_ratio(footprint, 1 + (added if commanded is None else added / commanded))
+    # A fit may try heights that no arm can take: the result only has to stay finite.
+    return _scaled_footprint(footprint, np.clip(1 + (added if commanded is None else added / commanded), 0.1, 10.0))
 
 
 def _scaled_footprint(footprint: Footprint, ratio: FloatArray) -> Footprint:

@@ -65,6 +65,11 @@ class LabGaussian:
         """The shape that the arrays broadcast to."""
         return np.broadcast_shapes(*(a.shape for a in self._arrays()))
 
+    @property
+    def centre_and_covariance(self) -> tuple[FloatArray, ...]:
+        """The Gaussian's centre x and y in the lab frame, and its var_x, var_y, cov_xy."""
+        return (self.x_mm + self.dx_mm, self.y_mm + self.dy_mm, self.var_x, self.var_y, self.cov_xy)
+
     def _arrays(self) -> tuple[FloatArray, ...]:
         return (self.x_mm, self.y_mm, self.dx_mm, self.dy_mm, self.var_x, self.var_y, self.cov_xy)
 
@@ -131,35 +136,20 @@ def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_node
     )
     shape = np.broadcast_shapes(gaussian.shape, (region.n_regions, 1))
     out = np.empty(shape)
-    x, y = (
-        np.broadcast_to(gaussian.x_mm + gaussian.dx_mm, shape),
-        np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
-    )
+    x, y, var_x, var_y, cov = (np.broadcast_to(a, shape) for a in gaussian.centre_and_covariance)
     steps = np.arange(-26.0, 27.0) / 4
     for i, j in np.ndindex(*shape):
-        cov = np.array(
-            [
-                [_broadcast_entry(gaussian.var_x, i, j), _broadcast_entry(gaussian.cov_xy, i, j)],
-                [_broadcast_entry(gaussian.cov_xy, i, j), _broadcast_entry(gaussian.var_y, i, j)],
-            ]
-        )
-        variance, axes = np.linalg.eigh(cov)
+        variance, axes = np.linalg.eigh([[var_x[i, j], cov[i, j]], [cov[i, j], var_y[i, j]]])
         sd = np.sqrt(variance)
         # Square pixels along the principal axes, hence more of them along the longer one.
         n_long = int(np.ceil(6.5 * sd[1] / sd[0] * 4))
         long_steps = np.arange(-n_long, n_long + 1) * sd[0] / 4
-        short_steps = steps * sd[0]
-        grid = np.stack(np.meshgrid(short_steps, long_steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        grid = np.stack(np.meshgrid(steps * sd[0], long_steps, indexing="ij"), axis=-1).reshape(-1, 2)
         weight = np.exp(-0.5 * np.sum((grid / sd) ** 2, axis=1))
-        centers = np.array([x[i, j], y[i, j]]) + grid @ axes.T
         turn = np.full(len(grid), np.arctan2(axes[1, 0], axes[0, 0]))
-        share = region.coverage(centers, sd[0] / 4, turn)[i if region.n_regions > 1 else 0]
-        out[i, j] = share @ weight / weight.sum()
+        share = region.coverage(np.array([x[i, j], y[i, j]]) + grid @ axes.T, sd[0] / 4, turn)
+        out[i, j] = share[i if region.n_regions > 1 else 0] @ weight / weight.sum()
     return out
-
-
-def _broadcast_entry(array: FloatArray, i: int, j: int) -> float:
-    return float(array[i if array.shape[0] > 1 else 0, j if array.shape[1] > 1 else 0])
 
 
 def _albedo_by_share_inside(outside: float, inside: float, share: FloatArray) -> FloatArray:
@@ -547,21 +537,10 @@ def _mean_albedo_over_mixed_regions(region: RegionsOfMixedKinds, gaussian: LabGa
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return an image's mean albedo: exact along x in each row of pixels, by Gauss-Legendre in panels across it."""
-    shape = gaussian.shape
-    out = np.empty(shape)
-    x, y = (
-        np.broadcast_to(gaussian.x_mm + gaussian.dx_mm, shape),
-        np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
-    )
-    for i, j in np.ndindex(*shape):
-        out[i, j] = _image_albedo_under_one_gaussian(
-            region,
-            float(x[i, j]),
-            float(y[i, j]),
-            _broadcast_entry(gaussian.var_x, i, j),
-            _broadcast_entry(gaussian.var_y, i, j),
-            _broadcast_entry(gaussian.cov_xy, i, j),
-        )
+    arrays = np.broadcast_arrays(*gaussian.centre_and_covariance)
+    out = np.empty(gaussian.shape)
+    for at in np.ndindex(out.shape):
+        out[at] = _image_albedo_under_one_gaussian(region, *(float(array[at]) for array in arrays))
     return out
 
 

@@ -35,7 +35,7 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
 
     `theta`: columns a_n, u_n, v_n (mm), A_n, B_n, C_n (1/mm^2), shape (n_samples, 6 n_gaussians); `n_gaussians`: number
     of Gaussians, N. Returns footprint with arrays (n_samples, 1, n_gaussians). Raises ParameterError if A, AB - C^2 or
-    the total mass is not positive. Single amplitudes may be negative; ShapeError if theta has another number of
+    the total mass is not positive (single amplitudes may be negative); ShapeError if theta has another number of
     columns.
     """
     if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:

@@ -62,12 +62,6 @@ def test_every_package_that_is_documented_is_offered():
     assert all(hasattr(probewise, name) for name in listed)
 
 
-def test_every_verb_has_its_place_on_the_page_of_the_command_line():
-    page = (Path(__file__).parents[2] / "docs" / "reference" / "cli.md").read_text(encoding="utf-8")
-    headings = {line.removeprefix("## ").split()[0] for line in page.splitlines() if line.startswith("## ")}
-    assert set(VERBS) <= headings
-
-
 def test_what_the_api_pages_lead_with_is_public():
     leads = tomllib.loads((Path(__file__).parents[2] / "docs" / "reference" / "leads.toml").read_text())
     assert "run" in leads["probewise.nested"]

@@ -27,13 +27,6 @@ def prior(n_gaussians: int, *, by_mass: bool) -> SSFPrior:
 CASES = pytest.mark.parametrize(("n_gaussians", "by_mass"), [(1, False), (1, True), (2, False), (3, True)])
 
 
-@CASES
-def test_the_unit_cube_is_found_again(n_gaussians: int, by_mass: bool) -> None:
-    belief = prior(n_gaussians, by_mass=by_mass)
-    u = np.random.default_rng(1).random((50, len(belief.names)))
-    assert belief.to_unit_cube(belief.from_unit_cube(u)) == pytest.approx(u, abs=1e-9)
-
-
 def coordinates(belief: SSFPrior, *, whole: bool) -> MomentCoordinates | WholeFootprintCoordinates:
     return WholeFootprintCoordinates(belief, (1.0, 0.5), 20.0) if whole else belief.coordinates
 

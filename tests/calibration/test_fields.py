@@ -31,12 +31,6 @@ def test_the_mean_field_is_the_weighted_mean_of_the_fields_on_one_grid() -> None
     np.testing.assert_allclose(both.cov_mm2, total, rtol=5e-3)
 
 
-def test_the_field_has_a_pixel_centred_on_the_mechanical_origin() -> None:
-    field = posterior_mean_ssf_field(ONE, 1, pixel_mm=0.2)
-    assert np.abs(field.u_mm).min() < 1e-9
-    assert np.abs(field.v_mm).min() < 1e-9
-
-
 def test_a_footprint_too_wide_for_the_grid_gets_wider_pixels() -> None:
     wide = ONE * [1, 1, 1, 1e-4, 1e-4, 1e-4]
     field = posterior_mean_ssf_field(wide, 1, pixel_mm=0.1, max_pixels=101)

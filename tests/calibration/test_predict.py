@@ -110,14 +110,15 @@ def test_blocks_of_samples_and_repeated_rows_change_nothing(
     np.testing.assert_allclose(whole.mean[:21], whole.mean[21:])
 
 
-def test_effects_that_carry_over_act_on_the_prediction(
+def test_effects_carry_over_but_those_of_single_scans_do_not(
     sensor: FittedSensor, make_sensor: Callable[..., FittedSensor]
 ) -> None:
     """Gear play of 2 mm shifts a one-way scan by 1 mm."""
-    loose = make_sensor(effects=("backlash",), extra={"backlash.width_mm": 2.0})
+    extra = {"scan_misplacement.offset_mm": 5.0, "backlash.width_mm": 2.0}
     plan = paper_plan().take(np.arange(101))
+    found = predict(make_sensor(effects=("scan_misplacement", "backlash"), extra=extra), plan)
     shifted = replace(plan, x_mm=plan.x_mm - 1.0)
-    np.testing.assert_allclose(predict(loose, plan).mean, predict(sensor, shifted).mean, rtol=1e-12)
+    np.testing.assert_allclose(found.mean, predict(sensor, shifted).mean, rtol=1e-12)
 
 
 def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
@@ -156,14 +157,6 @@ def test_a_sensor_file_of_before_counts_from_0(make_sensor: Callable[..., Fitted
     for damaged in (3, {"backlash": {"time_s": 3.0}}):
         with pytest.raises(FileError):
             FittedSensor.from_json(json.dumps(document | {"origins": damaged}))
-
-
-def test_effects_of_single_scans_do_not_carry_over(make_sensor: Callable[..., FittedSensor]) -> None:
-    extra = {"scan_misplacement.offset_mm": 5.0, "backlash.width_mm": 2.0}
-    bound = make_sensor(effects=("scan_misplacement", "backlash"), extra=extra)
-    loose = make_sensor(effects=("backlash",), extra={"backlash.width_mm": 2.0})
-    plan = paper_plan().take(np.arange(101))
-    np.testing.assert_allclose(predict(bound, plan).mean, predict(loose, plan).mean, rtol=1e-12)
 
 
 def test_the_mean_field_and_the_parameters_predict_alike(sensor: FittedSensor) -> None:
@@ -231,11 +224,8 @@ def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_senso
         predict(sags, replace(plan, covariates={}))
 
 
-def test_readings_that_do_not_match_the_plan_are_refused(sensor: FittedSensor) -> None:
+def test_a_plan_without_rows_predicts_nothing_and_readings_that_do_not_match_are_refused(sensor: FittedSensor) -> None:
     with pytest.raises(ShapeError, match="one per row"):
         predict(sensor, _disc_plan(), np.zeros(3))
-
-
-def test_a_plan_without_rows_predicts_nothing(sensor: FittedSensor) -> None:
     plan = _disc_plan().take(np.array([], dtype=int))
     assert len(predict(sensor, Recording(plan, np.array([])).plan)) == 0

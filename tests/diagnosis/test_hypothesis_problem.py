@@ -16,6 +16,7 @@ from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import Extent
+from probewise.nested.repartition import repartitioned
 from probewise.recordings import Recording, paper_plan
 
 PLAN = paper_plan().take(np.arange(0, 408, 8))
@@ -89,7 +90,7 @@ def test_the_evidence_of_two_gaussians_is_the_same_folded():
     truth, error = np.log(likelihood.mean()), likelihood.std() / likelihood.mean() / np.sqrt(len(likelihood))
     problem = SimpleNamespace(prior=prior, log_likelihood=of)
     first = nested.run(problem, rng=rng, n_live=200)
-    second = nested.run(nested.repartitioned(problem, first.samples(2000, rng=rng)), rng=rng, n_live=200)
+    second = nested.run(repartitioned(problem, first.samples(2000, rng=rng)), rng=rng, n_live=200)
     for found in (first, second):
         assert abs(found.log_z - truth) < 4 * np.hypot(found.log_z_error, error)
 

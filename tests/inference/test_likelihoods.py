@@ -78,14 +78,6 @@ def test_the_integral_over_sigma_is_what_quadrature_gives(n: int, rms: float) ->
     assert got == pytest.approx(by_quadrature(n * rms**2, n, 0.05, 60.0), rel=1e-9, abs=1e-8)
 
 
-def test_student_t_falls_smoothly_with_the_residual() -> None:
-    """No jump where the closed form changes branches."""
-    square = np.concatenate([[0.0], np.geomspace(1e-300, 1e300, 20_000)])
-    values = log_sigma_integral(square, 7, 0.1, 10.0)
-    assert np.isfinite(values).all()
-    assert (np.diff(values) <= 1e-9 * np.abs(values[1:])).all()
-
-
 def test_student_t_is_a_normalised_density_of_one_reading() -> None:
     """With a proper prior of sigma one reading says something, and its density integrates to one."""
     one = StudentT(np.zeros(1), 0.5, 20.0)
@@ -109,14 +101,6 @@ def test_student_t_multiplies_over_data_sets() -> None:
         for g in (2, 4, 9)
     )
     assert whole == pytest.approx(parts, abs=1e-12)
-
-
-def test_student_t_with_many_readings_ranks_as_the_paper_does() -> None:
-    """Far from both bounds the ratio of likelihoods is [S1 / S2]^(-N/2), paper's N - 1 being N with prior 1/sigma."""
-    readings = np.zeros(50)
-    predicted = np.array([1.0, 2.0])[:, None] * np.ones(50)
-    got = StudentT(np.zeros(50), 1e-3, 1e3).log_prob(readings, predicted)
-    assert got[0] - got[1] == pytest.approx(25 * math.log(4.0), abs=1e-9)
 
 
 def test_gaussian_likelihoods_add_up_normal_densities() -> None:

@@ -155,18 +155,6 @@ def test_a_run_stopped_after_every_round_ends_as_one_never_stopped(name: str, mo
     assert (problem.n_calls, problem.n_hypotheses) == (1, 1)
 
 
-def test_a_run_stopped_once_at_any_round_ends_as_one_never_stopped(tmp_path: Path) -> None:
-    states: list[RoundSummary] = []
-    whole = quiet(problems.plateau(), n_live=40, progress=states.append)
-    for k in range(1, len(states) + 1):
-        options = {"n_live": 40, "checkpoint": tmp_path / f"{k}.npz", "checkpoint_every_s": NEVER}
-        with pytest.raises(Stop):
-            quiet(problems.plateau(), progress=stopper(k), **options)
-        seen: list[RoundSummary] = []
-        assert_same(quiet(problems.plateau(), progress=seen.append, **options), whole)
-        assert seen == states[k:]
-
-
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize("name", ["plateau", "half impossible", pytest.param("SSF", marks=pytest.mark.slow)])
 def test_a_run_interrupted_within_rounds_ends_as_one_never_interrupted(name: str, move: str, path: Path) -> None:

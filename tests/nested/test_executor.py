@@ -5,11 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import multiprocessing
-import os
-import signal
-import subprocess
 import sys
-import textwrap
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -259,79 +255,3 @@ def test_a_problem_that_cannot_be_sent_is_told_how_to(processes: Executor) -> No
     problem = problems.Known(problems.box(2, 0, 1), lambda t: t[:, 0], 0.0)
     with pytest.raises(NotConvergedError, match=r"cannot be sent to the executor's workers .*without lambdas; or take"):
         run(problem, rng=rng(), n_live=50, executor=processes, n_workers=2)
-
-
-INTERRUPTED = """
-import multiprocessing, sys, time
-from concurrent.futures import {pool}
-import numpy as np
-import slopes_for_workers
-
-class Slow(slopes_for_workers.Slope):
-    def log_likelihood(self, theta):
-        time.sleep(0.005)
-        return super().log_likelihood(theta)
-
-def tell(state):
-    print("round", flush=True)
-
-def main():
-    from probewise.nested import run  # workers do without
-
-    context = dict(mp_context=multiprocessing.get_context("{start}")) if "{start}" else {{}}
-    with {pool}(2, **context) as pool:
-        result = run(Slow(), rng=np.random.default_rng(1), n_live=50, executor=pool, n_workers=4, progress=tell,
-                     checkpoint=sys.argv[1])
-    print(result.stop_reason, flush=True)
-
-if __name__ == "__main__":
-    main()
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends Ctrl-C otherwise")
-@pytest.mark.parametrize(
-    ("pool", "start", "everybody"),
-    [
-        ("ProcessPoolExecutor", "fork", True),
-        ("ProcessPoolExecutor", "spawn", False),
-        ("ProcessPoolExecutor", "spawn", True),
-        ("ProcessPoolExecutor", "forkserver", True),
-        ("ThreadPoolExecutor", "", True),
-    ],
-)
-def test_ctrl_c_ends_the_run_and_every_worker(
-    pool: str, start: str, everybody: bool, slopes: ModuleType, tmp_path: Path
-) -> None:
-    """A terminal sends it to every process; whoever starts the program, `kill -INT`, to the first alone.
-
-    The output ends when the last process that could write to it has ended.
-    """
-    script, path = tmp_path / "interrupted.py", tmp_path / "run.npz"
-    script.write_text(textwrap.dedent(INTERRUPTED).format(pool=pool, start=start))
-    folder = str(Path(str(slopes.__file__)).parent)
-    begun = subprocess.Popen(
-        [sys.executable, "-W", "ignore", str(script), str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([folder, *sys.path])},
-        start_new_session=True,
-        text=True,
-        # Where the tests run in the background, SIGINT is ignored, and a child would inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    try:
-        assert begun.stdout is not None
-        assert [begun.stdout.readline() for _ in range(2)] == ["round\n"] * 2
-        if everybody:
-            os.killpg(begun.pid, signal.SIGINT)
-        else:
-            begun.send_signal(signal.SIGINT)
-        out, err = begun.communicate(timeout=60)
-    except BaseException:
-        os.killpg(begun.pid, signal.SIGKILL)
-        begun.communicate()
-        raise
-    assert (begun.returncode, out.splitlines()[-1:]) == (0, ["interrupted"]), err
-    assert path.exists()

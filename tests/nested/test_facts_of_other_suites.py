@@ -144,18 +144,6 @@ def test_a_funnel_cut_by_the_cube_has_its_evidence_by_two_routes() -> None:
     assert abs(distance(run(near, rng=seeded(6, 2), n_live=100, max_cost=1), log_z)) < N_ERRORS
 
 
-def test_a_corner_with_nine_tenths_impossible_has_its_evidence() -> None:
-    """nautilus: L = 0 below x = 0.9 and x - 0.9 above; Z = 0.005 and x has density 2 (x - 0.9) / 0.01."""
-
-    def function(theta: np.ndarray) -> np.ndarray:
-        over = theta[:, 0] - 0.9
-        return np.where(over > 0, np.log(np.maximum(over, 1e-300)), -np.inf)
-
-    result = run(Posed(box(2, 0, 1), function), rng=seeded(7), n_live=300, max_cost=1)
-    assert abs(distance(result, math.log(0.005))) < N_ERRORS
-    assert_distributed(thinned(result, 200, seeded(7, 1))[:, 0], lambda x: ((x - 0.9) / 0.1) ** 2)
-
-
 def test_a_likelihood_that_says_nothing_gives_back_the_prior() -> None:
     """bilby: with a constant likelihood every parameter's samples pass a Kolmogorov-Smirnov test against its prior."""
     prior = Product({"level": Uniform(-2.0, 5.0), "scale": LogUniform(1e-3, 10.0), "offset": Normal(3.0, 0.5)})

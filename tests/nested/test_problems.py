@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from nested_sampling import compare, problems, seeds, ssf
-from nested_sampling.ours import ours
-from nested_sampling.sampler import Counted, Outcome
+from nested_sampling import problems, seeds, ssf
 from scipy.special import logsumexp
 
 
@@ -124,47 +122,3 @@ def test_the_summary_of_seeds_passes_a_right_sampler_and_fails_a_wrong_one(rng: 
     assert not biased["held"]
     assert not biased["checks_held"]
     assert not seeds.summarise(_lines(rng, 400, factor=1.5), known)["held"]
-
-
-def test_evaluations_are_counted_and_samples_follow_the_weights() -> None:
-    counted = Counted(problems.plateau())
-    found = ours(counted, 0, 30)
-    assert found.n_evaluations == counted.n_evaluations > 30
-    two = Outcome(0.0, 0.1, 5, np.array([[1.0], [2.0]]), np.log([1.0, 3.0]))
-    assert two.samples(400, 0).mean() == pytest.approx(1.75)
-    assert two.n_eff == pytest.approx(1.6)
-    assert two.mean(two.theta[:, 0])[0] == pytest.approx(1.75)
-
-
-def test_the_comparison_names_the_best_correct_peer() -> None:
-    """Three seeds each, worked out by hand: a fast peer that is wrong is no measure."""
-
-    def line(sampler: str, offset: float, cpu_s: float, seed: int) -> dict[str, object]:
-        return {
-            "problem": "plateau",
-            "sampler": sampler,
-            "seed": seed,
-            "status": "ok",
-            "log_z": 3.0 + offset,
-            "log_z_error": 0.1,
-            "n_evaluations": 1000,
-            "cpu_s": cpu_s,
-            "compiling_s": 0.0,
-            "n_live": 100,
-            "information": 2.0,
-            "worst_check": 1.0,
-        }
-
-    lines = [
-        line(name, offset, cpu, seed)
-        for name, offset, cpu in (("ours", 0.1, 1.0), ("right", -0.2, 10.0), ("wrong", 1.0, 0.1))
-        for seed in range(3)
-    ]
-    lines.append({"problem": "plateau", "sampler": "slow", "seed": 0, "status": "DNF"})
-    rows = {row["sampler"]: row for row in compare.summarise(lines, {"plateau": (3.0, 0.0)})}
-    assert [rows[name]["correct"] for name in ("ours", "right", "wrong", "slow")] == [True, True, False, False]
-    assert rows["ours"]["cpu_s_ratio"] == pytest.approx(0.1)
-    assert rows["ours"]["work"] == pytest.approx(1000 * 0.1**2)
-    assert rows["ours"]["work_ratio"] == pytest.approx(0.25)
-    assert rows["ours"]["per_nat"] == pytest.approx(5.0)
-    assert "DNF" in compare.table(rows.values())

@@ -108,16 +108,6 @@ def test_quantiles_of_equal_weights_are_the_plain_ones(result: NestedResult) -> 
         plain.mean(lambda t: t.sum())
 
 
-def test_the_cost_is_counted_for_each_live_point_and_nat(result: NestedResult) -> None:
-    each = result.calls_per_live_point_and_nat
-    assert each * result.n_live * result.information == pytest.approx(result.n_calls)
-    assert each > 1
-    assert f"{each:.3g} for each live point and nat" in result.summary()
-    nothing = dataclasses.replace(result, information=0.0)
-    assert nothing.calls_per_live_point_and_nat == np.inf
-    assert "for each" not in nothing.summary()
-
-
 def test_arrays_of_other_lengths_are_refused(result: NestedResult) -> None:
     for name in ("label", "birth_label", "n_at_death", "log_weight"):
         with pytest.raises(ShapeError, match=rf"{name} has shape \(1,\).*one per row of theta"):

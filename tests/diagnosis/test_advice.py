@@ -22,7 +22,6 @@ from probewise.diagnosis.advice import (
     is_settled,
     measurement_separating_rivals,
     mutual_information_lower_bound,
-    slopes_split_by_run,
 )
 from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, rows_by_command
 from probewise.diagnosis.fit import Model
@@ -43,7 +42,6 @@ from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 from probewise.systems import Noise, RunTable, Simulator
-from probewise.systems.forms import bind_forms
 
 SPOT = fixed_mixture(np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0]))  # a Gaussian of sd 5 mm
 
@@ -75,11 +73,6 @@ def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
     assert bound <= entropy + 1e-12
     if apart == 8.0:
         assert bound == pytest.approx(entropy, abs=0.02)
-
-
-def test_the_same_predictions_tell_nothing():
-    one = predictives(0, 1.0)[0]
-    assert mutual_information_lower_bound([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_prediction_that_ran_away_tells_nothing_and_gives_no_warning():
@@ -191,15 +184,6 @@ def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
     (pattern,) = (turned.patterns[name] for name, _ in turned.rows_by_pattern())
     assert pattern.normal_rad == pytest.approx(edge.normal_rad + math.pi / 2)
     np.testing.assert_allclose(read_by(turned), read_by(plan)[at], atol=1e-12)
-
-
-def test_a_sheet_moved_aside_reads_the_same_as_far_aside():
-    plan = paper_plan()
-    moved = laid(plan, "boundary_by_30_mm_near")
-    back = replace(moved, x_mm=moved.x_mm - 30.0, patterns={**moved.patterns, "boundary_by_30_mm": HalfPlane(0.0, 0.0)})
-    np.testing.assert_allclose(read_by(moved), read_by(back), atol=1e-12)
-    # The readings around the edge: it is among them, and not at their end.
-    assert moved.x_mm[5] < 30.0 < moved.x_mm[-6]
 
 
 def test_along_an_edge_there_is_nothing_to_lay_otherwise():
@@ -356,20 +340,10 @@ def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
 
 APPARATUS = SimulatorApparatus(ABOUT)
 NULL = Model(cast(Any, ABOUT.system), (), cast(Any, TABLE))
-OFFSETS = NULL.with_effect(cast(Any, bind_forms(ABOUT)["offset_per_run"]))
-PLAN = APPARATUS.plan_of_alternatives(APPARATUS.candidate_measurements(cast(Any, TABLE))[:2], cast(Any, TABLE))
-FIRST = np.flatnonzero(PLAN.scan == 0)
 
 
 def rival_of_new_runs(model: Model, z: np.ndarray, root: float = 1e-9) -> Rival:
     return Rival("a", model, z, root * np.eye(len(z)), 0.5, APPARATUS.coordinates_of_new_run(model))
-
-
-def test_a_new_run_begins_where_the_prior_says():
-    """`start_c` has the prior sd 5, and one value in all rows of a run; the other run has another."""
-    spread = rival_of_new_runs(NULL, ABOUT.z).predictive_distribution(PLAN, 0.05).covariance - np.eye(len(PLAN))
-    np.testing.assert_allclose(spread[np.ix_(FIRST, FIRST)], (5 / 0.05) ** 2, rtol=1e-3)
-    np.testing.assert_allclose(np.delete(spread[FIRST], FIRST, axis=1), 0.0, atol=1e-3)
 
 
 def test_the_values_of_recorded_runs_tell_nothing_of_a_new_one():
@@ -398,17 +372,6 @@ def test_the_gain_of_the_heater_tells_as_much_as_a_run_with_its_own_start_can():
         own = np.append(apart[rows], 0.0)
         left += float(np.sum((own - ones * (ones @ own) / (ones @ ones)) ** 2))
     assert asked.expected_log_bayes_factor == pytest.approx(left / 2, rel=0.02)
-
-
-def test_an_effect_with_a_value_per_run_has_another_one_in_a_new_run():
-    of_run = APPARATUS.coordinates_of_new_run(OFFSETS)
-    np.testing.assert_array_equal(of_run, [2, 3, 4, 5, 6, 7])
-    z = np.append(ABOUT.z, [1.0, -0.5, 0.2])
-    _, slopes = OFFSETS.predict_and_differentiate(z, PLAN)
-    shared, own = slopes_split_by_run(slopes, of_run, PLAN)
-    assert not shared[:, of_run].any()
-    assert (np.count_nonzero(own[FIRST], axis=0) > 0).sum() >= 2  # its start and its offset
-    np.testing.assert_allclose(own.sum(axis=1), slopes[:, of_run].sum(axis=1))
 
 
 def simulate(p, data):
@@ -456,19 +419,3 @@ def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so(dia
         assert f"{name} (0.48)" in diagnosis.reason
     assert diagnosis.reason.endswith(f"; {nothing}.")
     assert diagnosis.next_measurement is None
-
-
-def test_aliases_promise_no_readings_where_the_fit_absorbs_all_that_they_change(diagnosis):
-    aliases = {alias.effects: alias for alias in diagnosis.judged.aliases}
-    absorbed = [("depends:off:temp_c", "sensitivity:temp_c"), ("differs:slope", "input_gain:x")]
-    for effects in absorbed:
-        assert (aliases[effects].settle_by, aliases[effects].readings) == (
-            diagnosis.apparatus.words.settles_nothing,
-            0,
-        )
-
-
-def test_the_offset_of_a_new_day_is_not_known_to_any_rival(diagnosis):
-    assert len(COMPARED) > 1
-    for rival in COMPARED:
-        assert {*rival.of_run} >= {1, 2, 3}

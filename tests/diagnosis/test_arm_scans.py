@@ -33,13 +33,6 @@ def test_without_hands_all_scans_are_over_what_lies_there():
     assert len(offered) < len(LightSensorApparatus().candidate_measurements(plan))
 
 
-def test_a_sensor_that_only_a_hand_can_turn_stays_as_it_is():
-    plan = without_controls()
-    last_rad = plan.orientation_rad[np.argmax(plan.time_s)]
-    for scan in LightSensorApparatus(hands=False).candidate_measurements(plan):
-        np.testing.assert_allclose(scan.plan.orientation_rad, last_rad)
-
-
 def test_a_scan_that_returns_after_a_whole_turn_is_the_same_scan_at_the_same_orientation():
     """It is neither offered twice, nor a value of the covariate `orientation`."""
     plan = two_way_plan()

@@ -16,7 +16,7 @@ from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
-from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
+from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FreeLevels, FreeMixture
@@ -81,11 +81,6 @@ def test_the_smallest_size_leaves_lambda_eight():
     assert share * np.linalg.norm(trace) / expected.sd == pytest.approx(8.0, rel=0.05)
 
 
-def test_going_both_ways_tells_play_from_an_edge_that_lies_elsewhere():
-    assert sights_of(thinned(paper_plan()))[2] > 0.999
-    assert sights_of(thinned(two_way_plan(), 8))[2] < 0.1
-
-
 @pytest.mark.slow
 def test_what_a_cure_claims_is_seen_after_all_of_it():
     audit = audit_plan(thinned(paper_plan()))
@@ -122,15 +117,6 @@ def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
     plan = audit.cure_plan
     assert plan is not None
     assert {name for name, _ in plan.rows_by_pattern()} <= plan.patterns.keys()
-
-
-@pytest.mark.slow
-def test_a_flat_surface_shows_no_edge():
-    plan = thinned(paper_plan())
-    flat = replace(plan, patterns=dict.fromkeys(plan.patterns, Uniform(1.0)))
-    detectability = {effect.name: effect.detectability for effect in audit_plan(flat).effects}
-    assert detectability["backlash"] == detectability["edge_misplacement"] == "invisible"
-    assert detectability["ambient_gradient"] != "invisible"
 
 
 def test_only_what_the_apparatus_can_command_is_asked_for():
@@ -173,16 +159,6 @@ def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_c
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
     both = join_plans([replace(able, covariates={"battery_mv": gone}), dark])
     assert (both.covariates["battery_mv"][len(plan) :] == gone[-2]).all()
-
-
-def test_a_plan_over_other_patterns_keeps_them_behind_another():
-    plan = paper_plan()
-    quadrants, edge = plan.take(np.arange(404, 408)), plan.take(np.arange(101))
-    other = replace(edge, pattern_names=("tile",), pattern=np.zeros(101, dtype=int), patterns={"tile": Uniform(0.3)})
-    both = join_plans([quadrants, other])
-    assert [name for name, _ in both.rows_by_pattern()] == [*(f"quadrant_{k}" for k in "abcd"), "tile"]
-    assert both.patterns["tile"] == Uniform(0.3)
-    assert {both.pattern_names[k] for k in both.pattern[4:]} == {"tile"}
 
 
 def test_a_plan_over_a_pattern_that_is_not_described_is_refused():

@@ -42,21 +42,6 @@ def test_a_gaussian_in_halves_predicts_the_same():
     np.testing.assert_allclose(np.sort(mixed.chain.predict(mixed.theta, PLAN)[:, 150]), expected, rtol=1e-10)
 
 
-def test_orders_are_mixed_by_their_probability():
-    null = default_sensor(EXTENT, 2)
-    mixed = mix([samples_of(1), samples_of(2)], np.array([0.3, 0.7]), null, PLAN, rng=np.random.default_rng(3))
-    of_one = int(np.sum(mixed.noise_sd == 1.0))
-    # Four sd of a binomial of 500: fails by chance once in 16,000 seeds.
-    assert of_one == pytest.approx(150, abs=4 * np.sqrt(500 * 0.3 * 0.7))
-    assert dataclasses.replace(mixed).theta.shape == (500, 14)
-
-
-def test_one_order_alone_stays_as_it_is():
-    one = samples_of(2)
-    alone = mix([one], np.ones(1), default_sensor(EXTENT, 2), PLAN, rng=np.random.default_rng(0))
-    np.testing.assert_array_equal(np.sort(alone.theta, axis=0), np.sort(one.theta, axis=0))
-
-
 @pytest.mark.parametrize("name", [n for n, e in BUILT.items() if e is not None and e.nothing])
 def test_an_effect_at_nothing_does_nothing(name):
     """In a prediction, and in the noise of one."""
@@ -75,15 +60,6 @@ def test_an_effect_at_nothing_does_nothing(name):
     for share in ("sd", "rho", "wide_share", "lost_share", "step"):
         here, there = np.broadcast_arrays(getattr(level, share), getattr(plain, share))
         np.testing.assert_allclose(here, there, err_msg=share)
-
-
-def test_no_lag_is_none_where_the_clock_stands_still():
-    """Two readings at one time: nothing has waited, and still nothing is held back."""
-    plan = dataclasses.replace(PLAN, time_s=2.0 * (np.arange(len(PLAN)) // 2))
-    samples = samples_of(1, 5)
-    chain = default_sensor(EXTENT, 1).chain(plan, (BUILT["lag"],), n_nodes=ACCURATE_NODES)
-    theta = np.concatenate([samples.theta, np.zeros((5, 1))], axis=1)
-    np.testing.assert_allclose(chain.predict(theta, plan), samples.chain.predict(samples.theta, plan), atol=1e-9)
 
 
 def with_effect(name: str, n_gaussians: int, mark: float) -> ModelSamples:
@@ -172,11 +148,6 @@ def test_a_users_own_effect_is_mixed_in_only_where_the_best_has_it():
     cached, fits = samples(said, own=frozenset({"drift"}))
     assert ("drift",) not in cached.compatible_probabilities(fits[0, ("lag",)])
     assert cached.compatible_probabilities(fits[0, ("drift",)])["drift",] == pytest.approx(0.4)
-
-
-def test_the_best_stands_alone_where_the_verdict_has_no_probability_for_any():
-    cached, fits = samples({(("unknown",), ()): 1.0})
-    assert cached.compatible_probabilities(fits[0, ("lag",)]) == {("lag",): 1.0}
 
 
 _DIAGNOSIS_OF_EQUAL_RIVALS = """

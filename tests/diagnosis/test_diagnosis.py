@@ -6,7 +6,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
 from probewise.diagnosis.diagnosis import _weighing_json
@@ -19,15 +18,6 @@ from probewise.scene import Circle
 
 JUDGED = Judged("clean", (), 0.4, (Hypothesis((), 1.0),))
 FOUND = Diagnosis(None, JUDGED, None, (), None, VerdictReport("All is explained.", (), None), None)
-
-
-def test_what_is_read_most_is_at_hand():
-    assert (FOUND.verdict, FOUND.reason, FOUND.p_value) == ("clean", "All is explained.", 0.4)
-
-
-def test_a_name_that_never_was_is_no_attribute():
-    with pytest.raises(AttributeError, match="credibility"):
-        FOUND.credibility  # noqa: B018
 
 
 def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():

@@ -20,10 +20,8 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.refits import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
-from probewise.diagnosis.templates import _gram_eigensystems
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
-from probewise.priors import SharedScalePrior
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.systems import Simulator, table_for
 
@@ -50,25 +48,6 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     assert log_probability_effects_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(
         expected, abs=0.1 + 0.02 * abs(expected)
     )
-
-
-def test_a_fit_without_effects_is_as_it_is():
-    model = Model(default_sensor(EXTENT, 1), (), PLAN)
-    predicted, slopes = model.predict_and_differentiate(np.zeros(7))
-    found = Fit(model, np.zeros(7), predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
-    assert log_probability_effects_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0
-
-
-@pytest.mark.parametrize("width", [1, 2, 3])
-def test_closed_forms_are_those_of_the_general_solver(width):
-    columns = np.random.default_rng(3).standard_normal((50, 9, width))
-    if width > 1:
-        columns[0, :, 1] = columns[0, :, 0] * 2  # one axis only
-        columns[1] = 0.0
-    squares = columns.transpose(0, 2, 1) @ columns
-    values, axes = _gram_eigensystems(squares)
-    assert np.sort(values, axis=1) == pytest.approx(np.linalg.eigvalsh(squares), abs=1e-12)
-    assert (axes * values[:, None, :]) @ axes.transpose(0, 2, 1) == pytest.approx(squares, abs=1e-12)
 
 
 N = 2000
@@ -159,13 +138,6 @@ def test_nodes_that_are_close_enough_stay_as_they_are():
         assert refined(found, evidence) is evidence
 
 
-def test_a_noise_far_behind_is_not_refined():
-    found, recording = _found_with(WHITE + np.cumsum(0.9 * RNG.normal(size=N)))
-    evidence = laplace_evidence(found, NoiseModel((RandomWalk(),), recording))
-    assert refined(found, evidence, least=evidence.log_z + 100) is evidence
-    assert refined(found, evidence, least=evidence.log_z) is not evidence
-
-
 def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
     """AR(1) of correlation .75 whose innovations are sometimes wide: every third node of it was 20 nats too low."""
     n = 300
@@ -191,7 +163,6 @@ def test_a_fit_at_the_edge_of_its_formula_is_impossible_under_any_noise():
 
 
 N_RUNS, N_EACH = 12, 30
-_X = 0
 _RUN = np.repeat(np.arange(N_RUNS), N_EACH)
 
 
@@ -275,12 +246,3 @@ def test_a_run_held_out_is_expected_to_differ_as_much_as_the_others():
         exact[-1] -= norm.logpdf(held, rest.mean(), rest.std()).sum()
     assert found.per_reading * found.n_readings == pytest.approx(sum(exact), abs=10)
     assert found.per_reading > apart.per_reading
-
-
-def test_many_runs_keep_priors_of_their_own():
-    simulator = Simulator("y", "V", {"mean": (-50, 50)}, simulate=lambda p, u: p["mean"] + 0 * u["x"], run="run")
-    run = np.repeat(np.arange(40.0), 3)
-    readings = np.random.default_rng(0).standard_normal(len(run))
-    prepared = prepare_system(simulator, table_for(simulator, {"x": run % 7, "run": run, "y": readings}))
-    (form,) = prepared.effects["offset_per_run"].variants()
-    assert not isinstance(form.prior, SharedScalePrior)

@@ -11,8 +11,6 @@ import pytest
 
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.engine import diagnose_prepared
-from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.search.search import needs_more_than_memoryless_noise, search
 from probewise.diagnosis.search.searched import Posterior
 from probewise.diagnosis.verdict import run_global_test
@@ -51,27 +49,6 @@ def test_a_square_wave_is_no_pair_of_sinusoids():
     # The rest of each period with the other sign is the same wave.
     assert abs(values["a"]) == pytest.approx(0.23, abs=0.05)
     assert values["share"] == pytest.approx(0.35 if values["a"] > 0 else 0.65, abs=0.02)
-
-
-@pytest.mark.slow
-def test_two_sinusoids_are_named_as_two():
-    found = _diagnosed(
-        lambda u: 0.15 * np.sin(2 * np.pi * u["t_s"] / 23.0) + 0.15 * np.sin(2 * np.pi * u["t_s"] / 9.3), seed=2
-    )
-    assert found.verdict == "named"
-    assert sorted(found.combination) == ["interference", "interference~again"]
-
-
-@pytest.mark.slow
-def test_a_product_of_columns_is_no_pair_of_names():
-    def change(u):
-        return 0.015 * (u["damp"] - u["damp"].mean()) * (u["room"] - u["room"].mean())
-
-    found = _diagnosed(change, seed=3)
-    assert found.verdict == "unknown"
-    (product,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
-    assert "damp" in product.expression
-    assert "room" in product.expression
 
 
 def _prepared_with_climate(change, *, seed=5, **more):
@@ -129,11 +106,6 @@ def test_products_are_of_time_and_the_columns_that_vary_most():
     assert {"level", "row", "run", "bench"} <= {c.name for c in found}
     chosen = [c.name for c in prepared.apparatus.multiplied_covariates(found)]
     assert chosen == ["x", "temp", "damp", *(f"c{k}" for k in range(7))]
-
-
-def test_a_light_sensor_multiplies_no_columns():
-    columns = [Covariate(name, np.arange(5.0), np.arange(5)) for name in ("battery_mv", "room_c")]
-    assert LightSensorApparatus().multiplied_covariates(columns) == ()
 
 
 @pytest.mark.parametrize(

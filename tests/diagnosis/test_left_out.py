@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from probewise.diagnosis import diagnose_system, fit_simulator
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import Linearised, laplace_evidence
+from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.diagnosis.held_out import held_out_gain
@@ -89,13 +89,6 @@ def test_one_sentinel_is_noise_and_neither_model_is_bent_by_it():
         assert np.median(model.noise_sd) == pytest.approx(0.1, rel=0.3)
     predicted = predict_system(repaired_of(diagnosis), oven(), rng=np.random.default_rng(1))
     assert predicted.sd.max() < 0.2
-
-
-@pytest.mark.parametrize("row", ["r0", "m1"])
-def test_a_moderate_outlier_at_an_end_of_a_run_is_no_jump_and_no_delay(row):
-    true = {"r0": 20.0, "m1": 72.1}[row]
-    diagnosis = diagnose_system(OVEN, oven(**{row: true + 2}), rng=np.random.default_rng(1))
-    assert (diagnosis.verdict, diagnosis.combination) == ("noise", ("outliers",))
 
 
 def test_a_fit_says_which_row_it_leaves_out_and_which_one_bends_it():
@@ -192,29 +185,6 @@ def _without(prepared, rows):
     return replace(white_noise_of_recording(prepared.recording), lost=lost)
 
 
-def test_a_signal_that_rests_at_an_end_has_no_offset():
-    """By night half of the noise is cut off; what is left has a mean of 0.4 sds, which is no signal."""
-    rng = np.random.default_rng(3)
-    light = 800 * np.maximum(0.0, np.sin(np.arange(300) / 12))
-    lux = np.maximum(0.0, 0.1 * light + rng.normal(0, 3.0, 300))
-    meter = Simulator(
-        "lux",
-        "lx",
-        {"gain": (0, 1), "offset": ("normal", 0, 10)},
-        simulate=lambda p, u: p["offset"] + p["gain"] * u["light"],
-        noise={"sd": 3.0, "range": (0, None)},
-    )
-    prepared, found, _ = _fitted(meter, RunTable({"light": light, "lux": lux}))
-    _, offset = prepared.null.theta(found.z[None, :])[0]
-    covariance = np.linalg.inv(found.slopes.T @ found.slopes / found.sd**2 + np.eye(2))
-    assert abs(offset) < 4 * 10 * np.sqrt(covariance[1, 1])
-    assert abs(found.sd / 3.0 - 1) < 4 / np.sqrt(2 * 150)
-    assert any(
-        "left out near an end of the declared range, which cuts off the noise" in note
-        for note in prepared.recording.notes
-    )
-
-
 def test_readings_that_stand_below_the_declared_end_stay():
     """Those of a meter that stops at 900 lx: the fit does not explain them by the end at 1000 lx."""
     table = _lamp(most=900.0)
@@ -241,15 +211,6 @@ def test_an_advised_row_beyond_the_range_tells_nothing():
     _, slopes = Model(system, (), plan).predict_and_differentiate(_coordinates_of(system, TRUE_LIMITED))
     assert not slopes[:2].any()
     assert slopes[2].all()
-
-
-def test_a_reading_beyond_an_end_takes_no_change_that_is_added():
-    _, found, law = _fitted(LAMP, _lamp())
-    problem = Linearised.of(found, law)
-    beyond = found.residuals == 0
-    assert beyond.sum() > 5
-    assert not problem.whiten(np.ones((len(beyond), 1)))[beyond].any()
-    assert problem.whiten(np.ones((len(beyond), 1)))[~beyond].all()
 
 
 def test_a_predicted_mean_is_within_the_range_and_a_reading_at_its_end_is_sure_there():
@@ -293,23 +254,6 @@ def test_a_held_out_reading_at_an_end_gains_nothing_by_another_noise(carry):
     assert abs(dict(gain.by_scan)["at the end"]) < 1e-12
 
 
-def test_readings_that_are_all_at_the_ends_are_refused():
-    table = _lamp().with_columns({"lux": np.where(np.arange(150) % 2, HIGH, 0.0)})
-    with pytest.raises(ParameterError, match="readings within the declared range is 0; allowed: 12 or more"):
-        prepare_system(LAMP, table)
-
-
-def test_an_end_that_no_reading_reaches_leaves_nothing_out_however_wrong_the_simulator_is():
-    rng = np.random.default_rng(2)
-    x, w = rng.uniform(0, 10, 300), rng.uniform(0, 6, 300)
-    line = {"y": 10 + 4 * x + 28 * np.sin(w) + rng.normal(0, 0.2, 300), "x": x}
-    simulator = Simulator(
-        "y", "V", {"a": (-50, 50), "b": (0, 10)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
-        noise={"range": (-30, 90)},
-    )  # fmt: skip
-    assert prepare_system(simulator, table_for(simulator, line), with_effects=False).recording.usable.all()
-
-
 def test_a_walk_is_no_explanation_of_readings_at_an_end_that_the_simulator_does_not_predict_there():
     rng = np.random.default_rng(0)
     x, w = np.tile(np.linspace(0, 10, 60), 2), np.repeat([0.0, 1.0], 60)
@@ -333,19 +277,6 @@ def test_too_few_readings_within_the_range_are_refused_in_one_line():
     )  # fmt: skip
     with pytest.raises(ParameterError, match="readings within the declared range is 5; allowed: 12 or more"):
         prepare_system(simulator, table_for(simulator, {"x": x, "y": y}))
-
-
-def test_a_rounded_reading_at_a_declared_end_is_no_stop():
-    rng = np.random.default_rng(5)
-    x = np.linspace(0, 10, 300)
-    y = np.round(np.minimum(1 + 0.5 * x + rng.normal(0, 0.05, 300), 4.0951), 2)
-    simulator = Simulator(
-        "y", "V", {"a": (-10, 10), "b": (0, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
-        noise={"range": (0, 4.0951), "step": 0.01},
-    )  # fmt: skip
-    prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": y}), with_effects=False)
-    assert prepared.apparatus.stop is None
-    assert prepared.recording.censored.sum() > 50
 
 
 SLOPES_DEG = (6.0, 10.0, 14.0, 20.0)

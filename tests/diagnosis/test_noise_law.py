@@ -16,7 +16,7 @@ from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise
-from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value, rough_sd
+from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value
 from probewise.effects import Extent
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
@@ -162,37 +162,11 @@ def test_one_reading_at_an_end_of_the_declared_range_is_lost(value, lost):
         assert log_z["Dropouts"] == -math.inf
 
 
-def test_two_readings_that_agree_say_more_than_one_at_an_end():
-    rng = np.random.default_rng(16)
-    noise = SD * rng.normal(size=N)
-    dark, bright = np.argsort(MEAN)[:1], np.argsort(MEAN)[-2:]
-    noise[dark], noise[bright] = 100.0 - MEAN[dark], 37.0 - MEAN[bright]
-    found, recording = found_with(noise)
-    law = laplace_evidence(
-        found, NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
-    ).likeliest_law
-    np.testing.assert_array_equal(np.flatnonzero(law.lost), np.sort(bright))
-
-
 def test_the_prior_of_what_is_lost_to_sums_to_one():
     """Of a hundred cells of the range two are its ends, each of them likely."""
     others = 98 * math.exp(log_prior_of_lost_value(37.0, 100.0, (0.0, 100.0)))
     assert others + 2 * math.exp(log_prior_of_lost_value(100.0, 100.0, (0.0, 100.0))) == pytest.approx(1.0)
     assert log_prior_of_lost_value(100.0, 100.0, ()) == -math.log(100.0)
-
-
-def test_an_own_effect_may_lose_readings_too():
-    class Blind(Dropouts):
-        name = "blind"
-
-        def apply(self, value, theta, plan):
-            return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
-
-    noise = SD * np.random.default_rng(5).normal(size=N)
-    noise[[30, 90, 200]] = -MEAN[[30, 90, 200]]
-    found, recording = found_with(noise)
-    law = laplace_evidence(found, NoiseModel((Blind(), Dropouts()), recording, least_sd=1e-6)).likeliest_law
-    np.testing.assert_array_equal(np.flatnonzero(law.lost), [30, 90, 200])
 
 
 class OfDeclaredSds(Recording):
@@ -221,19 +195,6 @@ def test_where_nothing_is_lost_there_is_no_such_law():
     evidence = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
     assert evidence.log_z == -math.inf
     assert evidence.nodes.laws == ()
-
-
-def test_a_law_of_some_scans_is_that_of_the_whole():
-    found, recording = found_with(np.zeros(N))
-    law = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(found.predicted).laws[20]
-    rows = PLAN.scan == 1
-    r = np.random.default_rng(7).normal(size=N)
-    np.testing.assert_allclose(law.take_readings(rows)(r[rows]), law(r)[rows])
-
-
-def test_the_rough_sd_needs_no_model():
-    _, recording = found_with(SD * np.random.default_rng(8).normal(size=N))
-    assert rough_sd(recording) == pytest.approx(SD, rel=0.2)
 
 
 @pytest.mark.slow

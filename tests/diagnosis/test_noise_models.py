@@ -41,16 +41,6 @@ def test_a_walk_is_whitened_as_the_root_of_its_covariance_does():
     assert law.half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
 
 
-def test_what_is_kept_of_a_walk_has_walked_over_what_is_left_out():
-    rng = np.random.default_rng(1)
-    walk = rng.uniform(0.1, 1.0, 20)
-    law = NoiseLaw(np.ones(20), np.zeros(20), np.zeros(20, dtype=bool), walk=walk)
-    kept = rng.random(20) < 0.6
-    gone = np.cumsum(walk)[kept]
-    covariance = np.minimum(gone[:, None], gone) + np.eye(kept.sum())
-    assert law.take_readings(kept).half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
-
-
 def test_draws_of_a_walk_scatter_as_it_says():
     level = replace(
         RandomWalk(n_before=0).apply(
@@ -88,13 +78,6 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
         each = math.log(0.5) + gammaln(45) + 45 * np.log(2 / left) - logs @ np.array(counts, dtype=float)
         brute.append(logsumexp(each) - math.log(40_000))
     assert laplace == pytest.approx(logsumexp(brute) - math.log(5), abs=0.1)
-
-
-def test_one_run_has_no_noise_per_run_to_tell():
-    nodes, weights = NoisePerRun(("all",), (30,)).weighed_nodes(
-        np.ones(30), FittedReadings(np.zeros(30), 1.0, np.zeros(30, dtype=np.int64))
-    )
-    assert len(nodes) == len(weights) == 0
 
 
 SIMULATOR = Simulator(
@@ -169,28 +152,6 @@ def test_mixed_runs_have_the_noise_of_the_same_runs_one_after_the_other():
         noise_statistics(columns, steps, columns[:, 0], before=before),
         noise_statistics(columns[order], steps[order], columns[order, 0]),
     )
-
-
-def test_a_run_held_out_of_mixed_runs_leaves_the_others_as_they_were():
-    recording = _recording()
-    _, law = _law(recording)
-    out = recording.plan.scan[recording.usable] == 2
-    r = np.random.default_rng(4).normal(size=len(out))
-    np.testing.assert_allclose(law.take_readings(~out)(r[~out]), law(r)[~out])
-    np.testing.assert_allclose(law.take_readings(out)(r[out]), law(r)[out])
-
-
-def test_without_a_reading_in_between_the_next_has_its_correlation_with_the_one_before():
-    """As where runs are not mixed: `take` does not know how many rows it leaves out."""
-    recording, together = _recording(), _recording(SORTED)
-    order = order_by_scan(recording)
-    (_, law), (_, other) = _law(recording), _law(together)
-    kept = np.ones(len(order), dtype=bool)
-    kept[order[[13, 24]]] = False
-    r = np.random.default_rng(5).normal(size=len(order))
-    found = np.zeros(len(order))
-    found[kept] = law.take_readings(kept)(r[kept])
-    np.testing.assert_allclose(found[order][kept[order]], other.take_readings(kept[order])(r[order][kept[order]]))
 
 
 @pytest.mark.parametrize("left_out", ["first", "first two", "from the first on"])

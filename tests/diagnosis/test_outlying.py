@@ -11,13 +11,12 @@ from scipy.stats import betabinom
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, block_log_bayes_factors
+from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
 from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import Covariate, significant_places, window_columns_and_bounds
 from probewise.diagnosis.noise_law import NoiseLaw, white_noise
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
-from probewise.diagnosis.templates import TemplateBank
 from probewise.recordings import Recording, paper_plan
 from probewise.systems import Simulator, table_for
 from probewise.world.spots import Blob, gaussian_spot
@@ -38,19 +37,6 @@ def fit_of_noise() -> tuple[Fit, Fit]:
     found = Fit(cast(Any, None), np.array([0.3, -0.2]), np.zeros(N), residuals, slopes, 1.0, 0.0)
     kept = replace(found, predicted=found.predicted[~LOST], residuals=residuals[~LOST], slopes=slopes[~LOST])
     return found, kept
-
-
-def test_lost_readings_change_no_bayes_factor():
-    templates = [np.cos(np.pi * TIME[:, None] / N * np.arange(1, k + 1)) for k in (1, 3, 8, 24)]
-    both = []
-    for found, law, rows in zip(fit_of_noise(), (LAW, WITHOUT), (np.full(N, True), ~LOST), strict=True):
-        problem, columns = Linearised.of(found, law), [t[rows] for t in templates]
-        bank = TemplateBank.of(columns, ["a"] * len(columns), len(problem.law.sd))
-        blocks = OrthonormalBlocks.of(problem, columns)
-        by_blocks = block_log_bayes_factors(blocks, problem.residual[:, None], problem.n_kept)
-        np.testing.assert_allclose(bank.log_bayes_factors(problem), by_blocks)
-        both.append(by_blocks)
-    np.testing.assert_allclose(*both)
 
 
 def test_lost_readings_change_neither_the_noise_sd_nor_the_significance_of_a_window():
@@ -120,14 +106,6 @@ def test_the_evidence_is_that_of_two_beta_binomials_against_one():
 
 def _choose(n: int, k: int) -> float:
     return float(np.prod([(n - i) / (k - i) for i in range(k)])) if k else 1.0
-
-
-def test_together_speaks_for_it_and_scattered_against_it():
-    together, scattered = np.zeros(N_OF_OUTLYING), np.zeros(N_OF_OUTLYING)
-    together[100:108] = 1.0
-    scattered[np.arange(7, N_OF_OUTLYING, 15)] = 1.0
-    assert clustering_log_bayes_factors(together, [PLACE])["place, far out"] > 8
-    assert clustering_log_bayes_factors(scattered, [PLACE])["place, far out"] < 0
 
 
 def test_what_is_in_the_tail_follows_bayes_rule():

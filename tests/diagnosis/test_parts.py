@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.stats import multivariate_normal
 
 from probewise.arm import readings_of_recording, recording_of_readings
 from probewise.diagnosis.aliases import Alias, projected_cosine
@@ -17,22 +16,19 @@ from probewise.diagnosis.evidence import (
     SCALES,
     Linearised,
     OrthonormalBlocks,
-    average_over_amplitude_scales,
     block_log_bayes_factors,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
-from probewise.diagnosis.noise_law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
-from probewise.effects.noise import CorrelatedNoise
-from probewise.effects.reference import candidate_scan_groups, sign_of_motion
+from probewise.effects.reference import candidate_scan_groups
 from probewise.errors import ParameterError
 from probewise.recordings import (
     HalfPlane,
@@ -84,16 +80,6 @@ def test_an_effect_of_scans_of_which_one_has_no_usable_reading_is_located_in_the
     assert [place.scan for place in placed(bound, change, change, kept, [scans])] == ["s2"]
 
 
-def test_where_nearly_all_readings_move_one_way_hysteresis_shows_in_those_at_rest():
-    """An offset of all that move is absorbed by the levels."""
-    plan = line().plan
-    kept = plan.take(np.r_[0:12, 12])  # of the second scan a single reading
-    effect = VOCABULARY["hysteresis"].for_extent(Extent(0.0, 1.0, kept))
-    change = 3.0 * sign_of_motion(kept)
-    (place,) = placed(effect, change, change, kept, [])
-    assert (place.covariate, place.start, place.end) == ("direction", 0.0, 0.0)
-
-
 @pytest.mark.parametrize("n_gaussians", [1, 2, 3])
 def test_sensor_coordinates_round_trip(n_gaussians):
     sensor = default_sensor(EXTENT, n_gaussians)
@@ -133,20 +119,6 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
         sensor_from_posterior(("x",), np.zeros(1), np.eye(1))
 
 
-@pytest.mark.parametrize("unit", [1e-12, 1e9])
-def test_an_earlier_sensor_becomes_the_prior_of_the_same_spread_in_any_unit(unit):
-    """Levels in amperes are as well known as in picoamperes."""
-    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
-    mean, sd = (
-        np.array([0.02, 1, 2, 0.01, 0.012, 0.001, 10, 60]),
-        np.array([1e-3, 0.05, 0.05, 3e-4, 3e-4, 1e-4, 0.1, 0.2]),
-    )
-    in_unit = np.array([1.0] * 6 + [unit] * 2)
-    one, other = (sensor_from_posterior(names, size * mean, np.diag((size * sd) ** 2)) for size in (1.0, in_unit))
-    z = np.random.default_rng(0).normal(size=(100, 7))
-    np.testing.assert_allclose(other.theta(z), in_unit * one.theta(z), rtol=1e-6)
-
-
 def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     free = with_free_form(default_sensor(EXTENT, 1))
     rng = np.random.default_rng(0)
@@ -171,16 +143,6 @@ def test_the_prior_of_an_earlier_sensor_does_not_depend_on_the_unit(unit):
     drawn = prior.theta(np.random.default_rng(0).normal(size=(4000, prior.n_params)))
     assert drawn[:, -1].std() == pytest.approx(sd[-1], rel=0.05)
     assert drawn[:, -2].std() < 1e-6 * sd[-1]
-
-
-def test_the_prior_of_an_earlier_free_form_does_not_depend_on_the_unit():
-    free = with_free_form(default_sensor(EXTENT, 1))
-    theta = free.theta(0.02 * np.random.default_rng(0).normal(size=(4000, free.n_params)))
-    theta[:, -2:] *= 1e-12
-    names = (*mixture_parameter_names(free.n_gaussians), "I_min", "I_max")
-    prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
-    drawn = prior.theta(np.random.default_rng(1).normal(size=(4000, free.n_params)))
-    np.testing.assert_allclose(drawn[:, -2:].std(axis=0), theta[:, -2:].std(axis=0), rtol=0.06)
 
 
 def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
@@ -249,26 +211,6 @@ def test_effect_scores_invert_effect_values(name):
     np.testing.assert_allclose(effect_coordinates(effect, effect_values(effect, z)), z, atol=1e-6)
 
 
-def test_whitening_is_the_inverse_root_of_the_covariance():
-    """Likelihood of AR(1) noise with a missing reading: whitened, and by the full covariance matrix."""
-    recording = line(6)
-    readings = recording.readings.copy()
-    readings[2] = np.nan
-    recording = Recording(recording.plan, readings)
-    steps = n_rows_since_previous_usable(recording)
-    np.testing.assert_array_equal(steps, [0, 1, 2, 1, 1, 0, 1, 1, 1, 1, 1])
-    rows = np.flatnonzero(recording.usable)
-    nodes = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(np.zeros(len(rows)))
-    node = 20
-    rho, whitener = nodes.settings[node, 0], nodes.laws[node]
-    scan = recording.plan.scan[rows]
-    cov = np.where(scan[:, None] == scan[None, :], rho ** np.abs(rows[:, None] - rows[None, :]), 0.0)
-    r = np.random.default_rng(0).normal(size=len(rows))
-    by_whitening = -0.5 * np.sum(whitener(r) ** 2) - whitener.half_log_det() - 0.5 * len(r) * math.log(2 * math.pi)
-    assert by_whitening == pytest.approx(multivariate_normal(cov=cov).logpdf(r))
-    np.testing.assert_allclose(whitener(np.eye(len(r))) @ cov @ whitener(np.eye(len(r))).T, np.eye(len(r)), atol=1e-12)
-
-
 def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     """Route two: quadrature over the amplitude of the Student-t likelihood, for each scale."""
     rng = np.random.default_rng(3)
@@ -306,12 +248,6 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     assert found == pytest.approx(math.log(total / len(visible)), abs=1e-6)
 
 
-def test_a_template_of_which_nothing_survives_is_out_of_the_question():
-    explained, gain = np.full((2, 1, 1), 0.01), np.array([[300.0], [1e-4]])
-    assert average_over_amplitude_scales(explained, gain, 400)[0, 0] > -5
-    assert average_over_amplitude_scales(explained, gain, 400)[1, 0] < -40
-
-
 def test_a_bank_weighs_as_blocks_do():
     """Route one: the templates projected; route two: the products that a fit takes off."""
     rng = np.random.default_rng(4)
@@ -343,15 +279,6 @@ def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
     np.testing.assert_allclose(
         TemplateBank.of(templates, ["a", "b", "c"], n).unabsorbed_shares(problem), wanted, atol=1e-7
     )
-
-
-def test_null_draws_have_nothing_in_the_span_of_the_fit():
-    rng = np.random.default_rng(1)
-    basis, _ = np.linalg.qr(rng.normal(size=(40, 3)))
-    problem = Linearised(basis, np.zeros(40), white_noise(37), 1.0, 37)
-    draws = problem.draw_null_residuals(200, rng=rng)
-    np.testing.assert_allclose(basis.T @ draws, 0.0, atol=1e-12)
-    assert np.mean(np.sum(draws**2, axis=0)) == pytest.approx(37, rel=0.05)
 
 
 def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
@@ -424,14 +351,6 @@ def test_what_sets_in_at_a_level_is_at_what_would_be_read_without_it():
     assert found.end == pytest.approx(60.0, abs=1e-9)
 
 
-def test_an_effect_of_one_scan_is_in_that_scan():
-    scan = Covariate("scan", np.repeat([0.0, 1.0], 6), np.arange(12), groups=True)
-    effect = replace(VOCABULARY["scan_misplacement"].for_extent(EXTENT), where=Where(scans=("s1",)))
-    one = np.repeat([0.0, 1.0], 6)
-    (found,) = placed(effect, one, 0 * one, line(6).plan, [scan])
-    assert (found.covariate, found.scan, found.start) == ("scan", "s1", None)
-
-
 def test_an_effect_of_one_mounting_is_in_the_scans_that_feel_it_the_strongest_first():
     """A scan over white looks the same from any angle: nothing shows there, though its mounting is turned too."""
     plan = line(6, scans=3).plan
@@ -456,13 +375,6 @@ def test_noise_statistics_see_memory_tails_and_level():
     assert abs(lag[0]) < 0.1 < lag[1]
     assert abs(kurtosis[0]) < 0.5 < kurtosis[2]
     assert abs(tilt[0]) < 5 < tilt[3]
-
-
-def test_white_noise_is_left_as_it_is():
-    r = np.arange(5.0)
-    np.testing.assert_array_equal(white_noise(5)(r), r)
-    twice = NoiseLaw(np.full(5, 2.0), np.zeros(5), np.zeros(5, dtype=np.bool_))
-    assert twice.half_log_det() == pytest.approx(5 * math.log(2))
 
 
 def test_joined_recordings_keep_scans_and_patterns_apart():
@@ -511,18 +423,6 @@ def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tm
     assert join_plans([more, more]).sessions == ()
     readings = readings_of_recording(joined)
     assert recording_of_readings(joined.plan, readings).plan.sessions == ()
-
-
-def test_joined_recordings_keep_their_patterns_where_a_third_is_joined_to_them():
-    """What is joined a second time, such as the recording of an investigation, has a name "edge (2)" already."""
-
-    def over(albedo: float, n: int) -> Recording:
-        plan = replace(line(n).plan, pattern_names=("edge",), patterns={"edge": Uniform(albedo)})
-        return Recording(plan, line(n).readings)
-
-    joined = join([join([over(0.0, 4), over(1.0, 3)]), over(0.5, 2)])
-    seen = [joined.plan.patterns[joined.plan.pattern_names[code]].albedo for code in joined.plan.pattern]
-    assert seen == [0.0] * len(line(4)) + [1.0] * len(line(3)) + [0.5] * len(line(2))
 
 
 def test_images_of_one_name_that_differ_in_the_middle_alone_remain_two_patterns():

@@ -63,15 +63,6 @@ def test_a_bent_density_keeps_its_moments():
         assert abs(np.mean(found) - value) < 4 * np.std(found, ddof=1) / np.sqrt(20) + 0.02
 
 
-def test_what_cannot_be_is_left():
-    def log_p(z):
-        return np.where(z[:, 0] > 0, -0.5 * z[:, 0] ** 2, -np.inf)
-
-    z = drawn([0.0], [[1.0]], log_p, 1)
-    assert (z > 0).all()
-    assert z.mean() == pytest.approx(np.sqrt(2 / np.pi), abs=0.2)
-
-
 def test_weights_do_where_enough_of_them_count():
     """The density wanted is half as wide, its mean an sd aside; of more samples than wanted as many as it takes."""
 
@@ -149,13 +140,6 @@ def test_what_is_quadratic_is_met_everywhere():
 
     e = rng.standard_normal((50, 3))
     np.testing.assert_allclose(predicted(QuadraticPredictions.of(predict, 3, 1e-9), e), predict(e), atol=1e-8)
-
-
-def test_the_steps_and_their_sums_are_met():
-    one = np.eye(3)
-    asked = np.concatenate([np.zeros((1, 3)), one, -one, one[[0]] + one[[1]], one[[1]] + one[[2]]])
-    found = QuadraticPredictions.of(about_the_center, 3, 1e-9)
-    np.testing.assert_allclose(predicted(found, asked), about_the_center(asked), atol=1e-9)
 
 
 @pytest.mark.parametrize("sd", [0.01, 1.0])

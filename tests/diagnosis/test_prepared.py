@@ -17,7 +17,6 @@ from probewise.diagnosis.prepared import positions_in_stretches, prepare, rows_t
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.verdict import Hypothesis
 from probewise.effects import VOCABULARY, Extent
-from probewise.errors import ParameterError
 from probewise.priors import Normal, Product
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, paper_plan
 from probewise.report.covariates import covariate_values
@@ -64,14 +63,6 @@ def test_too_little_is_few_readings_or_equal_ones():
     assert not prepare(whole, apparatus=SENSOR).has_too_little_data
     assert prepare(recording(20), apparatus=SENSOR).has_too_little_data
     assert prepare(replace(whole, readings=np.full(408, 5.0)), apparatus=SENSOR).has_too_little_data
-
-
-def test_values_of_usable_readings_are_spread_over_all_rows():
-    whole = recording(30)
-    holes = replace(whole, readings=np.where(np.arange(30) % 2, np.nan, whole.readings))
-    spread = prepare(holes, apparatus=SENSOR).expand_usable_to_all_rows(np.arange(15.0))
-    np.testing.assert_array_equal(spread[::2], np.arange(15.0))
-    assert np.isnan(spread[1::2]).all()
 
 
 def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
@@ -127,11 +118,6 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     assert {cure.plan.instrumentation.height_mm for cure in audited.cures} <= {20.0}
 
 
-def test_no_reading_is_refused():
-    with pytest.raises(ParameterError, match="usable readings"):
-        prepare(replace(recording(), readings=np.full(408, np.nan)), apparatus=SENSOR)
-
-
 def test_an_effect_of_ones_own_stands_beside_the_vocabulary():
     own = LightSensorApparatus({"backlash": VOCABULARY["backlash"]}).effects(recording(), None)
     assert "backlash" in own
@@ -154,10 +140,6 @@ def long_recording(n_scans: int, per_scan: int) -> Recording:
     return Recording(plan, np.sin(plan.x_mm))
 
 
-def test_a_short_recording_is_taken_whole():
-    np.testing.assert_array_equal(rows_to_diagnose(long_recording(4, 100), 400), np.arange(400))
-
-
 def test_of_many_scans_whole_ones_are_taken_from_first_to_last():
     whole = long_recording(100, 40)
     rows = rows_to_diagnose(whole, 800)
@@ -165,14 +147,6 @@ def test_of_many_scans_whole_ones_are_taken_from_first_to_last():
     assert len(rows) == 800
     np.testing.assert_array_equal(counts, 40)
     assert (scans[0], scans[-1]) == (0, 99)
-
-
-def test_of_few_long_scans_stretches_are_taken_from_each():
-    whole = long_recording(3, 5000)
-    rows = rows_to_diagnose(whole, 1000)
-    assert len(rows) == pytest.approx(1000, rel=0.05)
-    np.testing.assert_allclose(np.bincount(whole.plan.scan[rows]), len(rows) / 3, rtol=0.05)
-    assert np.mean(np.diff(rows) == 1) > 0.8
 
 
 def test_scans_of_an_effect_have_their_numbers_in_the_whole_recording(monkeypatch):
@@ -232,10 +206,6 @@ def test_a_stretch_lies_in_one_run(interleaved):
         streaks = np.diff(np.concatenate([[-1], np.flatnonzero(np.diff(place) != 1), [len(place) - 1]]))
         assert len(streaks) > 5
         assert streaks.min() >= 6
-
-
-def test_of_very_short_runs_about_as_many_rows_are_chosen():
-    assert len(positions_in_stretches(np.arange(9000) // 2, 2400)) == 2400
 
 
 def test_scans_there_and_back_are_chosen_of_both_ways():

@@ -64,11 +64,6 @@ def test_every_noise_sums_to_one():
     assert sum(math.exp(odds.log_prior_on_noise(names)) for names in sets) == pytest.approx(1.0)
 
 
-def test_four_effects_that_somebody_has_chosen_are_no_likelier_than_three():
-    odds = PriorOdds(n_named=4)
-    assert math.exp(odds.log_prior_on_mean(tuple("abcd"))) == pytest.approx(odds.by_size[-1])
-
-
 def test_single_effects_of_a_vocabulary_without_any_on_the_mean_leave_clean_and_unknown():
     priors = PriorOdds(n_named=0).single_effect_priors([], ())
     assert set(priors) == {((), ()), (("unknown",), ())}

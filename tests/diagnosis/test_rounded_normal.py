@@ -12,13 +12,10 @@ from scipy.stats import norm
 
 from probewise.diagnosis import diagnose, diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.diagnosis.noise_law import NoiseLaw, RoundedNormal, stacked_density
-from probewise.diagnosis.noise_models import NoiseModel, least_sd_given_rounding, rough_sd
-from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.noise_law import NoiseLaw, RoundedNormal
+from probewise.diagnosis.noise_models import NoiseModel, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.refits import NoiseModels
-from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.stepwise import noise_sd_about_given_null
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
@@ -29,7 +26,6 @@ from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
 STEP, SIGMA = 4.0, 0.7
-LAW = RoundedNormal(0.5 * STEP / SIGMA, SIGMA)
 
 
 def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recording:
@@ -50,19 +46,6 @@ def noises(recording: Recording) -> NoiseModels:
     built = {name: kind.for_extent(extent) for name, kind in VOCABULARY.items() if kind.stage is Stage.NOISE}
     effects = {name: effect for name, effect in built.items() if effect is not None}
     return NoiseModels(recording, effects, PriorOdds.for_effects(effects))
-
-
-def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
-    """Whatever the mean: the chance that normal noise lands within half a step of the reading, over the step."""
-    mean = np.linspace(-9.0, 9.0, 37)[:, None]
-    reading = STEP
-    cell = norm.cdf((reading + STEP / 2 - mean) / SIGMA) - norm.cdf((reading - STEP / 2 - mean) / SIGMA)
-    misfit = np.array([LAW.minus_log_likelihood(row[None], np.array([SIGMA]), 1)[0] for row in reading - mean])
-    # A difference of cumulatives is exact to 1e-16 of one, and no better: far out it says nothing.
-    told = cell[:, 0] > 1e-12
-    wanted = -np.log(cell[told, 0] / STEP) - 0.5 * np.log(2 * np.pi)
-    np.testing.assert_allclose(misfit[told], wanted, rtol=1e-6, atol=1e-9)
-    assert np.isfinite(misfit).all()
 
 
 def log_cells(residuals: np.ndarray, sd: np.ndarray) -> np.ndarray:
@@ -124,32 +107,6 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(half):
     assert float(flat.fisher_information) == pytest.approx(wanted, rel=1e-4)
 
 
-def test_inside_the_flat_top_a_residual_says_nothing():
-    inside = LAW.normal_pseudo_residuals(np.array([[0.0], [0.3]]), np.array([SIGMA]))
-    outside = LAW.normal_pseudo_residuals(np.array([[STEP]]), np.array([SIGMA]))
-    assert np.abs(inside).max() < 0.01 * outside[0, 0]
-
-
-def test_laws_of_one_kind_are_taken_together():
-    one = np.ones(5)
-    laws = [NoiseLaw(one, 0 * one, one > 1, flat=flat, sigma=1 / flat) for flat in (1.0, 3.0)]
-    z = np.linspace(-2, 2, 5)[:, None]
-    together, sigma = stacked_density(laws), np.array([1.0, 1 / 3])
-    apart = np.concatenate([law.minus_log_likelihood(z, law.likeliest_sigma(z)) for law in laws])
-    np.testing.assert_allclose(together.minus_log_likelihood(z, sigma, 5), apart)
-    np.testing.assert_allclose(together.likeliest_sigma(z, 5), sigma)
-
-
-def test_no_pseudo_residual_is_farther_than_what_was_read():
-    law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
-    z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
-    pseudo = law.bounded_pseudo_residuals(z, np.array([0.5]))
-    assert (np.abs(pseudo) <= np.abs(z)).all()
-    np.testing.assert_array_equal(pseudo[3:], z[3:])
-    drawn = law.draw_pseudo_residuals(20_000, rng=np.random.default_rng(0))
-    assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
-
-
 @pytest.mark.parametrize("declared", [False, True])
 @pytest.mark.parametrize(("noise_sd", "coarse"), [(0.4, True), (3.0, False)])
 def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, coarse, declared):
@@ -206,27 +163,6 @@ def test_the_noise_of_rounded_readings_is_told_without_a_model(noise_sd):
     readings = Recording(plan, np.round(mean + noise_sd * rng.standard_normal(len(plan))))
     wanted = np.sqrt(noise_sd**2 + 1 / 12 + 1 / 72)  # rounding, and what is the same spread over a step
     assert rough_sd(readings) == pytest.approx(wanted, rel=0.2)
-
-
-def test_no_normal_law_sums_to_more_than_one_over_a_lattice():
-    """As narrow as it may be, about any mean, to a fifth of a percent."""
-    sd = least_sd_given_rounding(rounded(0.4, 1))
-    cells = STEP * np.arange(-9, 10)
-    sums = STEP * norm.pdf(cells, np.linspace(0, STEP / 2, 9)[:, None], sd).sum(axis=1)
-    np.testing.assert_allclose(sums, 1.0, atol=2e-3)
-    narrower = STEP * norm.pdf(cells, 0.0, 0.4 * STEP).sum()
-    assert narrower > 1.08
-
-
-@pytest.mark.parametrize("noise", ["correlated_noise", "signal_dependent_noise", "outliers"])
-def test_no_reading_is_known_better_from_those_before_it_than_a_lattice_allows(noise):
-    """Whatever the law makes of small residuals: their conditional sd is the floor's."""
-    recording = rounded(0.4, 1)
-    model = NoiseModel((noises(recording).effects[noise],), recording, least_sd=0.6 * STEP)
-    small = 0.01 * np.random.default_rng(4).standard_normal((int(recording.usable.sum()), 1))
-    for law in model.nodes_for_predictions(recording.readings[recording.usable]).laws:
-        conditional = law.likeliest_sigma(law(small)) * law.sd * np.sqrt(1 - law.carry**2)
-        assert conditional.min() == pytest.approx(0.6 * STEP)
 
 
 def test_the_nodes_of_the_noise_beside_rounding_hold_its_likeliest_sd_where_readings_declare_their_own():
@@ -291,47 +227,6 @@ def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
     slope = next(effect for effect in found.effects if effect.name == "ambient_gradient").parameters[0]
     assert abs(slope.mean - 0.15) < 4 * slope.sd
     assert dataclasses.asdict(found.improvement)["log_evidence"] > 10
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("noise_sd", [0.9, 1.4])
-def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):
-    found = diagnose(as_declared(rounded(noise_sd, 1)), rng=np.random.default_rng(0))
-    assert (found.verdict, found.report.noise.model) == ("clean", "white")
-    assert found.p_value > 0.01  # one test each
-    sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
-    assert sigma == pytest.approx(np.hypot(noise_sd, STEP / np.sqrt(12)), rel=0.15)
-
-
-@pytest.mark.slow
-def test_lost_readings_are_found_among_coarsely_rounded_ones():
-    whole = rounded(0.4, 1)
-    readings = whole.readings.copy()
-    readings[np.random.default_rng(3).choice(len(readings), 8, replace=False)] = 0.0
-    found = diagnose(as_declared(Recording(whole.plan, readings)), rng=np.random.default_rng(0))
-    assert (found.verdict, found.combination) == ("noise", ("dropouts",))
-
-
-@pytest.mark.slow
-def test_where_no_three_readings_follow_each_other_nothing_says_that_a_step_is_coarse():
-    """Every second reading is missing, and the step is a sixtieth of the noise."""
-    whole = paper_plan()
-    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)], pixel_mm=1.0)
-    readings = World(spot).expected_readings(whole) + 0.6 * np.random.default_rng(2).standard_normal(len(whole))
-    readings = np.where(np.arange(len(whole)) % 2, np.nan, np.round(readings, 2))
-    found = diagnose(Recording(whole, readings), rng=np.random.default_rng(0))
-    assert (found.verdict, found.report.noise.model) == ("clean", "white")
-
-
-def test_what_rivals_are_told_by_is_the_noise_of_a_reading_rounding_and_all():
-    """A whole step of noise and rounding is no less than either: of the normal part alone it would be."""
-    recording = as_declared(rounded(0.4, 1))
-    found = search(Prepared(recording, {}, None, LightSensorApparatus(), recording), max_order=1)
-    (null,) = found.evidences.fits.values()
-    assert null.law.flat > 0
-    rms = np.sqrt(np.mean(null.found.residuals**2))
-    assert null.whitened_sd == pytest.approx(rms, rel=0.15)
-    assert null.found.sd < 0.5 * null.whitened_sd
 
 
 @pytest.mark.slow

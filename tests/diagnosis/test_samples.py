@@ -151,11 +151,6 @@ def test_the_interval_of_a_step_is_as_probable_as_least_squares_with_all_effects
     assert 0.5 * np.abs(fit.weights["offset_step"] - exact).sum() > 0.3  # as it was added, alone
 
 
-def test_a_single_effect_keeps_its_weights(prepared, searched):
-    fit = _best_of(searched, ("offset_step",))
-    assert weights_beside_other_effects(fit.found, fit.law, prepared[0].usable_rows, fit.weights) is fit.weights
-
-
 def test_samples_have_the_step_where_the_readings_have_it(prepared, searched):
     ready, columns = prepared
     fit = _best_of(searched, ("offset_step", "sensitivity:humidity"))

@@ -30,15 +30,6 @@ def test_a_start_of_its_own_absorbs_an_offset_of_each_run(audit):
     assert of(audit, "offset_per_run").detectability == "invisible"
 
 
-def test_an_offset_by_a_column_that_is_constant_in_runs_is_invisible_too(audit):
-    assert of(audit, "sensitivity:room_c").detectability == "invisible"
-
-
-def test_effects_that_are_the_same_are_one_class(audit):
-    """The start is added to every reading: a jump of the one is a jump of the other."""
-    assert any({"offset_step", "steps:start_c"} <= set(names) for names in audit.classes)
-
-
 def test_rows_that_show_an_effect_grow_with_the_square_of_what_is_absorbed(audit):
     for effect in audit.effects:
         if effect.rows is not None:

@@ -12,7 +12,6 @@ from probewise.diagnosis.left_out import recording_from_table
 from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.calls import IntegrationTally
-from probewise.systems.system import with_converged_step
 
 
 def _rates(s, p, u):
@@ -76,15 +75,6 @@ def test_the_step_serves_all_time_constants_that_the_readings_allow(stiff):
         predicted = system.chain(table, ()).predict(np.array([[tau, 3.0]]), table)[0]
         np.testing.assert_allclose(predicted, _readings(tau, 3.0), atol=0.2 * SD)
     assert not system.tally.too_stiff
-
-
-def test_the_step_of_the_best_fit_alone_would_not(stiff):
-    """So the test above can fail: the explicit step that is still at the best fit runs away at 0.011 s."""
-    table, _, _, _, sd = stiff
-    first = with_converged_step(System.of(_simulator(), table), table, np.array([[0.15, 3.0]]), tolerance=0.02 * sd)
-    assert not first.stiff
-    predicted = first.chain(table, ()).predict(np.array([[0.011, 3.0]]), table)[0]
-    assert not np.allclose(predicted, _readings(0.011, 3.0), atol=10 * SD)
 
 
 def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():

@@ -10,7 +10,6 @@ from heater import runs
 
 from probewise.diagnosis.advice import Rival, measurement_separating_rivals
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
-from probewise.diagnosis.diagnosis import diagnosis_json
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
@@ -48,10 +47,6 @@ def offered(controls=("power_w",), table=TABLE):
     return {c.plan.scan_names[0]: c for c in possible_run_commands(table, "temp_c", controls, "s")}
 
 
-def test_without_controls_recorded_runs_are_taken_again():
-    assert list(offered(())) == ["1 again", "2 again", "3 again"]
-
-
 def test_a_control_is_swept_held_and_switched_between_its_ends():
     found = offered()
     power = {name: command.plan.columns["power_w"] for name, command in found.items()}
@@ -67,19 +62,6 @@ def test_a_control_is_swept_in_values_that_can_be_set():
     np.testing.assert_array_equal(swept, np.round(swept, 3))
     np.testing.assert_allclose(swept, np.linspace(2.0, 4.0, len(swept)), atol=0.0005)
     assert len(np.unique(swept)) == len(swept)
-
-
-def test_a_slow_run_takes_twice_the_time():
-    time = offered()["1 slow"].plan.time_s
-    np.testing.assert_allclose(np.ptp(time), 2 * np.ptp(TABLE.time_s[:12]))
-
-
-def test_what_is_yet_to_be_read_is_empty():
-    assert all(np.isnan(command.plan.columns["temp_c"]).all() for command in offered().values())
-
-
-def test_time_that_begins_anew_in_each_run_does_so_in_the_next():
-    assert offered()["2 again"].plan.time_s[0] == 0.0
 
 
 def test_time_that_goes_on_is_later_than_all_that_was_recorded():
@@ -105,11 +87,6 @@ def test_no_command_has_more_than_102_readings():
 def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
     table = runs((20.0, 21.0), names=("1", "1 again"))
     assert list(offered((), table)) == ["1 again (2)", "1 again again"]
-
-
-def test_runs_that_differ_in_a_small_control_are_each_taken_again():
-    table = TABLE.with_columns({"power_w": 1e-10 * TABLE.columns["power_w"]})
-    assert offered(table=table).keys() == offered().keys()
 
 
 @pytest.mark.parametrize(("unit", "minutes"), [("s", 1 / 60), ("min.", 1.0), ("Month", 43_830.0), ("fortnight", None)])
@@ -187,14 +164,6 @@ def test_every_effect_of_a_column_shows_in_it(name):
         assert set(form.covariates) <= known
 
 
-def test_a_formula_of_time_shows_in_time():
-    about = _prepared({}).apparatus.about
-    (square,) = (
-        form for form in formula_forms(about) if form.expression.startswith("a (t_s - ") and "^2" in form.name[-3:]
-    )
-    assert square.covariates == ("time",)
-
-
 def test_results_name_a_column_as_it_is_unless_that_means_something_else():
     assert published_covariate(covariate_of_column("scan")) == "scan"
     assert published_covariate(covariate_of_column("level")) == "column:level"
@@ -234,16 +203,6 @@ def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
     of_rate = [form for form in formula_forms(about) if form.name.startswith("formula:rate")]
     assert of_rate
     assert all(set(form.covariates) <= {"state:s", "time"} for form in of_rate)
-
-
-@pytest.mark.slow
-def test_a_reading_that_depends_on_a_column_called_scan_is_found_in_it():
-    """Before, the column was taken for numbers of scans, and the diagnosis ended in an IndexError."""
-    scan = _RNG.normal(20, 2, _N)
-    y = 1.0 + _X + 0.2 * (scan - 20) + 0.1 * _RNG.normal(size=_N)
-    simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"], time="t_s")
-    found = diagnose_system(simulator, {"t_s": _T, "x": _X, "scan": scan, "y": y}, rng=np.random.default_rng(1))
-    assert found.where[0].covariate == diagnosis_json(found)["where"][0]["covariate"] == "scan"
 
 
 def test_samples_of_an_effect_are_its_own_beside_a_column_whose_name_goes_on_with_a_point():
@@ -356,10 +315,6 @@ def test_a_scale_parameter_changes_linearly_first_and_by_a_factor_of_the_same_sl
         np.testing.assert_allclose(found, start * np.exp(-expected(3e-4) * _HOURS), rtol=1e-6)
         assert variant.fixed == ("as_factor",)
         assert np.isfinite(variant.prior.log_prob(np.array([[3e-4, which]])))[0]
-
-
-def test_a_misfit_that_asks_for_a_small_change_offers_the_linear_one_alone():
-    assert len(bind_forms(_about(1.0))[NAME].variants()) == 1
 
 
 @pytest.mark.single_case

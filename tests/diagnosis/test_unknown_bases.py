@@ -77,12 +77,6 @@ def test_some_basis_holds_it(mismatch):
     assert min(left) < 0.1
 
 
-def test_every_basis_is_of_the_rows_and_has_a_family():
-    assert len(BASES.widths) == len(BASES.labels)
-    assert BASES.columns.shape == (N, BASES.widths.sum())
-    assert all(np.isfinite(columns).all() and np.any(columns) for columns in TEMPLATES)
-
-
 def test_what_a_name_describes_is_no_unknown():
     """One offset per run is a name's; it becomes zero, and its share of the prior is not given to other bases."""
     rng = np.random.default_rng(3)

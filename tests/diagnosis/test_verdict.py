@@ -29,15 +29,6 @@ def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
     )
 
 
-def test_what_is_unknown_may_count_for_less_against_all_others():
-    found = ranked_hypotheses({((), ()): 0.4, (("unknown",), ()): 0.5, (("lag",), ()): 0.1}, unknown_weight=0.1)
-    assert {h.effects: h.probability for h in found} == {
-        (): pytest.approx(0.4 / 0.55),
-        ("unknown",): pytest.approx(0.05 / 0.55),
-        ("lag",): pytest.approx(0.1 / 0.55),
-    }
-
-
 def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_noise():
     found = ranked_hypotheses(
         {
@@ -113,21 +104,10 @@ def test_a_rare_effect_split_by_noise_behind_another_name_leaves_the_verdict_unk
     assert (hypotheses[0].effects, hypotheses[0].probability) == (("unknown",), pytest.approx(0.57))
 
 
-def test_a_rare_effect_that_the_readings_cannot_tell_from_an_alias_stays_unknown():
-    found = searched({(("arm_knock",), ()): 0.7, (("lag",), ()): 0.3})
-    assert hypotheses_with_verdict(found, 1e-6, of_probabilities)[1] == ("arm_knock",)
-    hypotheses, rare, _ = hypotheses_with_verdict(found, 1e-6, lambda each: of_probabilities(each, same=[("lag",)]))
-    assert (rare, hypotheses[0].effects) == ((), ("unknown",))
-
-
 def test_physics_is_named_on_an_alarm_only():
     sure = {(("lag",), ()): 0.9, ((), ()): 0.1}
     assert verdict(sure) == ("named", ("lag",))
     assert verdict(sure, p_value=0.2) == ("cannot_tell", ())
-
-
-def test_noise_is_named_without_an_alarm_of_the_mean():
-    assert verdict({((), ("outliers",)): 0.8, ((), ()): 0.2}, p_value=0.6) == ("noise", ("outliers",))
 
 
 def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_being_named():

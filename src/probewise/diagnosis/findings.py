@@ -94,9 +94,9 @@ def effects_found(
         beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()
     unit = plan.instrumentation.unit
     drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
-    ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
 
     def likeliest_candidate_with(name: str) -> tuple[WeighedFit | None, Names]:
+        ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
         fits = ((searched.best_refit_of(*key), key[1]) for key, p in ranked if p > 0 and name in (*key[0], *key[1]))
         return next(((fit, noise) for fit, noise in fits if fit is not None), (None, ()))
 
@@ -169,17 +169,17 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     if isinstance(effect, Dropouts) and effect.lost:
         return effect.distance
     if name in searched.certain:
-        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of_effect(name)]
-        return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(law.n_kept)
+        own = holder.evidence[noise]
+        step = float(own.nodes.settings[0, own.noise.columns_of_effect(name)][0])
+        return step / math.sqrt(12) / found.sd * math.sqrt(law.n_kept)
     if name in prepared.noise_effect_names:
         # For noise effects: the size of an effect on the mean with equal evidence.
         without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]
         gain = holder.evidence[noise].log_z - max(without)
         return math.sqrt(2 * max(gain, 0.0))
     model, stay = found.model.model_and_mask_without(name)
-    noise_free = prepared.recording.with_readings(
-        prepared.expand_usable_to_all_rows(found.predicted)
-    ).without_declared_range()
+    readings = prepared.expand_usable_to_all_rows(found.predicted)
+    noise_free = prepared.recording.with_readings(readings).without_declared_range()
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = law.likeliest_sigma_of(found.residuals)
     refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
@@ -286,9 +286,8 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
     named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
     prepared, covariates = searched.prepared, searched.misfit_templates.covariates
     draws = best.problem.draw_null_residuals(_N_DRAWS_OF_REMAINDER, rng=rng)
-    found = significant_places(
-        best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws
-    )
+    scans, residuals = prepared.recording.plan.scan_names, best.fit.found.residuals
+    found = significant_places(best.problem, covariates, scans, residuals, draws)
     where = found[0].covariate if found else None
     shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate_in_words(where)}"
     share = more / (named + more) if named + more > 0 else 0.0
@@ -307,15 +306,15 @@ def _formula_beside(
     """Return the formula that a fit adds to the best repair, with its gain over that, and a clause that tells it."""
     prepared, evidence = searched.prepared, fit.evidence[best.noise]
     effect = next(e for e in fit.found.model.effects if e.name not in best.fit.names)
-    values = sample_model(
-        fit.found, evidence, prepared.recording, weights=fit.weights, rng=rng, annealed=False
-    ).effect_samples(effect.name)
+    drawn = sample_model(fit.found, evidence, prepared.recording, weights=fit.weights, rng=rng, annealed=False)
+    values = drawn.effect_samples(effect.name)
     parts = prepared.apparatus.held_out_parts(prepared.recording)
     law, law_without = evidence.likeliest_law, best.fit.evidence[best.noise].likeliest_law
     held = held_out_gain(best.fit.found, fit.found, prepared.recording, law, parts, law_of_null=law_without)
     gained = evidence.log_z - best.fit.evidence[best.noise].log_z
-    unit = prepared.recording.plan.instrumentation.unit
-    formula = _formula_from_samples(effect, values, unit, gained, held.per_reading)
+    formula = _formula_from_samples(
+        effect, values, prepared.recording.plan.instrumentation.unit, gained, held.per_reading
+    )
     return formula, f"; a formula describes it: {sentence_from_samples(effect, values)}"
 
 

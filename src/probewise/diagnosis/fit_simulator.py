@@ -40,10 +40,7 @@ from probewise.systems.forms.binding import StoredFit, extract_stored_fit
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
     """Return the repaired model of a diagnosis: the simulator with the effects that it leaves out.
 
-    Raises
-    ------
-    ParameterError
-        If it is not the diagnosis of a simulator.
+    Raises ParameterError if it is not the diagnosis of a simulator.
     """
     return _fitted_system_of(diagnosis, "repaired")
 
@@ -81,16 +78,7 @@ def fitted_system_from_samples(
 ) -> FittedSystem:
     """Return posterior samples of a system with effects as a FittedSystem, which can be written to a file.
 
-    Parameters
-    ----------
-    system, model
-        The simulator over the runs of the recording, and the samples.
-    recording
-        The fitted recording.
-    predicted
-        Prediction for every row, (n_points,).
-    known
-        The recorded table, if the file needs it (`recorded_table_if_needed`).
+    `predicted`: prediction for every row, (n_points,); `known`: the recorded table, if the file needs it.
     """
     level = predicted[recording.usable]
     return FittedSystem(
@@ -136,19 +124,8 @@ class Evidence:
 class SystemFit(ShowsItself):
     """A simulator fitted to a table: posterior, evidence and predictions.
 
-    Parameters
-    ----------
-    recording
-        The table with its readings.
-    fitted
-        The simulator with posterior samples.
-    evidence
-        Log evidence.
-    nested
-        The same by nested sampling, if it was run beside (`thorough`).
-    predicted, sd
-        Mean and sd of every row's posterior predictive distribution, (n_points,), in the unit of the readings; the sd
-        includes the noise.
+    `predicted`, `sd`: mean and sd of every row's posterior predictive distribution, (n_points,), in the unit of the
+    readings; the sd includes the noise. `nested`: the evidence by nested sampling, if it was run beside (`thorough`).
     """
 
     recording: Recording

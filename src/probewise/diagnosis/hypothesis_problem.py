@@ -11,6 +11,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
@@ -33,32 +34,25 @@ class StandardNormal:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coordinates: z_1, z_2, ..."""
         return tuple(f"z_{k + 1}" for k in range(self.n_params))
 
     @property
     def coordinates(self) -> StandardNormal:
-        """The prior itself: chains step in the parameters as they are."""
         return self
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the unit cube to standard-normal coordinates, (n_samples, n_params) both ways."""
         return np.asarray(ndtri(u))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map standard-normal coordinates to the unit cube, (n_samples, n_params) both ways."""
         return np.asarray(ndtr(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the log density, (n_samples,)."""
         return np.asarray(-0.5 * np.sum(theta**2 + math.log(2 * math.pi), axis=1))
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        """Return parameters unchanged, as coordinates."""
         return theta
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return coordinates unchanged, as parameters, and their log prior density (n_samples,)."""
         return x, self.log_prob(x)
 
 
@@ -155,35 +149,31 @@ class FoldedNormal(StandardNormal):
         return np.asarray(images[np.argmin(far, axis=0), np.arange(len(z))])
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the unit cube to folded coordinates, (n_samples, n_params) both ways."""
         return self.fold(super().from_unit_cube(u))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the log density summed over all orders, (n_samples,); -inf if another order is nearer."""
         images, far = self._reordered_with_distances(theta)
         density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
         return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
-class FoldedProblem:
-    """A `HypothesisProblem` with the folded prior; predictions do not depend on the order of the Gaussians."""
+class FoldedProblem(HypothesisProblem):
+    """A `HypothesisProblem` with the prior folded onto the order of its Gaussians that is nearest to a point.
 
-    problem: HypothesisProblem
-    prior: FoldedNormal
-
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Return the log likelihood, (n_samples, n_params) -> (n_samples,)."""
-        return self.problem.log_likelihood(theta)
-
-
-def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProblem | FoldedProblem:
-    """Fold a problem onto the order of its Gaussians that is nearest to a point, such as its best fit.
-
-    `near`: the point, (n_params,). Returns a problem with the same evidence; the problem itself if its sensor has no
-    exchangeable Gaussians.
+    `near`: the point, (n_params,), such as its best fit. Predictions do not depend on the order, nor does the evidence.
     """
+
+    near: FloatArray
+
+    @cached_property
+    def prior(self) -> StandardNormal:
+        return FoldedNormal(self.model.n_params, cast(CalibratedSensor, self.model.sensor), self.near)
+
+
+def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProblem:
+    """Fold a problem as `FoldedProblem` does; return it as it is if its sensor has no exchangeable Gaussians."""
     sensor = problem.model.sensor
-    if not (isinstance(sensor, CalibratedSensor) and sensor.has_exchangeable_gaussians and sensor.n_gaussians > 1):
+    if not sensor.has_exchangeable_gaussians or sensor.n_gaussians < 2:
         return problem
-    return FoldedProblem(problem, FoldedNormal(problem.model.n_params, sensor, near))
+    return FoldedProblem(problem.model, problem.recording, problem.noise, near)

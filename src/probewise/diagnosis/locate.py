@@ -150,22 +150,20 @@ def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[Floa
     Returns indicator columns, (n_points, n_windows), and the covariate's least and largest value in each window.
     """
     values, rows = covariate.values, covariate.rows
-    columns: list[FloatArray] = []
-    ends: list[tuple[float, float]] = []
+    columns, ends = list[FloatArray](), list[tuple[float, float]]()
 
-    def add_window(members: FloatArray, low: float, high: float) -> None:
+    def add_window(members: IntArray) -> None:
         column = np.zeros(n_points)
-        column[rows[members.astype(np.int64)]] = 1.0
+        column[rows[members]] = 1.0
         columns.append(column)
-        ends.append((low, high))
+        ends.append((float(values[members].min()), float(values[members].max())))
 
     if covariate.groups:
         for value in np.unique(values):
-            add_window(np.flatnonzero(values == value).astype(np.float64), float(value), float(value))
+            add_window(np.flatnonzero(values == value))
         return np.stack(columns, axis=1), ends
     order = np.argsort(values, kind="stable")
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]])
-    n = len(values)
+    edges, n = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]]), len(values)
     width = n // 2
     looked: set[tuple[int, int]] = set()
     while width >= _LEAST_ROWS and len(columns) <= 160:
@@ -175,12 +173,9 @@ def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[Floa
             high = int(edges[np.searchsorted(edges, first + width)])
             if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
                 looked.add((low, high))
-                members = order[low:high]
-                add_window(members.astype(np.float64), float(values[members[0]]), float(values[members[-1]]))
+                add_window(order[low:high])
         width //= 2
-    if not columns:
-        return np.zeros((n_points, 0)), []
-    return np.stack(columns, axis=1), ends
+    return (np.stack(columns, axis=1) if columns else np.zeros((n_points, 0))), ends
 
 
 def significant_places(
@@ -216,14 +211,11 @@ def significant_places(
         p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
         if p_value > _LARGEST_P:
             continue
-        start: float | None
-        end: float | None
-        start, end = kept[best]
-        scan = covariate.scan
+        window: tuple[str | None, float | None, float | None] = (covariate.scan, *kept[best])
         if covariate.name in _RUNS:
-            scan, start, end = scan_names[int(kept[best][0])], None, None
+            window = scan_names[int(kept[best][0])], None, None
         curve = _mean_curve_fields(covariate, residuals, problem.sd)
-        out.append(Place(covariate.published_name, scan, start, end, p_value, float(scores[best]), **curve))
+        out.append(Place(covariate.published_name, *window, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
 
 
@@ -254,28 +246,21 @@ def places_of_effect(
         return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals, sd))]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
         curve = _mean_curve_fields(scans, residuals, sd)
-        return [
-            Place("scan", scan, None, None, p_value, size, **curve)
-            for scan in _scans_with_effect(effect.scans, change, plan)
-        ]
-    there = change[covariate.rows]
+        # A scan without usable readings is not in the plan, and a name may return.
+        rows = {scan: np.array([own == scan for own in plan.scan_names])[plan.scan] for scan in effect.scans}
+        largest = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
+        there = [scan for scan in effect.scans if largest[scan] >= _SIGNIFICANT * max(largest.values())]
+        strongest_first = sorted(there, key=lambda scan: -largest[scan])
+        return [Place("scan", scan, None, None, p_value, size, **curve) for scan in strongest_first]
+    own = change[covariate.rows]
     # The levels absorb what all readings share: where nearly all move one way, those at rest stand out.
-    strength = np.abs(there - there.mean() if name == "direction" else there)
+    strength = np.abs(own - own.mean() if name == "direction" else own)
     # An effect with a threshold in level begins where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]
     curve = _mean_curve_fields(covariate, residuals, sd)
     start, end = float(values.min()), float(values.max())
     return [Place(covariate.published_name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
-
-
-def _scans_with_effect(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
-    """List the scans in which an effect's change is a twentieth of its largest or more, strongest first."""
-    # A scan without usable readings is not in the plan, and a name may return.
-    rows = {scan: np.array([name == scan for name in plan.scan_names])[plan.scan] for scan in scans}
-    strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
-    significant = [scan for scan in scans if strength[scan] >= _SIGNIFICANT * max(strength.values())]
-    return sorted(significant, key=lambda scan: -strength[scan])
 
 
 def _mean_curve_fields(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:

@@ -128,7 +128,6 @@ def _log_density(apart: FloatArray, variance: FloatArray) -> FloatArray:
 
 
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
-_MANY = 12  # nodes of one effect above which they are thinned before combination with another's
 _APART = 0.3  # initial spacing of nodes in the log of half a step over the noise sd
 _WIDEST, _NARROWEST = -6, 9  # range of nodes: noise sds from 3 steps, or the residual rms, to a thirtieth of a step
 _UNLIKELY = 15.0  # nats behind the best from which nodes of noise with rounding are dropped
@@ -169,15 +168,6 @@ class NoiseModel:
     def columns_of_effect(self, name: str) -> slice:
         """Return the slice of one effect's parameters in the settings of nodes."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
-
-    def coarse_nodes_by_effect(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return, for each effect with one parameter and over twelve nodes, every third node and its log weight."""
-        out = {}
-        for effect in self.effects:
-            nodes = effect.bank()[:, 0, :]
-            if len(nodes) > _MANY and nodes.shape[1] == 1:
-                out[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
-        return out
 
     def nodes_for_predictions(self, predicted: FloatArray) -> NoiseNodes:
         """Return the product grid of the effects' nodes, with the noise law and log weight at each.

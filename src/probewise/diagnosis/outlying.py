@@ -139,16 +139,13 @@ def find_lost_readings(
     they are. A reading is lost if it also stands out from its neighbours in the run, so that neither a jump nor a bend
     explains it, or has the very value of one that is; and if such readings do not cluster in a covariate (`covariates`
     of a fit). Nothing is fitted unless a residual of the fit `first`, to all readings, is improbable, or their rms is
-    over twice a noise sd that is known without it.
-
-    Returns the readings; None if there are none, or if they cluster.
+    over twice a noise sd that is known without it. None if there are none.
     """
     law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
     n_most, size = int(MOST_OUTLYING * len(usable)), np.abs(law(first.residuals))
-    may_be_bent = (
-        float(np.sqrt(np.mean(size**2))) > _BENT * sd or size.max() > LARGEST_SIZE * np.median(size) / MAD_OF_NORMAL
-    )
-    if not may_be_bent and not improbable_rows(first, law).size:
+    is_bent = float(np.sqrt(np.mean(size**2))) > _BENT * sd
+    is_bent |= bool(size.max() > LARGEST_SIZE * np.median(size) / MAD_OF_NORMAL)
+    if not is_bent and not improbable_rows(first, law).size:
         return None
     found = _least_trimmed_fit(model, recording, [first.z, *starts], law, n_most)
     if found is None:
@@ -158,19 +155,18 @@ def find_lost_readings(
     known = replace(law, lost=aside)
     apart = np.diff(residual)[(np.diff(run) == 0) & ~aside[1:] & ~aside[:-1]]
     spread = [np.median(np.abs(residual))] + ([np.median(np.abs(apart)) / math.sqrt(2)] if apart.size > 2 else [])
-    kept = recording.with_readings(
-        np.where(np.isin(np.arange(len(recording)), usable[~aside]), recording.readings, np.nan)
-    )
+    is_kept = np.isin(np.arange(len(recording)), usable[~aside])
+    kept = recording.with_readings(np.where(is_kept, recording.readings, np.nan))
     sd = max(float(min(spread)) / MAD_OF_NORMAL, sd_floor(kept))
-    slopes = known(found.slopes) / sd
-    told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), (found.slopes / law.sd[:, None] / sd).T)
-    unknown = np.sqrt(1 + np.einsum("ij,ji->i", found.slopes / law.sd[:, None] / sd, told))
+    slopes, every = known(found.slopes) / sd, found.slopes / law.sd[:, None] / sd
+    told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), every.T)
+    unknown = np.sqrt(1 + np.einsum("ij,ji->i", every, told))
     size = np.abs(_beyond_neighbours(residual, run, aside)) / (sd * unknown)
     by_chance = -ndtri(0.5 * _BY_CHANCE / len(usable))
     far = aside & (size > LARGEST_SIZE * by_chance)
     readings = recording.readings[usable]
     far |= aside & (size > by_chance) & np.isin(readings, readings[far])  # lost to one value, nearer to what was there
-    if not far.any() or _cluster(far, recording, [*covariates(found), *_row_order(run)]):
+    if not far.any() or _cluster(far, readings, [*covariates(found), *_row_order(run)]):
         return None
     squares = residual**2
     return LostReadings(usable[far], size[far], float(squares[far].sum() / squares.sum()))
@@ -226,9 +222,8 @@ def _beyond_neighbours(residual: FloatArray, run: IntArray, aside: BoolArray) ->
     return np.asarray(np.nan_to_num(out[np.argsort(order, kind="stable")]))
 
 
-def _cluster(far: BoolArray, recording: Recording, covariates: Sequence[Covariate]) -> bool:
+def _cluster(far: BoolArray, readings: FloatArray, covariates: Sequence[Covariate]) -> bool:
     """Return whether far readings cluster in a covariate; equal ones in successive rows count once."""
-    readings = recording.readings[recording.usable]
     again = np.append(False, np.diff(readings) == 0)
     if np.mean(again[~far]) < _RARELY:
         far = far & ~(again & np.append(False, far[:-1]))

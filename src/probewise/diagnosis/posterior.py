@@ -50,13 +50,12 @@ def importance_resample(
     rng: np.random.Generator,
     least: float = _LEAST_OF_IT * _ENOUGH,
 ) -> FloatArray | None:
-    """Draw from a density by importance resampling, if the effective sample size suffices.
+    """Draw from a density by importance resampling: (n_wanted, n_params), in random order.
 
-    `first`: samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated;
-    `log_q`, `log_p`: unnormalised log densities of the proposal and the target, (n, n_params) -> (n,); `log_p` is minus
-    infinity outside its support; `n_wanted`: number of samples to draw; the effective sample size should be half of it;
-    `least`: least acceptable effective sample size, as a share of `n_wanted`. Returns samples in random order,
-    (n_wanted, n_params); None if the effective sample size is too small.
+    `first`: samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated,
+    for an effective sample size of half of `n_wanted`. `log_q`, `log_p`: unnormalised log densities of the proposal and
+    the target; the latter is minus infinity outside its support. `least`: share of `n_wanted` that the effective sample
+    size must reach; else None.
     """
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
     share = _n_distinct_effective(gain, first[:n_wanted]) / len(gain)
@@ -91,12 +90,11 @@ def draw_by_annealing(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> FloatArray:
-    """Draw from a density by sequential Monte Carlo, starting from samples of another one.
+    """Draw from a density by sequential Monte Carlo, starting from samples of another one, an even number.
 
-    `first`: samples of the other density, (n_walkers, n_params), an even number; `log_q`, `log_p`, `n_wanted`, `rng`:
-    as in `importance_resample`; `n_moves`: moves of each sample after a step of beta, and between collections of
-    samples. Returns samples in random order, (n_wanted, n_params), collected from the walkers every `n_moves` moves.
-    Raises NotConvergedError if no initial sample is in the support of the target.
+    `n_moves`: moves of each sample after a step of beta, and between collections of samples. The rest, and what is
+    returned, is as in `importance_resample`. Raises NotConvergedError if no initial sample is in the support of the
+    target.
     """
     n_walkers = len(first)
     z, heights = first, (log_q(first), log_p(first))
@@ -350,19 +348,13 @@ def _annealed(
     quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
     near = surrogate_log_density(quadratic, center, steps, laplace.recording.readings[usable], laplace.law)
 
-    def log_laplace(e: FloatArray) -> FloatArray:
-        return np.asarray(-0.5 * np.sum(e**2, axis=1))
-
-    def log_posterior_of_steps(e: FloatArray) -> FloatArray:
-        return log_posterior(center + e @ steps)
-
     def resampled_or_annealed(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
         weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
         if weighed is not None:
             return weighed
-        return draw_by_annealing(
-            first[:_N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress
-        )
+        some = first[:_N_WALKERS]
+        return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
 
-    e = resampled_or_annealed(draws, log_laplace, near, _MOVES_NEAR, _N_NEAR)
-    return center + resampled_or_annealed(e, near, log_posterior_of_steps, _MOVES, n_samples) @ steps
+    e = resampled_or_annealed(draws, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)
+    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples)
+    return center + e @ steps

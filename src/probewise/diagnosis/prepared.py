@@ -43,11 +43,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
     A covariate of the first, such as battery voltage, keeps its last known value in recordings that lack it; one that
     the first lacks is left out. The range and step that the first declares count for all; readings of a recording that
     declares another height than the first are at that height, if both declare one. Notes say so. Times are unchanged.
-
-    Raises
-    ------
-    ParameterError
-        If there is no recording, readings are in different units, or two recordings are the same.
+    Raises ParameterError if there is no recording, readings are in different units, or two recordings are the same.
     """
     if isinstance(recordings, str) or not isinstance(recordings, Sequence):
         require_recording(recordings)
@@ -58,11 +54,10 @@ def join(recordings: Sequence[Recording]) -> Recording:
     first = recordings[0]
     if len(recordings) == 1:
         return first
+    unit = first.plan.instrumentation.unit
     for other in recordings[1:]:
-        if other.plan.instrumentation.unit != first.plan.instrumentation.unit:
-            raise ParameterError(
-                "reading unit", other.plan.instrumentation.unit, f"{first.plan.instrumentation.unit!r}, as the first"
-            )
+        if other.plan.instrumentation.unit != unit:
+            raise ParameterError("reading unit", other.plan.instrumentation.unit, f"{unit!r}, as the first")
     for (i, one), (j, other) in itertools.combinations(enumerate(recordings), 2):
         if _is_same_recording(one, other):
             found = f"{_recording_label(one, i)} (number {i + 1}) and {_recording_label(other, j)} (number {j + 1})"
@@ -85,17 +80,17 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
     """
     first = plans[0]
     plans = [with_declared_height_commanded(plan, first.instrumentation.height_mm) for plan in plans]
-    patterns: dict[str, Pattern] = {}
-    names: list[str] = []
-    scan_names: list[str] = []
-    codes, scans = [], []
+    patterns, names, scan_names = dict[str, Pattern](), list[str](), list[str]()
+    codes, scans, sessions = [], [], list[int]()
     for plan in plans:
         renamed = []
         for name in plan.pattern_names:
-            described = plan.patterns.get(name)
-            own = name
-            if described is not None and name in patterns and patterns[name] is not described:
-                own = name if _is_same_pattern(patterns[name], described) else unused_name(name, {*names, *patterns})
+            own, described, known = name, plan.patterns.get(name), patterns.get(name)
+            if described is not None and known is not None and known is not described:
+                # Of the same kind and values and, of an image, the name of its file.
+                same = have_same_albedo(known, described)
+                same = same and getattr(known, "file", None) == getattr(described, "file", None)
+                own = name if same else unused_name(name, {*names, *patterns})
             if described is not None:
                 patterns[own] = described
             if own not in names:
@@ -103,13 +98,17 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
             renamed.append(names.index(own))
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
-        scan_names += _unused_scan_names(plan.scan_names, scan_names)
+        # Names that are taken change; names that differ stay different.
+        new: dict[str, str] = {}
+        for name in dict.fromkeys(plan.scan_names):
+            new[name] = unused_name(name, {*scan_names, *new.values(), *({*plan.scan_names} - {name})})
+        scan_names += [new[name] for name in plan.scan_names]
+        before = max(sessions, default=-1) + 1
+        sessions += [before + session for session in plan.sessions or (0,) * len(plan.scan_names)]
     commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
+    poses = ("x_mm", "y_mm", "orientation_rad", "time_s")
     return Plan(
-        x_mm=np.concatenate([p.x_mm for p in plans]),
-        y_mm=np.concatenate([p.y_mm for p in plans]),
-        orientation_rad=np.concatenate([p.orientation_rad for p in plans]),
-        time_s=np.concatenate([p.time_s for p in plans]),
+        **{name: np.concatenate([getattr(plan, name) for plan in plans]) for name in poses},
         scan=np.concatenate(scans),
         scan_names=tuple(scan_names),
         pattern=np.concatenate(codes),
@@ -117,24 +116,8 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
         patterns=patterns,
         covariates={name: _joined_covariate(plans, name) for name in sorted({*first.covariates, *commanded})},
         instrumentation=first.instrumentation,
-        sessions=_joined_sessions(plans) if own_sessions or any(plan.sessions for plan in plans) else (),
+        sessions=tuple(sessions) if own_sessions or any(plan.sessions for plan in plans) else (),
     )
-
-
-def _unused_scan_names(names: Sequence[str], taken: Sequence[str]) -> list[str]:
-    new: dict[str, str] = {}
-    for name in dict.fromkeys(names):
-        new[name] = unused_name(name, {*taken, *new.values(), *({*names} - {name})})
-    return [new[name] for name in names]
-
-
-def _joined_sessions(plans: Sequence[Plan]) -> tuple[int, ...]:
-    """Return, for each of the joined scans, the number of the recording that it is from."""
-    found: list[int] = []
-    for plan in plans:
-        before = max(found, default=-1) + 1
-        found += [before + session for session in plan.sessions or (0,) * len(plan.scan_names)]
-    return tuple(found)
 
 
 def last_known_value(values: FloatArray, otherwise: float = math.nan) -> float:
@@ -183,10 +166,6 @@ def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str
                 as_first = "none, as" if taken is None else f"{taken:g}, that of"
                 out.append(f"{label} declares {value} for {name}: taken is {as_first} {_recording_label(first, 0)}")
     return out
-
-
-def _is_same_pattern(one: Pattern, other: Pattern) -> bool:
-    return have_same_albedo(one, other) and getattr(one, "file", None) == getattr(other, "file", None)
 
 
 def _is_same_recording(one: Recording, other: Recording) -> bool:

@@ -101,12 +101,7 @@ class PriorOdds:
     def single_effect_priors(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
         """Return the probabilities of clean, unknown and single effects alone, by names on the mean and on the noise.
 
-        Parameters
-        ----------
-        names
-            Names of the effects on the mean in the vocabulary.
-        noise
-            Names of the certain noise effects, the same for all.
+        `names` are those of the effects on the mean in the vocabulary, `noise` those of the certain noise effects.
         """
         each = math.exp(self._log_prior_per_combination(1)) if self.n_named else self.by_size[0]
         believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}

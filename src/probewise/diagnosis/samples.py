@@ -66,15 +66,8 @@ def _fit_without(found: Fit, name: str, usable: IntArray) -> Fit:
     """Return a fit without one of its effects: what that explains is in the residuals, the other parameters stay."""
     model, stay = found.model.model_and_mask_without(name)
     change = found.change_by_effect(name, usable)
-    return Fit(
-        model,
-        found.z[stay],
-        found.predicted - change,
-        found.residuals + change,
-        found.slopes[:, stay],
-        sd=found.sd,
-        objective=found.objective,
-    )
+    left, slopes = found.residuals + change, found.slopes[:, stay]
+    return Fit(model, found.z[stay], found.predicted - change, left, slopes, found.sd, found.objective)
 
 
 N_SAMPLES = 500
@@ -112,21 +105,16 @@ class ModelSamples:
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Convert a light sensor's samples to a FittedSensor, as in sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
-        from_chain = (
-            gaussians_sorted_by_mass(self.theta, self.n_gaussians) if self.has_exchangeable_gaussians else self.theta
-        )
+        from_chain = self.theta
+        if self.has_exchangeable_gaussians:
+            from_chain = gaussians_sorted_by_mass(self.theta, self.n_gaussians)
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_median_step_mm(recording))
         field = posterior_mean_ssf_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
         residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
-        scan_noise = noise_by_scan(
-            residuals,
-            recording.plan.scan[usable],
-            recording.plan.scan_names,
-            sd_floor=sd_floor(recording),
-            sd_ceiling=sd_ceiling(recording),
-            rng=rng,
-        )
+        low, high = sd_floor(recording), sd_ceiling(recording)
+        scan, names = recording.plan.scan[usable], recording.plan.scan_names
+        scan_noise = noise_by_scan(residuals, scan, names, sd_floor=low, sd_ceiling=high, rng=rng)
         return FittedSensor(
             names=tuple(self.chain.names[i] for i in kept),
             samples=from_chain[:, kept],
@@ -176,17 +164,14 @@ def sample_model(
     effects = (*found.model.effects, *on_noise)
     null = found.model.sensor
     chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
-    own = {
-        effect.name: effect.redraw_by_variant(
-            effect_values(effect, z[:, found.model.coordinate_slice(effect.name)]), weights[effect.name], rng=rng
-        )
-        for effect in found.model.effects
-    }
-    theta = found.model.joined_theta(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
+    own = {}
+    for effect in found.model.effects:
+        values = effect_values(effect, z[:, found.model.coordinate_slice(effect.name)])
+        own[effect.name] = effect.redraw_by_variant(values, weights[effect.name], rng=rng)
+    theta = found.model.joined_theta(null.theta(z[:, : null.n_params]), own)
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
-    theta = np.concatenate(
-        [theta, *(_uniform_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1
-    )
+    of_noise = (_uniform_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)
+    theta = np.concatenate([theta, *of_noise], axis=1)
     names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
     for i in of_lattice:
@@ -200,13 +185,7 @@ def sample_model(
         least = np.where(rounding > 0, math.sqrt(8 / law.n_kept), 1)
         noise_sd = np.sqrt(np.maximum(noise_sd**2 - rounding**2 / 12, noise_sd**2 * least))
     return ModelSamples(
-        chain,
-        theta,
-        noise_sd,
-        names,
-        null.n_gaussians,
-        nuisance=null.nuisance_names,
-        has_exchangeable_gaussians=null.has_exchangeable_gaussians,
+        chain, theta, noise_sd, names, null.n_gaussians, null.nuisance_names, null.has_exchangeable_gaussians
     )
 
 

@@ -48,10 +48,8 @@ _ROUNDING = 1e-15
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:
     """Fit a system to readings, at an integration step at which likely predictions no longer change.
 
-    Returns
-    -------
-    The system with that step, the fit, and the sd of a reading: as declared, or else the smaller of the estimates from
-    the fit and from successive readings.
+    Returns the system with that step, the fit, and the sd of a reading: as declared, or else the smaller of the
+    estimates from the fit and from successive readings.
     """
     table = cast(RunTable, recording.plan)
     law = white_noise_of_recording(recording)
@@ -77,13 +75,10 @@ def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -
     A mode of the density in the priors' own coordinates leads where the evidence is larger, by Laplace's method.
     """
     model = Model(system, (), recording.plan)
-    tried = sorted(
-        fit_each_start(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_objective_or_infinity
-    )[:_BEST_STARTS]
+    tried = _best_fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED)
     longer = _starts_from_partial_runs(model, recording)
     if longer or not all(found.settled for found in tried):
-        starts = [*(found.z for found in tried), *longer]
-        tried = sorted(fit_each_start(model, recording, starts, law), key=_objective_or_infinity)
+        tried = _best_fits(model, recording, [*(found.z for found in tried), *longer], law)
     best = tried[0]
     if system.first is None and system.caller is not None and system.caller.broadcasts:
         for found in fit_each_start(model, recording, list(modes_of(system, recording, law, best.z)[0]), law):
@@ -118,16 +113,15 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
         if (part.usable & ~part.censored).sum() < system.least_readings:
             return []
-        found = sorted(
-            fit_each_start(model, part, starts, white_noise_of_recording(part), max_steps=_STEPS_TRIED),
-            key=_objective_or_infinity,
-        )
-        starts = [each.z for each in found[:_BEST_STARTS]]
+        law = white_noise_of_recording(part)
+        starts = [found.z for found in _best_fits(model, part, starts, law, max_steps=_STEPS_TRIED)]
     return starts
 
 
-def _objective_or_infinity(found: Fit) -> float:
-    return found.objective if np.isfinite(found.objective) else np.inf
+def _best_fits(model: Model, recording: Recording, starts: list[FloatArray], law: NoiseLaw, **steps: int) -> list[Fit]:
+    """Return the best few fits, the best first."""
+    found = fit_each_start(model, recording, starts, law, **steps)
+    return sorted(found, key=lambda each: each.objective if np.isfinite(each.objective) else np.inf)[:_BEST_STARTS]
 
 
 def modes_of(system: System, recording: Recording, law: NoiseLaw, found: FloatArray) -> tuple[FloatArray, int]:
@@ -136,14 +130,8 @@ def modes_of(system: System, recording: Recording, law: NoiseLaw, found: FloatAr
     In its own coordinate, the value or its logarithm, a bounded prior is flat; a normal one has its own density. Of
     modes that are equally high, as of exchangeable terms, the one nearest to the middle of the prior is first; after
     these come the lower ones. They are in standard-normal coordinates. Levenberg-Marquardt descends from many points
-    of the prior at once if predictions cost little, else from one fit.
-
-    Parameters
-    ----------
-    system, recording, law
-        The system, its readings and their noise, whose sd is the likeliest everywhere.
-    found
-        Coordinates of a fit, (n_params,).
+    of the prior at once if predictions cost little, else from one fit, of coordinates `found` (n_params,). The noise sd
+    is the likeliest everywhere.
     """
     descent = _Descent(system, recording, law)
     starts = found[None, :]
@@ -292,13 +280,7 @@ def with_step_for_likely_parameters(
     A shared parameter is followed from its best value to where the step fails, with the others refitted, as long as
     the log posterior density is within 5 nats of the best. The step becomes as short as the parameters on the way need.
     If this takes more than 4,096 steps beyond one per row, it stays longer, and `system.tally.too_stiff` is set.
-
-    Parameters
-    ----------
-    system, table, recording
-        The system, its table and its readings. One without a law is returned as it is.
-    found, sd
-        Its fit, and the sd of a reading.
+    A system without a law is returned as it is. `sd` is that of a reading.
     """
     if system.simulator.law is None:
         return system

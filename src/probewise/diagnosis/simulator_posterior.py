@@ -159,18 +159,8 @@ def draw_by_importance(
     kernels at draws of those before, by their weights, tempered where few have any, and beyond these. All draws count,
     over the mixture of all proposals and a share of the prior.
 
-    Parameters
-    ----------
-    problem
-        The model, its readings and their noise.
-    fits
-        Its modes, the most probable first.
-    law
-        White noise of the readings.
-    sizes
-        Draws of a round, kernels, rounds at most, and effective draws that suffice.
-    rng, progress
-        Source of randomness; called after each round.
+    `fits`: the modes, the most probable first; `sizes`: draws of a round, kernels, rounds at most, and effective draws
+    that suffice; `progress`: called after each round.
     """
     ridge = _Ridge(problem, fits[0], law)
     sensor, n_params = problem.model.sensor, problem.model.n_params
@@ -228,10 +218,8 @@ class _Ridge:
         points = np.concatenate([z[:, None], z[:, None] + steps[:, :, None] * self.eye], axis=1)
         predicted = self.problem.predict(points.reshape(-1, z.shape[1]))[:, usable]
         with np.errstate(all="ignore"):
-            left = (
-                self.law((self.problem.recording.readings[usable] - predicted).T).T / self._variance(self.best) ** 0.5
-            )
-            left = left.reshape(len(z), z.shape[1] + 1, -1)
+            left = self.law((self.problem.recording.readings[usable] - predicted).T).T
+            left = (left / self._variance(self.best) ** 0.5).reshape(len(z), z.shape[1] + 1, -1)
             slopes, residuals = (left[:, :1] - left[:, 1:]) / steps[:, :, None], left[:, 0]
         possible = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
         slopes, residuals = np.where(possible[:, None, None], slopes, 0.0), np.where(possible[:, None], residuals, 0.0)

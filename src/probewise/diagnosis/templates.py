@@ -91,7 +91,8 @@ class TemplateBank:
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.widths), own.shape[1]))
         for width, products in whitened.products.items():  # all templates of one width at a time
-            members, at = self._template_and_column_indices(width)
+            members = np.flatnonzero(self.widths == width)
+            at = self._first_columns[members, None] + np.arange(width)
             absorbed = taken[:, at].transpose(1, 0, 2)
             left = products - absorbed.transpose(0, 2, 1) @ absorbed
             gain, axes = _gram_eigensystems(left)
@@ -107,10 +108,6 @@ class TemplateBank:
         taken = problem.basis[: problem.n_points].T @ templates
         whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))
         return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
-
-    def _template_and_column_indices(self, width: int) -> tuple[IntArray, IntArray]:
-        members = np.flatnonzero(self.widths == width)
-        return members, self._first_columns[members, None] + np.arange(width)
 
     def _whitened_under(self, law: NoiseLaw) -> _WhitenedTemplatesAndGrams:
         """Whiten all templates, scaled to unit rms each, with Gram matrices; cached for the last few noise models."""
@@ -217,11 +214,7 @@ class TemplateCache:
         """Return one bank of the templates of several effects about a fit, of fewer variants, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
-            own = [
-                (effect.name, t)
-                for effect in effects
-                for t in self.templates_of(found, effect.with_fewer_variants()).columns
-            ]
+            own = [(e.name, t) for e in effects for t in self.templates_of(found, e.with_fewer_variants()).columns]
             self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
         return self.banks[key]
 
@@ -285,11 +278,10 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
         each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
         each[effect.name] = bank.reshape(n_rows, -1)[rows]
         theta = model.joined_theta(np.repeat(sensor, n, axis=0), each)
-        read = (
-            model.chain.predict(theta, there)
-            if seen is None
-            else model.chain.readings_from_simulated_view(seen, theta, there)
-        )
+        if seen is None:
+            read = model.chain.predict(theta, there)
+        else:
+            read = model.chain.readings_from_simulated_view(seen, theta, there)
         change[rows, kept] = read[:, at] - found.predicted[kept]
     columns = change.T
     largest = np.abs(found.predicted).max(initial=0.0)

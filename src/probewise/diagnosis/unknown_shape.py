@@ -38,7 +38,6 @@ class SensorAndShape:
     may_be_far_off = True  # without a missing effect the shape may be found at another place
 
     def coordinates(self, theta: FloatArray) -> None:
-        """Return None: what it simulates is no array of readings."""
         return None
 
     def __post_init__(self) -> None:
@@ -48,23 +47,7 @@ class SensorAndShape:
     def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:
         """Build from a calibrated sensor's posterior and a shape's prior, and search for shapes that fit the readings.
 
-        Of a set of shapes, only the best-fitting one is kept.
-
-        Parameters
-        ----------
-        sensor
-            The sensor as calibrated.
-        shape
-            The shape with its prior, or a set of shapes (`AnyOf`).
-        recording
-            The readings over it.
-        rng
-            Source of randomness, for the search.
-
-        Raises
-        ------
-        ParameterError
-            If no reading is usable.
+        Of a set of shapes (`AnyOf`), only the best-fitting one is kept. Raises ParameterError if no reading is usable.
         """
         known = sensor_from_samples(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
@@ -74,41 +57,33 @@ class SensorAndShape:
 
     @property
     def n_params(self) -> int:
-        """Number of parameters of sensor and shape."""
         return self.sensor.n_params + len(self.shape.prior.names)
 
     @property
     def n_gaussians(self) -> int:
-        """Number of Gaussians of the sensor's SSF."""
         return self.sensor.n_gaussians
 
     @property
     def effective_n_gaussians(self) -> int:
-        """Effective degrees of freedom of the sensor's SSF, counted in Gaussians."""
         return self.sensor.effective_n_gaussians
 
     @property
     def ssf_in_words(self) -> str:
-        """Description of the sensor's SSF, in words."""
         return self.sensor.ssf_in_words
 
     @property
     def has_exchangeable_gaussians(self) -> bool:
-        """Whether the sensor's Gaussians are exchangeable."""
         return self.sensor.has_exchangeable_gaussians
 
     @property
     def nuisance_names(self) -> tuple[str, ...]:
-        """Names of the shape's parameters, which apply to this recording only."""
         return self.shape.prior.names
 
     @property
     def least_readings(self) -> int:
-        """Fewest usable readings for a verdict: three per parameter of the shape, and three more."""
         return 3 * len(self.shape.prior.names) + 3
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return True: every effect can act on the sensor."""
         return self.sensor.admits(effect)
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -117,7 +92,6 @@ class SensorAndShape:
         return np.concatenate([self.sensor.theta(z[:, :k]), self.shape.prior.from_unit_cube(ndtr(z[:, k:]))], axis=1)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
-        """Build the model of a plan with effects, over the shape and the patterns that are described."""
         return self.sensor.chain_over(_ShapeAmongPatterns(self.shape, plan), effects, n_nodes=n_nodes)
 
     def with_shape_in_next_plan(self, diagnosis: Diagnosis) -> Diagnosis:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -48,15 +46,6 @@ def state(prepared):
 def _state(prepared):
     extent = Extent.of(prepared.recording)
     return state_with_nulls(prepared, {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)})
-
-
-def test_two_names_of_one_curve_have_the_same_evidence(state):
-    """An offset that follows the room, by name and as a zero that depends on the room."""
-    one, other = (
-        state.refits.refit_with_effect(state.null, state.effects[name])[0]
-        for name in ("sensitivity:room", "depends:zero:room")
-    )
-    assert one.log_z == pytest.approx(other.log_z, abs=1e-5)
 
 
 def test_a_fit_at_a_poor_optimum_is_made_again_from_where_one_more_effect_led(prepared):
@@ -123,13 +112,6 @@ def test_amounts_of_one_value_for_each_run_leave_what_they_have_in_common_to_the
     np.testing.assert_allclose(_amplitudes_in_residual(projected, residual), values, atol=0.02)
 
 
-def test_of_one_column_the_amount_is_that_of_least_squares():
-    rng = np.random.default_rng(1)
-    column, residual = rng.normal(size=(20, 1)), rng.normal(size=20)
-    exact = float(column[:, 0] @ residual / (column[:, 0] @ column[:, 0]))
-    np.testing.assert_allclose(_amplitudes_in_residual(column, residual), [exact])
-
-
 def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_line_for_each():
     """Route two: least squares with a slope of its own for each of six runs."""
     rng = np.random.default_rng(3)
@@ -147,27 +129,6 @@ def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_
     best = y - lines @ np.linalg.lstsq(lines, y)[0]
     assert np.sum(found.residuals**2) == pytest.approx(np.sum(best**2), rel=0.02)
     assert np.abs(found.z).max() < 3.0
-
-
-def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
-    """Eight pairs promise 500 nats by screening, of which six are refitted and keep nothing: the others fall, too."""
-    state = _state(prepared)
-    promised = state.null.log_z + 500.0
-    pairs = list(itertools.combinations(sorted(state.effects), 2))[:8]
-    state.about_null |= {(tuple(sorted(pair)), ()): promised for pair in pairs}
-
-    def posterior():
-        return posterior_of(
-            Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
-        )
-
-    searching._refit_favoured_by_screening(state, posterior, silent)
-    left = {
-        names: value for (names, _), value in state.screened_log_evidences().items() if names not in state.undetected
-    }
-    assert len(left) >= 2
-    assert all(value < max(c.log_z for c in state.candidates.values()) + 3.0 for value in left.values())
-    assert state.optimism > 400
 
 
 _N_RUNS, _N_SPARED = 3, 30
@@ -231,22 +192,6 @@ def test_a_fit_that_would_stay_above_what_matters_is_given_up(decaying, searched
     assert not asked.settled
     assert asked.objective > whole.objective
     assert np.isfinite(asked.slopes).all()
-
-
-def test_a_fit_that_may_still_come_down_is_not(decaying, searched_cup):
-    model = Model(decaying.null, (), decaying.recording.plan)
-    law = searched_cup.null.law
-    whole = fit(model, decaying.recording, _far_start(decaying), law)
-    same = fit(model, decaying.recording, _far_start(decaying), law, hopeless_above=whole.objective + 1.0)
-    np.testing.assert_array_equal(same.z, whole.z)
-
-
-def test_only_fits_of_a_law_are_given_up(decaying, searched_cup, prepared_line, searched_line):
-    for ready, searched, spared in ((decaying, searched_cup, True), (prepared_line, searched_line, False)):
-        refits = searched.refits
-        best = min(candidate.found.objective for candidate, _ in refits.known.values())
-        limit = refits._hopeless_above(Model(ready.null, (), ready.recording.plan))
-        assert limit == (best + 40.0 if spared else math.inf)
 
 
 def test_a_start_of_its_own_in_each_run_does_not_make_every_effect_be_refitted(prepared_line, monkeypatch):

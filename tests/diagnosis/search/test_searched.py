@@ -52,10 +52,6 @@ def test_an_evidence_that_is_no_number_leaves_all_others_as_they_are():
     assert by_mean == posterior().marginal_over_noise
 
 
-def test_orders_are_those_of_the_clean_mean_alone():
-    assert posterior().order_probabilities == {1: pytest.approx(0.25), 2: pytest.approx(0.75)}
-
-
 def test_orders_are_averaged_over_noises_by_the_prior_of_the_noise():
     """Order 2 leads only under outliers; by prior times evidence, not by evidence alone, order 1 is more probable."""
     by_noise = {1: {(): 0.0, ("outliers",): 0.0}, 2: {(): -1.0, ("outliers",): 0.5}}
@@ -68,13 +64,6 @@ def test_orders_are_averaged_over_noises_by_the_prior_of_the_noise():
     found = posterior_of(Evidences(fits), PRIOR, certain=(), n_forms=2).order_probabilities
     assert found[1] == pytest.approx(first / (first + second))
     assert found[1] > 0.5
-
-
-def test_evidence_that_is_moved_moves_what_is_unknown_beside_it():
-    moved = EVIDENCES.with_log_evidence_shifted({(1, ()): 2.0})
-    assert moved.unknown[1, (), ()] == 3.0
-    assert [moved.fits[key].evidence[()].log_z for key in ((1, ()), (1, ("lag",)))] == [2.0, 5.0]
-    assert EVIDENCES.unknown[1, (), ()] == 1.0
 
 
 def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_stated():
@@ -167,13 +156,6 @@ def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named,
     assert evidences.reported_shares((FORMULA, "offset_drift")) == {known: 1.0}
 
 
-def test_names_stay_and_the_unknown_stays():
-    evidences = of({("interference",): 5.0})
-    assert evidences.reported_shares(("interference",)) == {("interference",): 1.0}
-    assert evidences.reported_shares(("unknown",)) == {("unknown",): 1.0}
-    assert evidences.reported_shares(()) == {(): 1.0}
-
-
 def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formulas_alone():
     def fit(log_z, *names):
         evidence = {("outliers",): SimpleNamespace(log_z=log_z)}
@@ -208,20 +190,6 @@ def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():
     unknown = {(0, (), ()): 10.0, (0, ("lag",), ()): 10.0 + more}
     searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
     assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
-
-
-def test_each_order_of_the_ssf_counts_with_its_own_evidence():
-    """A second order 20 nats behind, in which `lag` alone is likely, changes nothing."""
-    prior = PriorOdds()
-    more = math.log(3.0) + prior.log_prior_with_unknown(()) - prior.log_prior_with_unknown(("lag",))
-    unknown = {(1, (), ()): 10.0, (1, ("lag",), ()): 10.0 + more, (2, (), ()): -40.0, (2, ("lag",), ()): -10.0}
-    searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
-    assert Searched.effect_probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})
-
-
-def test_nothing_stands_beside_what_was_not_weighed():
-    searched = SimpleNamespace(evidences=Evidences({}), prior=PriorOdds(), certain=())
-    assert Searched.effect_probabilities_given_unknown(searched) == {}
 
 
 def test_what_is_unknown_has_a_noise_too():

@@ -173,13 +173,6 @@ def test_what_predicts_the_same_as_a_name_is_left_out():
     assert (1, PUSH) not in stay
 
 
-def test_two_names_do_not_speak_for_one_effect_without():
-    stay, _ = prune_out_of_vocabulary(
-        by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES
-    )
-    assert stay[1, PUSH].log_z == 2.0
-
-
 @pytest.mark.parametrize(
     ("name", "beside", "speaks"),
     [(-1.0, 0.0, True), (-1.0, 2.5, False), (-4.0, -4.0, False)],

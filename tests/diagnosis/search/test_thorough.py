@@ -75,15 +75,6 @@ def test_the_weighing_says_first_how_long_it_may_take_and_then_how_far_it_is(ste
     assert {each for each, *_ in told} == {stage}
 
 
-def test_the_time_of_a_weighing_grows_with_its_live_points_and_its_hypotheses(stepped):
-    leaders = thorough._leading_hypotheses(stepped)
-    few, many = (
-        thorough._least_and_most_minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000)
-    )
-    assert few[0] < few[1] < many[1]
-    assert thorough._minutes_in_words((3.2, 14.1)) == "3 to 15 minutes"
-
-
 @pytest.mark.slow
 def test_a_line_weighs_what_quadrature_says():
     """The noise's sd integrated out in closed form, 1/2 Gamma(n/2) (pi rss)^(-n/2), then a fine grid over a and b."""
@@ -134,25 +125,6 @@ def test_a_wave_weighs_what_quadrature_over_all_its_phases_says():
     assert candidate.log_share == pytest.approx(math.log(2))
     assert told.nested == pytest.approx(truth + candidate.log_detectable, abs=0.05 + 4 * told.error)
     assert told.error < 0.1
-
-
-@pytest.mark.slow
-def test_the_null_is_always_weighed_too(stepped):
-    found, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
-    assert {"ambient_step", "clean"} <= {w.label for w in weighings}
-    assert all(w.agree for w in weighings)
-    assert found.posterior.probabilities == stepped.posterior.probabilities
-
-
-@pytest.mark.slow
-def test_where_no_density_fits_the_runs_themselves_become_sharp(stepped, monkeypatch):
-    monkeypatch.setattr(thorough.nested, "refine", lambda *_, **__: SimpleNamespace(sound=False))
-    monkeypatch.setattr(thorough, "_SHARP", 0.1)
-    _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
-    for weighing in weighings:
-        assert weighing.agree
-        assert not weighing.doubts
-        assert weighing.error < 0.15  # one round alone leaves 0.18
 
 
 def stub_of_the_whole_prior(monkeypatch, change):
@@ -222,12 +194,6 @@ def test_nested_sampling_wins_where_it_disagrees(stepped, monkeypatch):
     found, _ = moved(stepped, monkeypatch, 2.5)
     assert odds(found) / odds(stepped) == pytest.approx(math.exp(2.0))
     assert sum(found.posterior.probabilities.values()) == pytest.approx(1.0)
-
-
-def test_what_is_unknown_beside_a_hypothesis_moves_with_it(stepped, monkeypatch):
-    found, _ = moved(stepped, monkeypatch, 2.5)
-    for key, value in found.evidences.unknown.items():
-        assert value - stepped.evidences.unknown[key] == pytest.approx(2.0 if key[1] else 0.0)
 
 
 def test_within_a_nat_laplace_stands(stepped, monkeypatch):

@@ -51,6 +51,7 @@ _HOPELESS = 40.0
 _FEW_VARIANTS = 2  # of an effect, which are all refitted: screening is no judge of a bound
 _VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
 _MOST_FAULTS = 3  # of the noise at once
+_MANY = 12  # nodes of one effect above which they are thinned before combination with another's
 # Nats behind the best to which refined nodes must be able to raise a noise model: further back it does not count.
 _NOISE_NODES_REFINED_WITHIN = 10.0
 
@@ -99,10 +100,8 @@ class WeighedFit:
 
         An evidence that is no number counts as minus infinity: it must not spoil the probabilities of all others.
         """
-        return replace(
-            self,
-            evidence={noise: replace(e, log_z=or_impossible(e.log_z + by)) for noise, e in self.evidence.items()},
-        )
+        shifted = {noise: replace(e, log_z=or_impossible(e.log_z + by)) for noise, e in self.evidence.items()}
+        return replace(self, evidence=shifted)
 
     @property
     def n_gaussians(self) -> int:
@@ -175,11 +174,9 @@ WITH_MEMORY = frozenset({CorrelatedNoise.name, RandomWalk.name})
 class NoiseModels:
     """The noise models of one recording: each noise effect alone, and pairs and triples if fewer are significant.
 
-    `models`: noise models by the names of their effects; `certain`: noise effects that the readings show beyond doubt,
-    part of every model; `least_sd`: the least plausible sd of a reading.
-
-    `sd_about_fit` is the noise sd about a first fit, infinite without one. Rounding is judged by it too, since
-    successive readings tell the noise only if the signal varies little from one to the next.
+    `certain`: noise effects that the readings show beyond doubt, part of every model; `least_sd`: the least plausible
+    sd of a reading; `sd_about_fit`: the noise sd about a first fit, infinite without one. Rounding is judged by it too,
+    since successive readings tell the noise only if the signal varies little from one to the next.
     """
 
     recording: Recording
@@ -197,11 +194,8 @@ class NoiseModels:
         sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
         seen = Quantisation.seen_above * sd < self._step
         rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
-        shown = {
-            name: effect.parameters_known_before_fit
-            for name, effect in self.effects.items()
-            if effect.parameters_known_before_fit is not None
-        }
+        before = {name: effect.parameters_known_before_fit for name, effect in self.effects.items()}
+        shown = {name: values for name, values in before.items() if values is not None}
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))
         self._hidden = sd < HIDDEN * self._step
@@ -264,30 +258,24 @@ class NoiseModels:
                 both = tuple(sorted({*first, *other}))
                 if len(self._uncertain_names(both)) != size + 1 or set(both) >= WITH_MEMORY:
                     continue
-                coarse = self.models[other].coarse_nodes_by_effect()
+                coarse = {}  # of effects with many nodes of one parameter, every third
+                for effect in self.models[other].effects:
+                    nodes = effect.bank()[:, 0, :]
+                    if len(nodes) > _MANY and nodes.shape[1] == 1:
+                        coarse[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
                 nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
                 least = best - ALIASED_NATS - self.log_prior(both)
                 own = refined(found, nearby, least=least)
                 if own.log_z > least:
-                    recentred = self._nodes_beside(found, nearby, self._uncertain_names(first))
+                    # Of all nodes of each effect, the likeliest beside the likeliest of the others.
+                    best_of = {name: nearby.likeliest_nodes_of_effect(name) for name in self._uncertain_names(both)}
+                    recentred = {}
+                    for name in self._uncertain_names(first):
+                        beside = {k: nodes for k, nodes in best_of.items() if k != name}
+                        again = laplace_evidence(found, self._build_model(both, beside))
+                        recentred[name] = again.likeliest_nodes_of_effect(name)
                     self.models[both], known[both] = self._build_model(both, recentred | coarse), own
         return True
-
-    def _nodes_beside(
-        self, found: Fit, evidence: NoiseEvidence, names: Names
-    ) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return the likeliest nodes of each effect named, of all its nodes, beside the likeliest nodes of the others.
-
-        `evidence` is that of a fit under all effects together, of which each has only few nodes.
-        """
-        effects = self._uncertain_names(evidence.noise.names)
-        likely = {name: evidence.likeliest_nodes_of_effect(name) for name in effects}
-        out = {}
-        for name in names:
-            beside = {other: nodes for other, nodes in likely.items() if other != name}
-            again = laplace_evidence(found, self._build_model(evidence.noise.names, beside))
-            out[name] = again.likeliest_nodes_of_effect(name)
-        return out
 
     def _uncertain_names(self, names: Names) -> Names:
         return tuple(n for n in names if n not in self.certain)
@@ -384,9 +372,8 @@ class Refits:
             found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
         else:
             evidence = self.noises.evidence_by_noise(found)
-        return WeighedFit.of(
-            found, law, evidence, log_probability_effects_detectable(found, law, self.templates.usable)
-        )
+        detectable = log_probability_effects_detectable(found, law, self.templates.usable)
+        return WeighedFit.of(found, law, evidence, detectable)
 
     def fits_better_at_z(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
         """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""

@@ -163,10 +163,8 @@ class UnknownEffects:
                 return False
             if self._log_evidence_with_unknown(candidate) == -np.inf:
                 self.weigh_beside([candidate])
-            if (
-                self._log_evidence_with_unknown(candidate) - self._log_evidence_without_unknown(candidate)
-                < ALIASED_NATS
-            ):
+            more = self._log_evidence_with_unknown(candidate) - self._log_evidence_without_unknown(candidate)
+            if more < ALIASED_NATS:
                 return True
         return False
 
@@ -200,15 +198,11 @@ def search(
     prior = prior or prepared.apparatus.prior_odds(effects)
     on_mean = {name: effect for name, effect in effects.items() if name not in prepared.noise_effect_names}
     on_noise = {name: cast(NoiseEffect, effect) for name, effect in effects.items() if name not in on_mean}
-    refits = (
-        Refits(
-            prepared.null,
-            NoiseModels(recording, on_noise, prior, noise_sd_about_given_null(prepared)),
-            TemplateCache(prepared.usable_rows),
-        )
-        if after is None
-        else after.refits
-    )
+    if after is None:
+        models = NoiseModels(recording, on_noise, prior, noise_sd_about_given_null(prepared))
+        refits = Refits(prepared.null, models, TemplateCache(prepared.usable_rows))
+    else:
+        refits = after.refits
     noises, templates, own = refits.noises, refits.templates, prepared.apparatus.user_effect_names(on_mean)
     if prepared.null is not None and prepared.null.may_be_far_off:
         own = frozenset(on_mean)
@@ -217,16 +211,7 @@ def search(
     def share_is_spent(share: float) -> bool:
         return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
-    state = SearchState(
-        on_mean,
-        prior,
-        noises=noises,
-        templates=templates,
-        refits=refits,
-        tried_always=own,
-        progress=progress,
-        share_is_spent=share_is_spent,
-    )
+    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, share_is_spent)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
     else:
@@ -262,13 +247,13 @@ def search(
     return Searched(
         prepared,
         prior,
-        noise_models=noises.models,
-        certain=noises.certain,
-        nulls=state.sensors,
-        misfit_templates=misfit_templates,
-        refits=refits,
-        evidences=evidences(),
-        posterior=posterior(),
+        noises.models,
+        noises.certain,
+        state.sensors,
+        misfit_templates,
+        refits,
+        evidences(),
+        posterior(),
     )
 
 

@@ -97,13 +97,13 @@ class Evidences:
     def best_formula_beside(self, fit: WeighedFit, noise: Names) -> WeighedFit | None:
         """Return the refit of largest evidence that adds formulas alone to the effects of another fit, if any."""
         options = [
-            (more.evidence[noise].log_z, more)
+            more
             for (n, names), more in self.fits.items()
             if n == fit.n_gaussians
             and {*fit.names} < {*names}
             and all(name.startswith(PROPOSAL) for name in {*names} - {*fit.names})
         ]
-        return max(options, key=lambda option: option[0], default=(0.0, None))[1]
+        return max(options, key=lambda more: more.evidence[noise].log_z, default=None)
 
     def one_name_outweighs_unnamed(self) -> bool:
         """Return whether some named effect, on mean or noise, has more evidence alone than any unnamed effect alone.
@@ -250,10 +250,9 @@ class MisfitTemplates:
 class Searched:
     """Result of a search.
 
-    `prepared`: input of the search; `prior`: prior odds; `noise_models`, `certain`: noise models by the names of their
-    effects; names of the noise effects beyond doubt; `nulls`: the null by SSF order (number of Gaussians), without
-    fits; `misfit_templates`: templates by which a fit is tested; `refits`: all refits, for another search of the same
-    recording; `evidences`, `posterior`: evidences and probabilities of all hypotheses.
+    `noise_models`, `certain`: noise models by the names of their effects; names of the noise effects beyond doubt;
+    `nulls`: the null by SSF order (number of Gaussians), without fits; `refits`: all refits, for another search of the
+    same recording.
     """
 
     prepared: Prepared
@@ -274,13 +273,10 @@ class Searched:
     def with_prior_probabilities(self) -> Searched:
         """Return the result with prior instead of posterior probabilities, for readings without information."""
         effects = self.prepared.effects
-        on_mean = [
-            name
-            for name in effects
-            if name not in self.prepared.noise_effect_names
-            and not effects_out_of_vocabulary((name,))
-            and name_of_first_copy(name) is None
-        ]
+        named = (
+            name for name in effects if not effects_out_of_vocabulary((name,)) and name_of_first_copy(name) is None
+        )
+        on_mean = [name for name in named if name not in self.prepared.noise_effect_names]
         probabilities = self.prior.single_effect_priors(on_mean, self.certain)
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
 

@@ -79,11 +79,9 @@ _REFITTED_AT_OTHER_ORDERS = 1e-4  # probability of such a combination, among tho
 class SearchState:
     """The mutable state of a search. A candidate is a refitted combination of effects with one number of Gaussians.
 
-    `effects`: effects on the mean, by name; `prior`: prior odds; `noises`: the noise models; `templates`: cache of
-    templates of effects about fits; `refits`: fits of the recording; `tried_always`: effects that are always refitted
-    alone, whatever their score by screening; `progress`: called at every refit; `share_is_spent`: function of a share:
-    whether that share of this search's budget of refits is spent; `share`: share of the budget that may be spent by
-    now.
+    `effects`: effects on the mean, by name; `tried_always`: effects that are always refitted alone, whatever their
+    score by screening; `progress`: called at every refit; `share_is_spent`: function of a share: whether that share of
+    this search's budget of refits is spent; `share`: share of the budget that may be spent by now.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
@@ -141,10 +139,9 @@ class SearchState:
 
     def template_banks(self, about: WeighedFit) -> list[TemplateBank]:
         """Return the template banks of what a candidate lacks, about it: in the vocabulary, and out of it if any."""
-        lacking = {name: effect for name, effect in self.effects.items() if name not in about.names}
-        named = [effect for name, effect in lacking.items() if not effects_out_of_vocabulary((name,))]
-        rest = [effect for name, effect in lacking.items() if effects_out_of_vocabulary((name,))]
-        return [self.templates.coarse_bank(about.found, effects) for effects in (named, rest) if effects]
+        lacking = [effect for name, effect in self.effects.items() if name not in about.names]
+        parts = ([e for e in lacking if bool(effects_out_of_vocabulary((e.name,))) == rare] for rare in (False, True))
+        return [self.templates.coarse_bank(about.found, effects) for effects in parts if effects]
 
     def log_bayes_factors_by_effect(
         self, parent: WeighedFit, law: NoiseLaw, about: WeighedFit
@@ -153,10 +150,10 @@ class SearchState:
 
         The templates are those about `about`: the candidate, or its null.
         """
-        of_banks = [
-            self.refits.log_bayes_factors_by_label(parent.found, law, bank) for bank in self.template_banks(about)
-        ]
-        return {name: own for scores in of_banks for name, own in scores.items()}
+        out: dict[str, FloatArray] = {}
+        for bank in self.template_banks(about):
+            out |= self.refits.log_bayes_factors_by_label(parent.found, law, bank)
+        return out
 
     def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
         """Return the penalty in nats of effects at an SSF with fewer degrees of freedom than the null alone needs.
@@ -164,12 +161,10 @@ class SearchState:
         `each` is the penalty per degree of freedom; by default that of the prior. It is averaged over the orders of the
         null, so that a small chance lead of one order has little effect.
         """
-        nulls = self.nulls
-        log_z = np.array([c.log_z for c in nulls])
-        spared = np.array([max(c.ssf_degrees_of_freedom - degrees_of_freedom, 0) for c in nulls])
-        return float(
-            logsumexp(log_z) - logsumexp(log_z - (self.prior.complexity_penalty if each is None else each) * spared)
-        )
+        log_z = np.array([c.log_z for c in self.nulls])
+        spared = np.array([max(c.ssf_degrees_of_freedom - degrees_of_freedom, 0) for c in self.nulls])
+        each = self.prior.complexity_penalty if each is None else each
+        return float(logsumexp(log_z) - logsumexp(log_z - each * spared))
 
     def penalty_of_extending(self, parent: WeighedFit) -> float:
         """Return the complexity penalty of the first effect that is added to a candidate, in nats; 0 if it has some."""
@@ -187,18 +182,13 @@ class SearchState:
 
         Returns the best candidate of the resulting combination, possibly an earlier one; None if there is none.
         """
-        against = self.penalty_of_extending(parent)
+        against, names = self.penalty_of_extending(parent), tuple(sorted((*parent.names, added)))
         if self.share_is_spent(self.share):
-            return max(
-                self.candidates_of_combination(tuple(sorted((*parent.names, added)))),
-                key=lambda c: c.log_z,
-                default=None,
-            )
+            return max(self.candidates_of_combination(names), key=lambda c: c.log_z, default=None)
         self.extended.add((parent, added))
         try:
             candidate, scores = self.refits.refit_with_effect(parent, self.effects[added], against)
         except NotConvergedError:  # its model diverges from every start
-            names = tuple(sorted((*parent.names, added)))
             self.about_parts |= {(names, noise): e.log_z - against for noise, e in parent.evidence.items()}
             self.undetected.add(names)
             return None
@@ -209,7 +199,6 @@ class SearchState:
             return known
         # Laplace fails where an effect is too small to be significant and the closed form does not; but the
         # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
-        names = tuple(sorted((*parent.names, added)))
         for noise, value in scores.items():
             self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
         self.undetected.add(names)
@@ -226,9 +215,8 @@ class SearchState:
         for held in self.candidates_of_combination(tuple(name for name in candidate.names if name != left_out)):
             alike = held.n_gaussians == candidate.n_gaussians and set(model.effects) == set(held.found.model.effects)
             if alike and self.refits.fits_better_at_z(model, start, held):
-                again = self.refits.fit_and_weigh(model, start[None, :], candidate.law).with_variant_factor_and_weights(
-                    held.log_share, held.weights
-                )
+                again = self.refits.fit_and_weigh(model, start[None, :], candidate.law)
+                again = again.with_variant_factor_and_weights(held.log_share, held.weights)
                 if again.log_z > held.log_z + SAME_MODE:
                     self.store_candidate(again)
                     self.refits.replace_fit(held, again)
@@ -434,7 +422,10 @@ def _proposals_to_refit(
         alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
         return [*alone[:1], *_proposals_under_simplest_noise(state, null), *alone[1:]]
     if size == 2:
-        proposals = _with_larger_pair_scores(state, proposals)
+        best = _largest_scores_about_null(state)
+        proposals = {
+            names: replace(own, score=max(own.score, best.get(names, own.score))) for names, own in proposals.items()
+        }
     chosen = promising_combinations(state, proposals, width=_BEAM, behind=ALIASED_NATS)
     more = [*_leading_under_simplest_noise(state, proposals), *_pairs_of_repeatable_effects(state, null)]
     return [proposals[names] for names in dict.fromkeys([*chosen, *more]) if names in proposals]
@@ -448,9 +439,8 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:_PAIRED]
         singles = {name: singles[name] for name in ranked}
         templates = {name: state.templates.templates_of(null.found, state.effects[name]) for name in ranked}
-        for pair, value in log_bayes_factors_of_pairs(
-            Linearised.of(null.found, evidence.likeliest_law), templates, singles
-        ).items():
+        about = Linearised.of(null.found, evidence.likeliest_law)
+        for pair, value in log_bayes_factors_of_pairs(about, templates, singles).items():
             state.about_null[pair, noise] = evidence.log_z + value
 
 
@@ -499,10 +489,7 @@ def _leading_and_not_far_behind(
 ) -> list[Names]:
     """Choose combinations by their log posterior `odds`, as `promising_combinations` does."""
     ranked = sorted(odds, key=lambda names: -odds[names])
-    named, rest = (
-        [n for n in ranked if not effects_out_of_vocabulary(n)],
-        [n for n in ranked if effects_out_of_vocabulary(n)],
-    )
+    named, rest = ([n for n in ranked if bool(effects_out_of_vocabulary(n)) == rare] for rare in (False, True))
     return [
         names
         for names in [*named[:width], *rest[:_MOST_OUT_OF_VOCABULARY]]
@@ -602,15 +589,6 @@ def _leading_under_simplest_noise(state: SearchState, proposals: Mapping[Names, 
     return sorted(odds, key=lambda names: -odds[names])[:_LEADING_PLAINLY]
 
 
-def _with_larger_pair_scores(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
-    """Replace each proposal's score by the log evidence of the pair about the null, where that is larger."""
-    best = _largest_scores_about_null(state)
-    return {
-        names: replace(proposal, score=best[names]) if best.get(names, proposal.score) > proposal.score else proposal
-        for names, proposal in proposals.items()
-    }
-
-
 def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
@@ -636,18 +614,14 @@ def eliminate_backward(state: SearchState) -> None:
             state.refit_stepwise(others)
         for candidate in state.candidates_of_combination(names):
             state.refit_subset_from(candidate, left_out)
-        held = state.candidates_of_combination(others)
-        if held:
-            _refit_leading_extensions(state, max(held, key=lambda c: c.log_z), names)
-
-
-def _refit_leading_extensions(state: SearchState, held: WeighedFit, names: Names) -> None:
-    """Refit a candidate with one more effect: the one that makes it `names`, and those that screening favours."""
-    proposals = proposals_for(state, held, {})
-    chosen = [names, *promising_combinations(state, proposals, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
-    for added in [proposals[key].added for key in chosen if key in proposals]:
-        if (held, added) not in state.extended:
-            state.refit_with_effect(held, added)
+        held = max(state.candidates_of_combination(others), key=lambda c: c.log_z, default=None)
+        if held is None:
+            continue
+        proposals = proposals_for(state, held, {})
+        chosen = [names, *promising_combinations(state, proposals, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
+        for added in [proposals[key].added for key in chosen if key in proposals]:
+            if (held, added) not in state.extended:
+                state.refit_with_effect(held, added)
 
 
 def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
@@ -662,24 +636,17 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
     for k, names in enumerate(leaders[:_MOST_AT_OTHER_ORDERS]):
         state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _MOST_AT_OTHER_ORDERS))
         held = state.candidates_of_combination(names)
-        if held and by_mean[names] >= _REFITTED_AT_OTHER_ORDERS * known:
-            source = max(held, key=lambda c: c.log_z)
-            for n in _orders_to_refit(state, source):
+        if not held or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
+            continue
+        source = max(held, key=lambda c: c.log_z)
+        own = state.candidates[source.n_gaussians, ()].log_z
+        for n, sensor in state.sensors.items():
+            # A freer SSF that the evidence rejects by itself is also rejected with an effect.
+            ahead, more = state.candidates[n, ()].log_z - own, sensor.effective_n_gaussians
+            is_freer, is_much_freer = (more >= source.ssf_degrees_of_freedom + k for k in (0, 2))
+            rejected = (is_freer and ahead <= -_REFITTED_WITHIN) or (is_much_freer and ahead <= 0)
+            if (n, names) not in state.candidates and not rejected:
                 _refit_at_order(state, source, n)
-
-
-def _orders_to_refit(state: SearchState, source: WeighedFit) -> list[int]:
-    """List the other numbers of Gaussians with which a candidate's effects should be refitted."""
-    own = state.candidates[source.n_gaussians, ()].log_z
-    behind = own - _REFITTED_WITHIN
-    return [
-        n
-        for n, sensor in state.sensors.items()
-        if (n, source.names) not in state.candidates
-        # A freer SSF that the evidence rejects by itself is also rejected with an effect.
-        and (sensor.effective_n_gaussians < source.ssf_degrees_of_freedom or state.candidates[n, ()].log_z > behind)
-        and (sensor.effective_n_gaussians <= source.ssf_degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
-    ]
 
 
 def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
@@ -692,11 +659,7 @@ def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
         state.refits.likeliest_law(source),
         max_steps=15,
     )
-    log_share = (
-        source.log_share
-        + state.complexity_penalty(source.ssf_degrees_of_freedom)
-        - state.complexity_penalty(sensor.effective_n_gaussians)
-    )
-    candidate = candidate.with_variant_factor_and_weights(log_share, source.weights)
+    before, after = map(state.complexity_penalty, (source.ssf_degrees_of_freedom, sensor.effective_n_gaussians))
+    candidate = candidate.with_variant_factor_and_weights(source.log_share + before - after, source.weights)
     if is_significantly_better(candidate, null):
         state.store_candidate(candidate)

@@ -133,9 +133,8 @@ def weigh_thoroughly(
     require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
     leaders = _leading_hypotheses(searched)
-    bar = _ProgressBar(
-        progress, len(leaders), _least_and_most_minutes(leaders, searched, n_live, rng=np.random.default_rng(0))
-    )
+    minutes = _least_and_most_minutes(leaders, searched, n_live, rng=np.random.default_rng(0))
+    bar = _ProgressBar(progress, len(leaders), minutes)
     for k, ((candidate, noise), own) in enumerate(zip(leaders, rng.spawn(len(leaders)), strict=True)):
         key = candidate.n_gaussians, candidate.names
         weighings[key] = _weigh_by_nested_sampling(

@@ -76,6 +76,13 @@ def test_a_part_held_out_of_noise_with_memory_has_its_density_given_the_rest(kin
     assert found.sum() == pytest.approx(
         multivariate_normal(np.zeros(n), every).logpdf(readings) - kept.logpdf(readings[~out])
     )
+    told = every[np.ix_(out, ~out)] @ np.linalg.inv(every[np.ix_(~out, ~out)])
+    left, variance = (
+        readings[out] - told @ readings[~out],
+        np.diag(every[np.ix_(out, out)] - told @ every[~out][:, out]),
+    )
+    alone = sequential_log_densities(law, out, readings, slopes, mean, spread, sigma**2, each_alone=True)
+    np.testing.assert_allclose(alone, -0.5 * (np.log(2 * np.pi * variance) + left**2 / variance), rtol=1e-6)
 
 
 def test_a_parameter_of_one_part_stays_its_own_where_integration_leaves_rounding_in_the_others():

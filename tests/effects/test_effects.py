@@ -14,48 +14,37 @@ from probewise._words import value_with_sd
 from probewise.diagnosis.findings import parameters_found
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
-from probewise.effects.noise import CorrelatedNoise, Dropouts
+from probewise.effects.noise import Dropouts
 from probewise.effects.optics import distinct_scan_lines
 from probewise.effects.reference import Origin, orientation_deg, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters, Poses, Stage
+from probewise.sensor import Chain, FixedLevels, FixedMixture, Poses, Stage
 
 PLAN = with_jittered_times(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
 
 
-def there_and_back() -> Plan:
-    x = np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])
-    return Plan(
-        x_mm=x,
-        y_mm=np.zeros(6),
-        orientation_rad=np.zeros(6),
-        time_s=np.arange(6) * 10.0,
-        scan=[0, 0, 0, 1, 1, 1],
-        scan_names=("out", "back"),
-        pattern=np.zeros(6),
-        pattern_names=("edge",),
-        patterns={"edge": HalfPlane(0.0, 0.0)},
-    )
-
-
-def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = None) -> Plan:
-    """Readings at these places, a second apart."""
+def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = None, every_s: float = 1.0) -> Plan:
+    """Readings at these places, one after the other."""
     n = len(x_mm)
     return Plan(
         x_mm=x_mm,
         y_mm=y_mm,
         orientation_rad=np.zeros(n),
-        time_s=np.arange(float(n)),
+        time_s=every_s * np.arange(n),
         scan=np.zeros(n, dtype=int) if scan is None else scan,
         scan_names=("out", "back")[: 1 if scan is None else 2],
         pattern=np.zeros(n, dtype=int),
         pattern_names=("edge",),
         patterns={"edge": HalfPlane(0.0, 0.0)},
     )
+
+
+def there_and_back() -> Plan:
+    return plan_along(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0]), np.zeros(6), np.repeat([0, 1], 3), every_s=10.0)
 
 
 def base() -> Chain:
@@ -263,6 +252,15 @@ def test_an_effect_that_could_not_show_is_not_built():
     nowhere = Extent(10.0, 60.0, plan.take(np.arange(404, 405)))
     for name in ("periodic_position_error", "glint", "ambient_step", "missing_tooth"):
         assert EFFECTS[name].for_extent(nowhere) is None
+    still = replace(there_and_back(), time_s=np.zeros(6))
+    opposite = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.3 + np.pi], 3))
+    turned = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.7], 3))
+    for name, own, shows in (
+        ("overshoot", still, False),
+        ("polarisation", opposite, False),
+        ("polarisation", turned, True),
+    ):
+        assert (EFFECTS[name].for_extent(Extent(10.0, 60.0, own)) is not None) is shows
 
 
 OF_MOUNTINGS = ("scan_angle_error", "height_offset")
@@ -587,11 +585,6 @@ def test_frequencies_lie_close_enough_to_find_any():
     assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
 
 
-def test_an_overshoot_needs_time_that_passes():
-    plan = replace(there_and_back(), time_s=np.zeros(6))
-    assert EFFECTS["overshoot"].for_extent(Extent(10.0, 60.0, plan)) is None
-
-
 @pytest.mark.parametrize(("gap", "told"), [(0.03, True), (0.0, False)])
 def test_a_size_of_either_sign_is_told_with_its_range(gap, told):
     """And one that is not told from 0 has no sign to tell."""
@@ -599,13 +592,6 @@ def test_a_size_of_either_sign_is_told_with_its_range(gap, told):
     samples = np.stack([share + gap * np.sign(share), np.full(500, 6.0)], axis=1)
     said = sentence_from_samples(EFFECTS["overshoot"](), samples)
     assert ("; its size share may have either sign, between -0.05" in said) is told
-
-
-def test_polarisation_shows_only_in_orientations_that_differ():
-    opposite = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.3 + np.pi], 3))
-    assert EFFECTS["polarisation"].for_extent(Extent(10.0, 60.0, opposite)) is None
-    turned = replace(there_and_back(), orientation_rad=np.repeat([0.3, 0.7], 3))
-    assert EFFECTS["polarisation"].for_extent(Extent(10.0, 60.0, turned)) is not None
 
 
 def test_a_soft_saturation_is_below_its_limit_and_nothing_far_below():
@@ -619,13 +605,6 @@ def test_nonlinearity_keeps_black_and_white():
     values = np.array([[-1e-17, 0.0, 0.25, 1.0, 1 + 1e-15]])
     out = VOCABULARY["nonlinearity"]().apply(values, np.array([[0.5]]), there_and_back())
     np.testing.assert_allclose(out, [[0.0, 0.0, 0.5, 1.0, 1.0]])
-
-
-def test_correlated_noise_sets_the_memory_and_not_the_sd():
-    level = NoiseParameters(sd=np.full((1, 1), 0.6), rho=np.zeros((1, 1)))
-    out = CorrelatedNoise().apply(level, np.array([[0.3]]), there_and_back())
-    assert out.rho[0, 0] == 0.3
-    assert out.sd[0, 0] == 0.6
 
 
 def test_a_battery_that_is_not_known_changes_nothing():

@@ -44,19 +44,6 @@ def level_of(name: str) -> NoiseParameters:
     return CHAIN.with_effects(effect).noise_parameters(np.array([values]), PLAN, np.full((1, 1), SD))
 
 
-@pytest.mark.parametrize("name", NOISES)
-def test_a_noise_keeps_the_contract(name):
-    kind = type(NOISES[name][0])
-    effect = kind.for_extent(Extent(10.0, 60.0, PLAN))
-    names = effect.prior.names
-    assert (effect.name, len(effect.units)) == (name, len(names))
-    bank = effect.bank()
-    assert bank.shape[1:] == (1, len(names))
-    assert np.isfinite(effect.prior.log_prob(bank[:, 0])).all()
-    said = effect.sentence(bank[0, 0], np.abs(bank[0, 0]) / 10 + 1e-6)
-    assert any(c.isdigit() for c in said)
-
-
 def draw_readings(level: NoiseParameters, predicted: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
     """Draw readings of one scan, (n_samples, n_points): AR(1) noise, outliers, lost readings, then rounding."""
     noise = rng.standard_normal(predicted.shape)

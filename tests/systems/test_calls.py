@@ -52,14 +52,16 @@ def test_a_parameter_that_varies_by_row_is_interpolated_where_a_function_takes_o
     assert loop.caller.interpolated == {"b"}
 
 
-def test_a_function_that_branches_on_a_parameter_is_called_sample_by_sample():
-    system, _ = _system(lambda p, data: data["x"] * (1.0 if p["a"] > 1 else 2.0) + p["b"])
-    assert not system.caller.broadcasts
-
-
-def test_a_function_that_looks_at_all_rows_is_not_taken_to_broadcast():
-    system, _ = _system(lambda p, data: p["a"] * data["x"] / np.max(p["b"] + data["x"]))
-    assert not system.caller.broadcasts
+@pytest.mark.parametrize(
+    "simulate",
+    [
+        lambda p, data: data["x"] * (1.0 if p["a"] > 1 else 2.0) + p["b"],
+        lambda p, data: p["a"] * data["x"] / np.max(p["b"] + data["x"]),
+    ],
+    ids=["branches", "looks at all rows"],
+)
+def test_a_function_that_branches_or_looks_at_all_rows_is_called_sample_by_sample(simulate):
+    assert not _system(simulate)[0].caller.broadcasts
 
 
 def test_a_simulator_that_fails_at_some_places_gives_nan_there_and_is_counted():
@@ -75,22 +77,21 @@ def test_a_simulator_that_fails_at_some_places_gives_nan_there_and_is_counted():
     assert system.caller.n_failed > 0
 
 
-def test_a_simulator_that_always_raises_is_refused_with_its_own_message():
-    def simulate(p, data):
-        raise KeyError("powr_w")
+def _raises(p, data):
+    raise KeyError("powr_w")
 
-    with pytest.raises(FileError, match=r"simulate raises KeyError: 'powr_w'"):
+
+@pytest.mark.parametrize(
+    ("simulate", "error", "said"),
+    [
+        (_raises, FileError, "simulate raises KeyError: 'powr_w'"),
+        (lambda p, data: float(p["a"]) * data["x"][1:], ShapeError, r"shape \(10,\)"),
+        (lambda p, data: np.full(11, np.nan), ParameterError, "not finite at any of the"),
+    ],
+)
+def test_a_simulator_that_never_gives_readings_is_refused(simulate, error, said):
+    with pytest.raises(error, match=said):
         _system(simulate)
-
-
-def test_a_simulator_of_another_shape_is_refused():
-    with pytest.raises(ShapeError, match=r"shape \(10,\)"):
-        _system(lambda p, data: float(p["a"]) * data["x"][1:])
-
-
-def test_a_simulator_that_gives_nan_everywhere_is_refused():
-    with pytest.raises(ParameterError, match="not finite at any of the"):
-        _system(lambda p, data: np.full(11, np.nan))
 
 
 def test_the_same_call_is_made_once():

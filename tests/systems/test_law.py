@@ -69,11 +69,8 @@ def test_runs_go_on_side_by_side_as_each_would_alone():
 
 def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts():
     """v = v0 - a t until 0, then it sticks."""
-    motion = LawWithEffects(Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]})).with_friction(
-        "v", np.full((1, 1), 0.5)
-    )
-    table = _table(np.linspace(0, 4, 81))
-    found = _states(motion, table, {}, 0.05)["v"]
+    law, table = Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]}), _table(np.linspace(0, 4, 81))
+    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 0.5)), table, {}, 0.05)["v"]
     np.testing.assert_allclose(found, np.maximum(1 - 0.5 * table.time_s, 0), atol=0.03)
     assert np.all(found[table.time_s > 2.1] == 0)
 
@@ -148,7 +145,7 @@ def test_the_step_is_halved_until_readings_stand_still():
     simulator = Simulator(
         "y",
         "V",
-        {"l_m": _uniform(0.1, 1.0), "c": _uniform(0.0, 0.1)},
+        {"l_m": (0.1, 1.0), "c": (0.0, 0.1)},
         law=Law({"phi": 1.0, "omega": 0.0}, _pendulum),
         time="t_s",
     )
@@ -160,12 +157,6 @@ def test_the_step_is_halved_until_readings_stand_still():
     far = np.abs(still.chain(table, ()).predict(theta, table) - finer.chain(table, ()).predict(theta, table))
     assert still.max_step < system.max_step
     assert far.max() < 1e-4
-
-
-def _uniform(low, high):
-    from probewise.priors import Uniform
-
-    return Uniform(low, high)
 
 
 def test_rates_may_change_what_they_are_given():

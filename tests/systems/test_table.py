@@ -25,16 +25,13 @@ def test_missing_values_are_interpolated_within_each_run():
     np.testing.assert_allclose(table.interpolated_within_runs(values), expected)
 
 
-def test_masked_values_are_missing():
+def test_masked_values_are_missing_and_decimal_numbers_are_numbers():
     x = np.ma.masked_equal([1, 2, -999], -999)
     texts = np.ma.masked_array(["a", "bad"], mask=[False, True])
     np.testing.assert_array_equal(RunTable({"x": x}).columns["x"], [1.0, 2.0, np.nan])
     assert RunTable({"who": texts}).columns["who"].tolist() == ["a", ""]
-
-
-def test_decimal_numbers_are_numbers():
-    table = RunTable({"x": [Decimal("1.5"), None, Decimal(2)]})
-    np.testing.assert_array_equal(table.covariates["x"], [1.5, np.nan, 2.0])
+    exact = RunTable({"x": [Decimal("1.5"), None, Decimal(2)]})
+    np.testing.assert_array_equal(exact.covariates["x"], [1.5, np.nan, 2.0])
 
 
 def test_two_columns_of_one_name_are_refused():
@@ -116,34 +113,28 @@ def test_runs_of_one_name_in_two_tables_are_two_runs():
     assert notes == ("runs of b.csv renamed, as another table has them too: 1 is 1 (2)",)
 
 
-def test_a_column_that_the_second_lacks_is_missing_there_and_noted():
-    second = runs((25.0,), names="7")
-    bare = dataclasses.replace(second, columns={k: v for k, v in second.columns.items() if k != "room_c"})
-    joined, notes = concatenate_tables([runs(), bare], ["a.csv", "b.csv"])
-    assert np.isnan(joined.columns["room_c"][len(runs()) :]).all()
+def test_a_column_of_one_table_is_missing_or_left_out_in_both_and_noted():
+    first, second = runs(), runs((25.0,), names="7")
+    bare, without = (
+        dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "room_c"})
+        for table in (second, first)
+    )
+    joined, notes = concatenate_tables([first, bare], ["a.csv", "b.csv"])
+    assert np.isnan(joined.columns["room_c"][len(first) :]).all()
     assert notes == ("b.csv has no column room_c: missing there",)
-
-
-def test_a_column_that_the_first_lacks_is_left_out_and_noted():
-    first = runs()
-    bare = dataclasses.replace(first, columns={k: v for k, v in first.columns.items() if k != "room_c"})
-    joined, notes = concatenate_tables([bare, runs((25.0,), names="7")], ["a.csv", "b.csv"])
+    joined, notes = concatenate_tables([without, second], ["a.csv", "b.csv"])
     assert "room_c" not in joined.columns
     assert notes == ("column room_c of b.csv left out: a.csv has none",)
 
 
-def test_the_same_table_twice_is_refused():
+def test_the_same_table_twice_or_texts_where_the_first_has_numbers_are_refused():
     with pytest.raises(ParameterError, match=r"a.csv and a.csv"):
         concatenate_tables([runs(), runs()], ["a.csv", "a.csv"])
-
-
-def test_texts_where_the_first_has_numbers_are_refused():
-    first, second = runs(), runs((25.0,), names="7")
+    second = runs((25.0,), names="7")
     cells = second.columns["room_c"].astype(str)
     cells[2] = "warm"
-    texts = second.with_columns({"room_c": cells})
     with pytest.raises(ParameterError, match=r"column 'room_c' of b.csv in row 4 is 'warm'"):
-        concatenate_tables([first, texts], ["a.csv", "b.csv"])
+        concatenate_tables([runs(), second.with_columns({"room_c": cells})], ["a.csv", "b.csv"])
 
 
 def test_tables_without_runs_are_a_run_each():
@@ -167,13 +158,14 @@ def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
     assert concatenate_tables([advised, first], ["next.csv", "a.csv"])[0].scan_names == ("1 again", "1", "2")
 
 
-def test_a_column_of_remarks_may_be_empty_in_one_table():
-    empty, written = RunTable({"x": [1.0], "note": [np.nan]}), RunTable({"x": [2.0], "note": ["rain"]})
-    for tables, expected in (([empty, written], ["", "rain"]), ([written, empty], ["rain", ""])):
-        assert concatenate_tables(tables, ["a.csv", "b.csv"])[0].columns["note"].tolist() == expected
-
-
-def test_a_text_that_is_a_number_in_the_second_table_is_the_same_text():
-    first, second = RunTable({"batch": ["2", "2b"]}), RunTable({"batch": [2.0, 3.0]})
-    joined, _ = concatenate_tables([first, second], ["a.csv", "b.csv"])
-    assert joined.columns["batch"].tolist() == ["2", "2b", "2", "3"]
+@pytest.mark.parametrize(
+    ("one", "other", "joined"),
+    [
+        ([np.nan], ["rain"], ["", "rain"]),
+        (["rain"], [np.nan], ["rain", ""]),
+        (["2", "2b"], [2.0, 3.0], ["2", "2b", "2", "3"]),
+    ],
+)
+def test_a_column_of_texts_may_be_empty_or_of_numbers_in_one_table(one, other, joined):
+    tables = [RunTable({"x": np.arange(len(c)) + 9.0 * k, "note": c}) for k, c in enumerate((one, other))]
+    assert concatenate_tables(tables, ["a.csv", "b.csv"])[0].columns["note"].tolist() == joined

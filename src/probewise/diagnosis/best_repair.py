@@ -68,7 +68,7 @@ class Improvement:
     `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading,
     `heldout_by_scan` the mean by part; rms residuals (`Recording.rms`) in the unit of the readings, beside a random
     walk if the noise has one; `p_value_after` of the global test of the repaired model; `comes_next` the gain on the
-    last fifth of each run given the rest, where rows have a time.
+    last fifth of each run, each reading given the rest, where rows have a time.
     """
 
     log_evidence: float
@@ -124,7 +124,8 @@ class BestRepair:
         calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
         after = Linearised.of(repaired, law)
         rms = [recording.rms(residuals_beside_walk(found.residuals, law)) for found in (calibrated, repaired)]
-        held, comes_next, p_after = HeldOutGain(0.0, 0.0, 0, ()), None, test.p_value
+        held, p_after = HeldOutGain(0.0, 0.0, 0, ()), test.p_value
+        comes_next = None
         if fit is not test.null:
             parts = searched.prepared.apparatus.held_out_parts(recording)
             # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
@@ -132,7 +133,9 @@ class BestRepair:
             own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
             held = held_out_gain(calibrated, repaired, recording, law, parts, law_of_null=own)
             later = searched.prepared.apparatus.what_comes_next(recording)
-            comes_next = later and held_out_gain(calibrated, repaired, recording, law, later, law_of_null=own)
+            if later is not None:
+                fits = (calibrated, repaired, recording, law, later)
+                comes_next = held_out_gain(*fits, law_of_null=own, each_alone=True)
             p_after = p_value_after(searched, fit, after, rng=rng)
         log_evidence = fit.evidence[noise].log_z - test.null.evidence[searched.certain].log_z
         of_parts = held.per_reading, held.sd, held.by_scan

@@ -45,14 +45,22 @@ class HeldOutGain:
 
 
 def held_out_gain(
-    null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts, *, law_of_null: NoiseLaw
+    null: Fit,
+    repaired: Fit,
+    recording: Recording,
+    law: NoiseLaw,
+    held_out: Parts,
+    *,
+    law_of_null: NoiseLaw,
+    each_alone: bool = False,
 ) -> HeldOutGain:
     """Refit both models without one part of the readings at a time, and compare their log densities of that part.
 
     A held-out reading is predicted from the other parts alone. If the part has parameters of its own, which other parts
     do not determine, or if the noise has memory, its readings are predicted sequentially, each given those before it:
-    together they have the joint density of the part given the rest. Parts of fewer than eight readings are not held
-    out, and of more than ten parts only ten.
+    together they have the joint density of the part given the rest, unless `each_alone` asks for what the rest tells of
+    each: far from the rest, noise with memory is as wide as it is without. Parts of fewer than eight readings are not
+    held out, and of more than ten parts only ten.
 
     `law`, `law_of_null`: noise distribution of the repaired model, and of the null; `held_out`: number of the part of
     each usable reading, and names of the parts.
@@ -65,7 +73,7 @@ def held_out_gain(
         rows[np.flatnonzero(usable)[out]] = True
         each = ((repaired, law), (null, law_of_null))
         with np.errstate(invalid="ignore"):  # without them a model may predict no number
-            densities = (_refit_log_densities(f, recording, rows, own, out) for f, own in each)
+            densities = (_refit_log_densities(f, recording, rows, own, out, each_alone) for f, own in each)
             repaired_one, null_one = (np.where(np.isnan(each), _NO_DENSITY, each) for each in densities)
         return np.asarray(repaired_one - null_one)
 
@@ -106,7 +114,7 @@ def mean_gain_over_parts(
 
 
 def _refit_log_densities(
-    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray
+    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray, each_alone: bool
 ) -> FloatArray:
     """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
 
@@ -133,9 +141,8 @@ def _refit_log_densities(
     # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
     hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
     sequential = bool((of_its_own | hardly_told).any())
-    return predictive_log_densities(
-        law, out, miss, slopes, without.z - about, covariance, sigma_2, sequential=sequential
-    )
+    told = (law, out, miss, slopes, without.z - about, covariance, sigma_2)
+    return predictive_log_densities(*told, sequential=sequential, each_alone=each_alone)
 
 
 def predictive_log_densities(
@@ -148,13 +155,15 @@ def predictive_log_densities(
     sigma_2: float,
     *,
     sequential: bool = False,
+    each_alone: bool = False,
 ) -> FloatArray:
     """Return the log density of each held-out reading from a linear model of the others, (n_out,); 0 for lost ones.
 
     Arguments as of `sequential_log_densities`, which is used if asked for, or if the noise has memory.
     """
     if sequential or law.has_memory:
-        return sequential_log_densities(law, out, miss, slopes, mean, covariance, sigma_2)
+        told = (law, out, miss, slopes, mean, covariance, sigma_2)
+        return sequential_log_densities(*told, each_alone=each_alone)
     own, left = law.take_readings(out), (miss - slopes @ mean)[out]
     spread = np.einsum("ij,jk,ik->i", slopes[out], covariance, slopes[out])
 
@@ -187,15 +196,19 @@ def sequential_log_densities(
     mean: FloatArray,
     covariance: FloatArray,
     sigma_2: float,
+    *,
+    each_alone: bool = False,
 ) -> FloatArray:
     """Return the log density of each held-out reading given the others and those held out before it, 0 for lost ones.
 
     `out`: mask of the held-out readings, (n_points,); `miss`, `slopes`: residuals of all readings, (n_points,), and
     slopes, (n_points, n_params), at one point; `mean`, `covariance`: of the coordinates about that point, from the
     readings that are not held out. Returns log densities, (n_out,), whose sum is the log of the joint density; of
-    censored readings, relative to the peak.
+    censored readings, relative to the peak. With `each_alone`, none is given those held out before it.
     """
-    whitened, sd = innovations_given_rest(law, np.concatenate([slopes, miss[:, None]], axis=1), out)
+    whitened, sd = innovations_given_rest(
+        law, np.concatenate([slopes, miss[:, None]], axis=1), out, each_alone=each_alone
+    )
     turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
     mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
     noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
@@ -212,6 +225,8 @@ def sequential_log_densities(
             densities[k] -= np.logaddexp(
                 *(_log_normal_density(np.zeros(2), parts) + np.log(np.maximum(shares, 1e-300)))
             )
+        if each_alone:
+            continue
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
     return np.asarray((densities - np.where(censored, 0.0, np.log(sd))) * kept)

@@ -29,20 +29,29 @@ from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
 
-def innovations_given_rest(law: NoiseLaw, columns: FloatArray, asked: BoolArray) -> tuple[FloatArray, FloatArray]:
+def innovations_given_rest(
+    law: NoiseLaw, columns: FloatArray, asked: BoolArray, *, each_alone: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """Whiten the noise of some readings given that of all others: what the others and earlier ones do not tell of each.
 
     `columns`: residuals, or slopes, of all readings, (n_points, n_columns); `asked`: mask of the readings to whiten,
     (n_points,); those that are lost are neither whitened nor given. Returns `innovations, sd`: whitened columns of the
     readings asked for, (n_asked, n_columns), of sd sigma each and independent, 0 where lost; and the sd of each reading
-    in units of sigma, given the other readings and those asked for before it, (n_asked,), 1 where lost.
+    in units of sigma, given the other readings and those asked for before it, (n_asked,), 1 where lost. With
+    `each_alone`, none is given those asked for before it, and they are not independent.
     """
     law, there = replace(law, flat=0.0), ~law.lost[asked]
     # A whitening w of all readings has w^T w for their precision; a part of it is that of some given all others.
     own = law(np.eye(len(columns))[:, asked & ~law.lost])
-    root = np.linalg.cholesky((own.T @ own)[::-1, ::-1])[::-1, ::-1]  # upper: root root^T is the precision
+    precision, told = own.T @ own, own.T @ law(columns)
     innovations, sd = np.zeros((len(there), columns.shape[1])), np.ones(len(there))
-    innovations[there], sd[there] = np.linalg.solve(root, own.T @ law(columns)), 1 / np.diag(root)
+    if each_alone:
+        covariance = np.linalg.inv(precision)
+        sd[there] = np.sqrt(np.diag(covariance))
+        innovations[there] = covariance @ told / sd[there, None]
+    else:
+        root = np.linalg.cholesky(precision[::-1, ::-1])[::-1, ::-1]  # upper: root root^T is the precision
+        innovations[there], sd[there] = np.linalg.solve(root, told), 1 / np.diag(root)
     return innovations, sd
 
 

@@ -40,7 +40,7 @@ class ArmError:
     slopes
         Shift of the posterior mean by each independent error of one sd, (n_params, n_errors).
     shifts
-        Shift of each posterior sample by an error of the arm drawn for it, (n_samples, n_params).
+        Shift of each posterior sample by an error of the arm drawn for it, (n_samples, n_params); 0 for another shape.
     """
 
     slopes: FloatArray
@@ -87,21 +87,10 @@ def arm_error_in_posterior(
     slopes = _posterior_mean_shifts(
         experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
     )
-    return ArmError(slopes, draw_shape_shifts_from_arm_error(experiment, slopes, theta, likely_shape, rng=rng))
-
-
-def draw_shape_shifts_from_arm_error(
-    experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
-) -> FloatArray:
-    """Draw an error of the arm for each sample of the shape's parameters, and return the shifts that the errors cause.
-
-    `theta` and the shifts are (n_samples, n_params); `slopes` (n_params, n_errors) are `ArmError.slopes`. Samples of
-    other shapes than `likely_shape` are not shifted.
-    """
-    moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
+    shifts = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
-        moved[experiment.shape.shape_index(theta) != experiment.shape.shape_names.index(likely_shape)] = 0.0
-    return np.asarray(moved)
+        shifts[experiment.shape.shape_index(theta) != experiment.shape.shape_names.index(likely_shape)] = 0.0
+    return ArmError(slopes, shifts)
 
 
 def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:

@@ -26,7 +26,8 @@ from probewise.nested.weights import n_effective
 _MATTERS = 1e-4  # probability, by the raised odds, from which on a kind is solved at a doubt, and wakes
 _HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
 _SLEEPS = 1e-8  # probability, by the raised odds, below which a kind falls asleep
-_PER_READING = 3  # kinds never solved, or with difficulties since, that are while the sensor is in doubt
+_EACH = 2  # kinds that are solved after a reading: the most probable of the unsure, and those solved longest ago
+_MOVES = 4.0  # of each new live point: its samples are only where draws are made
 _BEHIND = 20.0  # nats behind what the prior's search found, from which on carried samples are not drawn about
 _LOST_SHARE = 0.05  # of a posterior that may lie outside the samples' range, besides what chance leaves there
 _FOUND, _WELL_FOUND = 15.0, 100.0  # effective draws from which on importance sampling counts, and need not go on
@@ -56,26 +57,26 @@ def with_evidence_from_prior(
 ) -> Posterior:
     """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those never solved too.
 
-    `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. After a
-    reading, the probable kinds are solved whose samples followed it with difficulty or sleep; if these hold most of the
-    posterior, every such kind. Where no effect can be left out, the end changes samples only if they had lost a mode.
+    `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. Unsure are kinds
+    whose samples followed a reading with difficulty or were woken, and in doubt those never solved, too. After a
+    reading, a few of these are solved; before a run ends, all. Where no effect can be left out, the end changes samples
+    only if they had lost a mode.
     """
     n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
     raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
-    matters, asleep = raised > _MATTERS, np.array([p.asleep for p in now.particles])
-    doubtful = np.array([p.is_doubtful for p in now.particles])
-    searched_at = np.array([p.searched_at for p in now.particles])
-    unsure = doubtful | (searched_at == -math.inf)
-    due = asleep & matters
+    asleep, doubtful = (np.array([getattr(p, name) for p in now.particles]) for name in ("asleep", "is_doubtful"))
+    searched_at, matters = np.array([p.searched_at for p in now.particles]), raised > _MATTERS
+    unsure = np.where(asleep, matters, doubtful | (searched_at == -math.inf))
     if at_end:
-        due |= unsure & (now.doubts_sensor | (raised > _HAS_A_SAY))
+        due = np.flatnonzero(unsure & (now.doubts_sensor | (raised > _HAS_A_SAY)))
     else:
-        due |= doubtful & (matters | (raised[doubtful].sum() > 0.5))
-        if now.doubts_sensor and possible and now.left_out[""] < 0.5:
-            others = np.flatnonzero(unsure & ~due)
-            due[others[np.lexsort((-raised[others], searched_at[others]))[:_PER_READING]]] = True
+        in_doubt = raised[doubtful].sum() > 0.5 or (now.doubts_sensor and possible and now.left_out[""] < 0.5)
+        unsure &= np.full(len(raised), in_doubt) | ((doubtful | asleep) & matters)
+        likely, old = np.lexsort((-raised, ~unsure)), np.lexsort((-raised, searched_at, ~unsure))
+        due = np.unique(np.concatenate([likely[:_EACH], old[:_EACH]]))
+        due = due[unsure[due]]
     particles = list(now.particles)
-    for k in np.flatnonzero(due).tolist():
+    for k in due.tolist():
         own, kind, problem = particles[k], now.kinds[k], problems[k]
         n = max(len(own.ancestor), n_samples_of_kind(kind, float(raised[k]), n_particles))
         carried = own.with_zero_evidence() if own.asleep else own
@@ -102,8 +103,8 @@ def posterior_from_prior(
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DoubtfulResultWarning)  # its samples are only where draws are made
-            result = nested_sampling_from_scratch(problem, n_live=n_live // 2, rng=rng)
+            warnings.simplefilter("ignore", DoubtfulResultWarning)
+            result = nested_sampling_from_scratch(problem, n_live=n_live // 2, moves=_MOVES, rng=rng)
     except NotConvergedError:
         return None
     points = result.samples(n, rng=rng)

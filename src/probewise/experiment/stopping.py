@@ -13,7 +13,7 @@ from scipy.stats import rankdata
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.experiment.arm_error import ArmError, arm_error_in_posterior, draw_shape_shifts_from_arm_error
+from probewise.experiment.arm_error import ArmError, arm_error_in_posterior
 from probewise.experiment.journal import PATTERN
 from probewise.experiment.kinds import Posterior
 from probewise.experiment.setup import Experiment, largest_sd_mm
@@ -109,9 +109,7 @@ def with_arm_error(
     if arm is None:
         return judged
     theta = posterior.theta.copy()
-    own = theta[:, experiment.shape_columns]
-    shifts = draw_shape_shifts_from_arm_error(experiment, arm.slopes, own, likely, rng=rng)
-    theta[:, experiment.shape_columns] = own + shifts
+    theta[:, experiment.shape_columns] += arm.shifts
     may_stop, off = may_stop_and_chance_off(experiment, posterior, theta=theta, arm_sd=arm.sd)
     return replace(judged, may_stop=may_stop, chance_off=off, arm_error=arm)
 

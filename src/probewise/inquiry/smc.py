@@ -304,13 +304,15 @@ def particles_from_posterior(
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
 
-def nested_sampling_from_scratch(problem: Samplable, *, n_live: int, rng: np.random.Generator) -> NestedResult:
-    """Solve a problem, all readings at once, by nested sampling."""
+def nested_sampling_from_scratch(
+    problem: Samplable, *, n_live: int, rng: np.random.Generator, moves: float = KernelMove.moves
+) -> NestedResult:
+    """Solve a problem, all readings at once, by nested sampling; see `KernelMove` for `moves`."""
     return run(
         problem,
         rng=rng,
         n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
-        move=KernelMove(),
+        move=KernelMove(moves=moves),
         stop=RemainingEvidence(_DLOGZ),
         max_cost=1.0,  # speed matters, since the robot waits
         return_interrupted=False,

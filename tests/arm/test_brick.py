@@ -128,10 +128,6 @@ def test_a_sensor_whose_values_disagree_is_a_link_error(brick, paper_brick, cloc
         light.read()
 
 
-def test_the_battery_is_read_in_millivolt(brick):
-    assert brick.battery_mv() == 7412
-
-
 def test_a_voltage_that_jumps_is_believed_when_it_is_told_twice(brick, paper_brick):
     brick.battery_mv()
     paper_brick.alter[len(paper_brick.commands)] = changed(4, 0x10)

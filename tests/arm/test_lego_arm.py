@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from probewise.arm import (
     DryRun,
     Geometry,
-    Instrument,
     LegoArm,
     Pose,
     SimulatedArm,
@@ -342,19 +341,6 @@ def test_the_guard_lets_a_joint_that_is_outside_come_back():
     limits.require_allowed_move(0, outside, outside + 30)
     with pytest.raises(ReachError):
         limits.require_allowed_move(0, outside, outside - 1)
-
-
-def test_a_rehearsal_says_the_moves_and_makes_none():
-    said = []
-    arm: Instrument = LegoArm(DryRun(SHIPPED, said.append), SHIPPED)
-    with arm:
-        reading = arm.measure(Pose(300.0, 200.0, float(arm.orientation_rad(np.array([[300.0, 200.0]]))[0])))
-    assert math.isnan(reading.value)
-    joints = [line.split()[0] for line in said]
-    assert joints[0] == "base"
-    assert {"shoulder", "elbow", "read"} <= set(joints)
-    assert said[-1] == "release all motors"
-    assert "motor from 0 to" in said[0]
 
 
 def test_the_seconds_that_a_reading_takes_grow_with_the_way(bench):

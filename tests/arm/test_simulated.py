@@ -80,28 +80,6 @@ def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(p
     assert (arm.pose, arm.time_s) == before
 
 
-class Strip:
-    """A workspace of one's own: what the protocol asks for, and nothing else."""
-
-    rest_mm = (50.0, 0.0)
-
-    def contains(self, places_mm):
-        return (places_mm[:, 0] >= 0.0) & (places_mm[:, 0] <= 100.0)
-
-    def orientation_rad(self, places_mm):
-        return np.zeros(len(places_mm))
-
-    def sentence(self):
-        return "a strip"
-
-
-def test_an_arm_takes_a_workspace_of_ones_own():
-    robot = SimulatedArm(lambda pose, time_s, height_mm: 40.0, reach=Strip())
-    assert robot.measure(Pose(80.0, 0.0)).value == 40.0
-    with pytest.raises(ReachError):
-        robot.measure(Pose(180.0, 0.0))
-
-
 def test_the_clock_is_advanced_by_travel_and_reading():
     arm = SimulatedArm(
         flat(50.0), speed=Speed(move_mm_s=50.0, read_s=2.0), last=Reading(50.0, Pose(500.0, 250.0), 100.0)

@@ -107,18 +107,6 @@ def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock: Virt
     assert likely(sum(b"" < answer < ANSWER for answer in got), N, 0.9 * 0.1)
 
 
-def test_a_brick_that_is_looked_after_all_the_time_hears_again_after_half_a_telegram(clock: VirtualClock) -> None:
-    """As the program at the terminal does, every 50 ms."""
-    _, radio = link(clock, Faults())
-    radio.send(BATTERY[:3])
-    for _ in range(20):
-        clock.sleep(0.05)
-        radio.send(b"")
-    radio.send(BATTERY)
-    clock.sleep(1.0)
-    assert radio.receive() == ANSWER
-
-
 def test_a_request_that_an_error_befalls_is_not_carried_out(clock: VirtualClock) -> None:
     """The refusal is as long as the firmware makes it; without a reply wanted there is none."""
     line, radio = link(clock, Faults(error=1.0))

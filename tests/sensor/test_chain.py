@@ -15,7 +15,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
-from probewise.scene import AnyOf, Circle, Ellipse, HypothesisScene, KnownScene, Rectangle, disc_region
+from probewise.scene import Circle, Ellipse, HypothesisScene, KnownScene, disc_region
 from probewise.sensor import (
     ACCURATE_NODES,
     FAST_NODES,
@@ -169,17 +169,6 @@ def test_few_nodes_are_enough_for_the_robot(shape):
     for n_nodes, error in ((FAST_NODES, 1e-4), (ACCURATE_NODES, 1e-8)):
         fast = Chain(ssf, levels, scene, n_nodes=n_nodes).predict(theta, plan)
         assert np.abs(full - fast).max() < 40 * error
-
-
-def test_a_set_of_shapes_goes_through_the_chain():
-    shape = AnyOf({"circle": Circle(), "rectangle": Rectangle()})
-    ssf, levels = fixed_mixture(TWO), FixedLevels(10, 50)
-    theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((30, 7)))
-    plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
-    found = Chain(ssf, levels, HypothesisScene(shape)).predict(theta, plan)
-    circles = shape.shape_index(theta) == 0
-    alone = Chain(ssf, levels, HypothesisScene(Circle())).predict(theta[circles][:, 1:4], plan)
-    assert found[circles] == pytest.approx(alone, abs=1e-8)
 
 
 def test_the_naive_sensor_reads_by_the_point_under_it():

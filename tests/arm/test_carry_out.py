@@ -88,15 +88,6 @@ def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told
     assert abs(off).max() == pytest.approx(math.degrees(math.atan2(50, 320)), abs=0.1)
 
 
-def test_the_field_place_is_the_plans_place_and_the_origin(told):
-    measured = []
-    measure = told.arm.measure
-    told.arm.measure = lambda pose: measured.append(pose) or measure(pose)
-    told.take(thinned(paper_plan(), 50))
-    assert measured[0].x_mm == 524.0 - 50.0
-    assert measured[0].y_mm == 260.0
-
-
 def test_it_goes_on_behind_the_rows_that_were_taken(told):
     plan = thinned(paper_plan())
     first = told.take(plan, first=len(plan) - 3)

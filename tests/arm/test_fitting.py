@@ -84,14 +84,6 @@ def test_claimed_sds_hold_over_many_arms():
     assert 0.5 < np.mean(height) < 1.6
 
 
-def test_five_marks_do():
-    true = built()
-    marks = np.array([[150.0, 240.0], [520.0, 60.0], [900.0, 240.0], [350.0, 400.0], [700.0, 400.0]])
-    found = fit_geometry(GEOMETRY, *touched(true, marks=marks))
-    assert np.abs(errors_mm(found.geometry, true)[:, 2]).max() < 4.0
-    assert found.geometry.accuracy.marks == 5
-
-
 def test_a_mark_that_was_only_seen_gives_its_place():
     turned, places = touched(built())
     places[::3, 2] = np.nan

@@ -167,13 +167,6 @@ def test_a_motor_in_whose_way_something_is_is_held_and_told_of(motor, paper_bric
     assert abs(motor.move_to(900, 1) - 900) <= 1
 
 
-def test_a_motor_that_does_not_turn_at_all_is_told_of(motor, paper_brick):
-    paper_brick.motors[0].blocked_at = 0
-    with pytest.raises(MotorError, match="motor A is stuck at 0 counts"):
-        motor.move_to(100, 1)
-    assert paper_brick.at_rest
-
-
 def test_a_motor_that_runs_away_is_held(motor, paper_brick):
     """Its target has been moved behind our back, by another program's telegram say."""
     motor.move_to(0, 1)

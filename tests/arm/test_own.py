@@ -342,14 +342,6 @@ def turns_asked(asked):
     return [round(math.degrees(request.turned_rad)) for request in asked if request.turned_rad is not None]
 
 
-def test_a_sensor_that_an_earlier_plan_left_turned_is_turned_back():
-    asked, own = [], Own()
-    with as_instrument(own) as arm:
-        for _ in range(2):
-            list(carry_out(arm, plan(), origin_mm=(100.0, 50.0), ask=asked.append))
-    assert turns_asked(asked) == [60, 0, 60]
-
-
 def test_a_sensor_that_the_rows_taken_before_may_have_left_turned_is_turned_back():
     asked = []
     angles = [0.0, math.pi / 3, 0.0, 0.0]

@@ -26,17 +26,6 @@ def flat(value):
     return lambda pose, time_s, height_mm: value
 
 
-def test_the_arm_reaches_all_but_the_two_far_corners_and_what_is_too_near():
-    """Paper, Fig. entropy-map: dark jagged edges at the bottom, where the arm does not reach."""
-    held = Reach().contains(GRID)
-    assert 0.95 < held.mean() < 0.99
-    missed = GRID[~held]
-    far, near = missed[missed[:, 1] < 260], missed[missed[:, 1] >= 260]
-    assert far[:, 1].max() < 120
-    assert set(np.sign(far[:, 0] - 524)) == {-1, 1}
-    assert np.hypot(near[:, 0] - 524, near[:, 1] - 580).max() < 126
-
-
 def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
     """Two routes to one reach, a ring to the mm, and the joints of the shipped geometry with room for their motors."""
     shipped, ring = read_geometry(shipped_geometry_path()), Reach()
@@ -91,28 +80,6 @@ def test_an_unreachable_pose_is_refused_with_what_is_allowed_and_the_arm_stays(p
     assert (arm.pose, arm.time_s) == before
 
 
-class Strip:
-    """A workspace of one's own: what the protocol asks for, and nothing else."""
-
-    rest_mm = (50.0, 0.0)
-
-    def contains(self, places_mm):
-        return (places_mm[:, 0] >= 0.0) & (places_mm[:, 0] <= 100.0)
-
-    def orientation_rad(self, places_mm):
-        return np.zeros(len(places_mm))
-
-    def sentence(self):
-        return "a strip"
-
-
-def test_an_arm_takes_a_workspace_of_ones_own():
-    robot = SimulatedArm(lambda pose, time_s, height_mm: 40.0, reach=Strip())
-    assert robot.measure(Pose(80.0, 0.0)).value == 40.0
-    with pytest.raises(ReachError):
-        robot.measure(Pose(180.0, 0.0))
-
-
 def test_the_clock_is_advanced_by_travel_and_reading():
     arm = SimulatedArm(
         flat(50.0), speed=Speed(move_mm_s=50.0, read_s=2.0), last=Reading(50.0, Pose(500.0, 250.0), 100.0)
@@ -124,17 +91,6 @@ def test_the_clock_is_advanced_by_travel_and_reading():
     assert third.time_s - second.time_s == pytest.approx(2.0)
     assert first.time_s == pytest.approx(100 + 50 / 50 + 2)
     assert arm.time_s == third.time_s
-
-
-def test_travel_time_is_what_the_clock_then_shows():
-    arm = SimulatedArm(flat(50.0))
-    arm.measure(HERE)
-    places = np.array([[300.0, 200.0], [500.0, 400.0]])
-    promised = arm.travel_s(arm.pose, places)
-    assert promised.shape == (2,)
-    before = arm.time_s
-    arm.measure(Pose(500.0, 400.0))
-    assert arm.time_s - before == pytest.approx(promised[1])
 
 
 def test_the_sensor_is_lowered_to_14_mm_and_told_when_and_where():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import pytest
 
 from probewise.emulator import (
     EmulatedArm,
-    EmulatedBench,
     Geometry,
     LightModel,
     SensorPose,
@@ -88,16 +86,6 @@ def test_the_brick_counts_what_a_hand_turns(geometry: Geometry, clock: VirtualCl
     assert counts == pytest.approx(10 * shoulder.numbers.gear_ratio, abs=1)
 
 
-def test_a_joint_stops_beyond_its_limits(geometry: Geometry) -> None:
-    base = geometry.joints[0]
-    arm = EmulatedArm(geometry)
-    motor = arm.motors()["ABC".index(base.port)]
-    for _ in range(20_000):
-        motor.step(1e-3, 100, brake=False, battery_mv=9000)
-    end_deg = math.degrees(arm.joints[0].angle_rad)
-    assert min(abs(end_deg - base.low_deg), abs(end_deg - base.high_deg)) == pytest.approx(3.0)
-
-
 def sight(stand: SensorPose, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
     world = replace(WORLD, noise_sd=0.0)
     return LightModel(world, Tabletop(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
@@ -130,38 +118,6 @@ def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualCloc
         expected = 60.5 + 0.6 * np.random.default_rng([7, number]).standard_normal()
         assert look(True) == pytest.approx(expected)
         assert look(True) != pytest.approx(expected)
-
-
-def read_light(bench: EmulatedBench, clock: VirtualClock, port: int) -> int:
-    brick = bench.radio.brick
-    brick.answer(bytes((0x80, 0x05, port, 0x05, 0x80)))
-    clock.sleep(0.1)
-    reply = brick.answer(bytes((0x00, 0x07, port)))
-    assert reply is not None
-    valid, *_, scaled, _ = struct.unpack("<BBBBHHhh", reply[4:])
-    assert valid
-    return int(scaled)
-
-
-def test_a_brick_over_a_circle_reads_white_inside_and_black_outside(geometry: Geometry, clock: VirtualClock) -> None:
-    """The arm is put at reading height by inverse kinematics, worked out here with the law of cosines."""
-    bench = set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1)
-    upper, lower = geometry.links_mm
-    readings = []
-    for y_mm in (300.0, 450.0):
-        out = geometry.base_mm[1] - y_mm - geometry.shoulder_mm[0] - geometry.sensor_mm[0]
-        up = 14.0 + geometry.sensor_mm[1] - geometry.shoulder_mm[1]
-        far = math.hypot(out, up)
-        slope = math.atan2(up, out)
-        shoulder = slope + math.acos((upper**2 + far**2 - lower**2) / (2 * upper * far))
-        elbow = slope - math.acos((lower**2 + far**2 - upper**2) / (2 * lower * far))
-        for joint, angle_rad in zip(bench.arm.joints, (-math.pi / 2, shoulder, elbow), strict=True):
-            joint.set_angle_by_hand(math.degrees(angle_rad))
-        stand = bench.arm.sensor_pose()
-        assert (stand.x_mm, stand.y_mm, stand.height_mm) == pytest.approx((524.0, y_mm, 14.0))
-        readings.append(read_light(bench, clock, geometry.sensor_port - 1))
-    assert readings[0] == pytest.approx(60, abs=3)
-    assert readings[1] == pytest.approx(10, abs=3)
 
 
 def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClock) -> None:

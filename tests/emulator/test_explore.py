@@ -47,7 +47,7 @@ def asked() -> Experiment:
     return experiment()
 
 
-QUICK = ("corrupt", "all")
+QUICK = ("corrupt",)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FAULTS])

@@ -67,12 +67,6 @@ def test_a_table_and_a_file_make_the_same_recording(frame):
     require_same(other, recording)
 
 
-def test_what_was_made_from_arrays_is_written_and_read_back(tmp_path):
-    recording = made(orientation_rad=np.pi / 2, scan=[*"aab"], covariates={"battery_mv": [8, 7, 6]}, min=0, max=5)
-    write_recording(recording, tmp_path / "made.csv")
-    require_same(read_recording(tmp_path / "made.csv"), recording)
-
-
 def test_sessions_are_written_read_back_and_made_from_a_table(tmp_path):
     recording = made(scan=[*"aab"], session=[0, 0, 1])
     assert recording.plan.sessions == (0, 1)

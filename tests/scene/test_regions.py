@@ -58,14 +58,6 @@ def test_coverage_is_the_mean_albedo_of_a_turned_pixel(region):
     assert np.abs(found - painted(region, centers, 2.0, turn)).max() < 0.015
 
 
-def test_coverage_of_a_straight_edge_is_exact():
-    """The share of a square at 45 degrees cut at half its half-diagonal is 7/8."""
-    region = HalfPlaneRegion(np.zeros(1), np.zeros(1))
-    half_diagonal = np.sqrt(0.5)
-    found = region.coverage(np.array([[half_diagonal / 2, 0.0]]), 1.0, np.array([np.pi / 4]))
-    assert found[0, 0] == pytest.approx(7 / 8, abs=1e-12)
-
-
 def test_a_half_plane_and_a_large_polygon_cover_pixels_alike():
     """Two routes to one number: the projected square, and Green's theorem on clipped edges."""
     rng = np.random.default_rng(2)

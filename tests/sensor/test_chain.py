@@ -15,7 +15,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
-from probewise.scene import AnyOf, Circle, Ellipse, HypothesisScene, KnownScene, Rectangle, disc_region
+from probewise.scene import Circle, Ellipse, HypothesisScene, KnownScene, disc_region
 from probewise.sensor import (
     ACCURATE_NODES,
     FAST_NODES,
@@ -119,13 +119,6 @@ def test_readings_together_equal_one_by_one(model):
         assert sensor.predict(theta, plan.take(np.array([j])))[:, 0] == pytest.approx(together[:, j], abs=1e-8)
 
 
-def test_predictions_lie_between_dark_and_bright(model):
-    sensor, draw = model
-    found = sensor.predict(draw(20), plan_of(30))
-    assert found.min() >= 8.0 - 1e-6
-    assert found.max() <= 55.0 + 1e-6
-
-
 def test_theta_of_another_width_is_refused(model):
     sensor, draw = model
     with pytest.raises(ShapeError, match="theta has shape"):
@@ -143,17 +136,6 @@ def test_one_gaussian_over_a_half_plane_reads_the_error_function():
         mean_x = plan.x_mm[j] + (rotation @ [u, v])[0]
         sd_x = np.sqrt((rotation @ cov @ rotation.T)[0, 0])
         assert found[j] == pytest.approx(10 + 40 * ndtr(mean_x / sd_x), abs=1e-7)
-
-
-def test_a_half_covered_ssf_reads_midway():
-    plan = replace(plan_of(1, names=("boundary",)), x_mm=[0.0], y_mm=[0.0], orientation_rad=[0.7])
-    theta = np.array([[1.0, 0.0, 0.0, 0.02, 0.01, 0.005, 10.0, 50.0]])
-    assert CHAINS["one_free"][0].predict(theta, plan)[0, 0] == pytest.approx(30.0, abs=1e-9)
-
-
-def test_an_empty_view_gives_the_dark_count():
-    plan = replace(plan_of(1, names=("boundary",)), x_mm=[-500.0])
-    assert CHAINS["two_free"][0].predict(np.array([[*TWO, 10.0, 50.0]]), plan)[0, 0] == pytest.approx(10.0, abs=1e-9)
 
 
 @settings(max_examples=20, deadline=None)
@@ -174,17 +156,6 @@ def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):
     assert moved.predict(theta, turned) == pytest.approx(still.predict(theta, plan), abs=1e-6)
 
 
-def test_the_field_route_agrees_with_the_closed_forms():
-    """1 mm pixels, 1e-3 of the span of 40."""
-    u = np.arange(-40.0, 41.0)
-    field = DiscreteSSF(mean_ssf_field(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
-    plan = plan_of(20)
-    scene, levels = KnownScene(PATTERNS), FixedLevels(10, 50)
-    closed = Chain(fixed_mixture(TWO), levels, scene).predict(np.zeros((1, 0)), plan)
-    summed = Chain(field, levels, scene).predict(np.zeros((1, 0)), plan)
-    assert np.abs(summed - closed).max() < 0.04
-
-
 @pytest.mark.parametrize(
     "shape", [Circle(), pytest.param(Ellipse(), marks=pytest.mark.slow)], ids=["circle", "ellipse"]
 )
@@ -198,17 +169,6 @@ def test_few_nodes_are_enough_for_the_robot(shape):
     for n_nodes, error in ((FAST_NODES, 1e-4), (ACCURATE_NODES, 1e-8)):
         fast = Chain(ssf, levels, scene, n_nodes=n_nodes).predict(theta, plan)
         assert np.abs(full - fast).max() < 40 * error
-
-
-def test_a_set_of_shapes_goes_through_the_chain():
-    shape = AnyOf({"circle": Circle(), "rectangle": Rectangle()})
-    ssf, levels = fixed_mixture(TWO), FixedLevels(10, 50)
-    theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((30, 7)))
-    plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
-    found = Chain(ssf, levels, HypothesisScene(shape)).predict(theta, plan)
-    circles = shape.shape_index(theta) == 0
-    alone = Chain(ssf, levels, HypothesisScene(Circle())).predict(theta[circles][:, 1:4], plan)
-    assert found[circles] == pytest.approx(alone, abs=1e-8)
 
 
 def test_the_naive_sensor_reads_by_the_point_under_it():
@@ -270,7 +230,7 @@ def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
 
 
 def test_effects_before_the_footprint_act_a_hypothesis_each():
-    """Shifting and turning the pose of each hypothesis equals predicting from a moved plan."""
+    """Shifting and turning the pose of each hypothesis equals predicting from a moved plan, and so does shifting it."""
     base = CHAINS["two_free"][0]
     plan, theta = plan_of(), thetas(3, 2)
     moves = np.array([[0.0, 0.0], [2.0, 0.5], [-1.0, 3.0]])
@@ -278,13 +238,8 @@ def test_effects_before_the_footprint_act_a_hypothesis_each():
     for i, (shift, turn) in enumerate(moves):
         moved = replace(plan, x_mm=plan.x_mm + shift, orientation_rad=plan.orientation_rad + turn)
         assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
-
-
-def test_a_shift_alone_keeps_the_fast_route_and_its_numbers():
-    base = CHAINS["two_free"][0]
-    plan, theta = plan_of(), thetas(2, 2)
-    found = base.with_effects(SHIFT).predict(np.concatenate([theta, [[1.5], [-2.5]]], axis=1), plan)
-    for i, shift in enumerate((1.5, -2.5)):
+    found = base.with_effects(SHIFT).predict(np.concatenate([theta, moves[:, :1]], axis=1), plan)
+    for i, shift in enumerate(moves[:, 0]):
         moved = replace(plan, x_mm=plan.x_mm + shift)
         assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
 

@@ -64,16 +64,6 @@ def test_pixels_err_over_an_edge_as_the_page_says(sd_mm, pixel_mm, error):
     assert worst < 0.0202 * (pixel_mm / sd_mm) ** 2 * 1.01
 
 
-@pytest.mark.parametrize("name", ["half_plane", "quadrant", "disc"])
-def test_the_error_of_the_sum_falls_as_the_pixel_squared(name):
-    """Pixels of 3, 1.5 and 0.75 mm: the root mean square error over places falls fourfold each time."""
-    region, poses = region_of(PATTERNS[name]), poses_about(16)
-    wanted = closed(region, poses)
-    rms = [np.sqrt(np.mean((mean_albedo_by_pixels(region, pixels(p), poses) - wanted) ** 2)) for p in (3.0, 1.5, 0.75)]
-    assert np.allclose(np.log2(np.array(rms[:-1]) / rms[1:]), 2.0, atol=0.3), rms
-    assert np.log2(rms[0] / rms[-1]) / 2 == pytest.approx(2.0, abs=0.1)
-
-
 def test_many_hypotheses_and_poses_equal_one_by_one():
     rng = np.random.default_rng(0)
     discs = disc_region(rng.normal(size=(3, 2)), np.array([5.0, 9.0, 14.0]))

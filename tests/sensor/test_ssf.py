@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixtures import fixed_mixture, total_variation
-from scipy.integrate import dblquad
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor import (
@@ -36,20 +35,7 @@ def paper_ssf(x, y, row):
 
 
 def test_parameters_are_named_in_the_papers_order():
-    assert mixture_parameter_names(2) == (
-        "a_1",
-        "u_1",
-        "v_1",
-        "A_1",
-        "B_1",
-        "C_1",
-        "a_2",
-        "u_2",
-        "v_2",
-        "A_2",
-        "B_2",
-        "C_2",
-    )
+    assert " ".join(mixture_parameter_names(2)) == "a_1 u_1 v_1 A_1 B_1 C_1 a_2 u_2 v_2 A_2 B_2 C_2"
     assert FreeMixture(2).names == mixture_parameter_names(2)
 
 
@@ -70,23 +56,6 @@ def test_the_footprint_is_the_papers_formula_normalised():
     assert np.abs(field.values - values).max() < 1e-12
 
 
-def test_the_mass_of_a_gaussian_is_a_pi_over_the_root():
-    """dblquad of one Gaussian against a pi / sqrt(AB - C^2): the weights follow."""
-    masses = []
-    for row in TWO.reshape(-1, 6):
-        far = 12 / np.sqrt(min(row[3:5]))
-        mass, _ = dblquad(
-            lambda y, x, row=row: paper_ssf(x, y, row),
-            row[1] - far,
-            row[1] + far,
-            row[2] - far,
-            row[2] + far,
-            epsabs=1e-4,
-        )
-        masses.append(mass)
-    assert footprint_of(TWO, 2).weight[0, 0] == pytest.approx(np.array(masses) / sum(masses), abs=1e-6)
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     a=st.floats(0.01, 100),
@@ -100,21 +69,6 @@ def test_the_ssf_integrates_to_one(a, aa, bb, rho, u):
     footprint = footprint_of(theta, 3)
     assert footprint.weight.sum() == pytest.approx(1.0)
     assert mean_ssf_field(footprint, u_mm=grid(60), v_mm=grid(60)).values.sum() == pytest.approx(1.0)
-
-
-def test_only_ratios_of_the_amplitudes_matter():
-    scaled = TWO.copy()
-    scaled[:, [0, 6]] *= 7.0
-    assert np.allclose(footprint_of(scaled, 2).weight, footprint_of(TWO, 2).weight)
-
-
-def test_many_samples_equal_one_by_one():
-    theta = TWO + np.linspace(0, 0.003, 5)[:, None]
-    together = footprint_of(theta, 2)
-    for i in range(5):
-        alone = footprint_of(theta[i : i + 1], 2)
-        assert np.array_equal(together.cov_uv[i], alone.cov_uv[0])
-        assert np.array_equal(together.weight[i], alone.weight[0])
 
 
 def test_the_mean_field_is_a_mean_of_fields_not_of_parameters():

@@ -110,8 +110,7 @@ class FittedGeometry:
         """Return a text table of each parameter's change and sd."""
         lines = []
         for k, name in enumerate(FITTED):
-            angle = k < 3
-            scale, unit, digits = (180 / np.pi, "degrees", 2) if angle else (1.0, "mm", 1)
+            scale, unit, digits = (180 / np.pi, "degrees", 2) if k < 3 else (1.0, "mm", 1)
             was, is_, sd = (scale * float(array[k]) for array in (self.before, self.values, self.sds))
             lines.append(
                 f"{name:<17} {is_:8.{digits}f} ± {sd:.{digits}f} {unit} (was {was:.{digits}f}, {is_ - was:+.{digits}f})"
@@ -156,13 +155,10 @@ def fit_geometry(
         raise ParameterError("touch_mm", touch_mm, "greater than 0")
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
-    before = fitted_parameter_values(geometry)
-    values, total, jacobian = _least_squares_fit(geometry, before, turned, marks, touch_mm)
-    n = int(np.isfinite(marks).sum())
-    p_value = float(chdtrc(n, total))
+    values, p_value, jacobian = _least_squares_fit(geometry, turned, marks, touch_mm)
     residuals = marks - places_at_parameters(geometry, values, turned)
     if p_value < LEAST_P:
-        raise MarksDisagreeError(_disagreement_message(geometry, before, turned, marks, touch_mm, residuals))
+        raise MarksDisagreeError(_disagreement_message(geometry, turned, marks, touch_mm, residuals))
     covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
     fitted = _geometry_with_values(geometry, values)
     accuracy = _accuracy_of_fit(fitted, covariance, len(marks))
@@ -174,40 +170,35 @@ def fit_geometry(
             f"marks that determine them to {MOST_HEIGHT_SD_MM:g} and {MOST_PLACE_SD_MM:g} mm all over the field: "
             "more of them, touched, near and far from the base and on both sides",
         )
-    return FittedGeometry(
-        replace(fitted, accuracy=accuracy), before, values, np.sqrt(np.diagonal(covariance)), residuals, p_value
-    )
+    before, sds = fitted_parameter_values(geometry), np.sqrt(np.diagonal(covariance))
+    return FittedGeometry(replace(fitted, accuracy=accuracy), before, values, sds, residuals, p_value)
 
 
 def _least_squares_fit(
-    geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
+    geometry: Geometry, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Return the most probable parameters, and chi-square and Jacobian, (n_residuals, 9), of marks and prior there."""
-    known = np.isfinite(marks)
+    """Return the most probable parameters, their p-value, and the Jacobian, (n_residuals, 9), of marks and prior."""
+    known, before = np.isfinite(marks), fitted_parameter_values(geometry)
 
     def scaled_residuals(scaled: FloatArray) -> FloatArray:
         off = (places_at_parameters(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
         return np.concatenate([off, scaled])
 
     found = least_squares(scaled_residuals, np.zeros(len(before)), method="lm", xtol=1e-12, ftol=1e-12)
-    return before + RULER_SDS * found.x, float(2 * found.cost), np.asarray(found.jac / RULER_SDS)
+    p_value = float(chdtrc(int(known.sum()), 2 * found.cost))
+    return before + RULER_SDS * found.x, p_value, np.asarray(found.jac / RULER_SDS)
 
 
 def _disagreement_message(
-    geometry: Geometry,
-    before: FloatArray,
-    turned: FloatArray,
-    marks: FloatArray,
-    touch_mm: float,
-    residuals: FloatArray,
+    geometry: Geometry, turned: FloatArray, marks: FloatArray, touch_mm: float, residuals: FloatArray
 ) -> str:
     """Build the error's message, with the mark, if any, without which the other marks agree."""
     rms = np.sqrt(np.nanmean(residuals**2))
     off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
         others = np.arange(len(marks)) != k
-        values, total, _ = _least_squares_fit(geometry, before, turned[others], marks[others], touch_mm)
-        if chdtrc(int(np.isfinite(marks[others]).sum()), total) >= LEAST_P:
+        values, p_value, _ = _least_squares_fit(geometry, turned[others], marks[others], touch_mm)
+        if p_value >= LEAST_P:
             away = float(np.sqrt(np.nansum((marks[k] - places_at_parameters(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
     return (
@@ -235,25 +226,12 @@ def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -
     )
 
 
-def _geometry_with_values(geometry: Geometry, values: Sequence[float] | FloatArray) -> Geometry:
+def _geometry_with_values(geometry: Geometry, values: FloatArray) -> Geometry:
     """Return the geometry with values of `FITTED`; limits and stops, counted from home, shift with the home angles."""
-    joints = []
-    for joint, home in zip(geometry.joints, values[:3], strict=True):
-        by = float(home) - joint.home_rad
-        stop = None if joint.stop_rad is None else joint.stop_rad + by
-        joints.append(
-            replace(
-                joint, home_rad=float(home), low_rad=joint.low_rad + by, high_rad=joint.high_rad + by, stop_rad=stop
-            )
-        )
-    upper, lower, x, y, forward, height = (float(value) for value in values[3:])
-    base, shoulder, elbow = joints
-    return replace(
-        geometry,
-        axis_mm=(x, y),
-        shoulder_mm=(forward, height),
-        links_mm=(upper, lower),
-        base=base,
-        shoulder=shoulder,
-        elbow=elbow,
-    )
+    joints = {}
+    for name, joint, home in zip(JOINTS, geometry.joints, values[:3].tolist(), strict=True):
+        ends = {end: getattr(joint, end) for end in ("low_rad", "high_rad", "stop_rad")}
+        shifted = {end: angle + (home - joint.home_rad) for end, angle in ends.items() if angle is not None}
+        joints[name] = replace(joint, home_rad=home, **shifted)
+    upper, lower, x, y, forward, height = values[3:].tolist()
+    return replace(geometry, axis_mm=(x, y), shoulder_mm=(forward, height), links_mm=(upper, lower), **joints)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from probewise._kinds import checked_path
 from probewise.arm.geometry import FITTED, JOINTS, Accuracy, Geometry, Joint
@@ -19,6 +20,7 @@ ELBOWS = ("absolute", "relative")
 _HEADER = re.compile(r"\s*\[\s*([\w.]+)\s*\]")
 _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)([-+\w.]+)(.*)")
 LARGEST = 1e6
+T = TypeVar("T")
 
 
 def shipped_geometry_path() -> Path:
@@ -56,8 +58,11 @@ def read_geometry(path: str | Path) -> Geometry:
         raise sensor.error_at("whole_percent", "true or false")
     tables = {name: joints.table(name) for name in JOINTS}
     known = top.table("accuracy") if "accuracy" in content else None
-    try:
-        geometry = Geometry(
+    parts = {name: _parse_joint(table) for name, table in tables.items()}
+    accuracy = None if known is None else _parse_accuracy(known)
+    geometry = _built(
+        top,
+        lambda: Geometry(
             field_mm=(field.number("width_mm"), field.number("height_mm")),
             axis_mm=(base.number("x_mm"), base.number("y_mm")),
             shoulder_mm=(base.number("shoulder_forward_mm"), base.number("shoulder_height_mm")),
@@ -69,15 +74,12 @@ def read_geometry(path: str | Path) -> Geometry:
             read_height_mm=sensor.number("read_height_mm"),
             travel_height_mm=sensor.number("travel_height_mm"),
             lowest_mm=sensor.number("lowest_mm"),
-            base=_parse_joint(tables["base"]),
-            shoulder=_parse_joint(tables["shoulder"]),
-            elbow=_parse_joint(tables["elbow"]),
+            **parts,
             whole_percent=whole,
-            accuracy=None if known is None else _parse_accuracy(known),
+            accuracy=accuracy,
             light_per_mm=sensor.number("light_per_mm") if "light_per_mm" in sensor.content else None,
-        )
-    except ParameterError as error:
-        raise FileError(path, f"{error.name} is {shown(error.value)}", error.allowed) from error
+        ),
+    )
     for table in (top, field, base, links, sensor, joints, *tables.values(), *([] if known is None else [known])):
         table.require_all_taken()
     return geometry
@@ -138,6 +140,10 @@ def text_with_fitted_values(text: str, geometry: Geometry) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
 class _TomlTable:
     """One table of the file; `require_all_taken` raises FileError if an entry, being unknown, was never taken."""
 
@@ -162,7 +168,7 @@ class _TomlTable:
 
     def number(self, name: str) -> float:
         value = self.take_entry(name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        if not _is_number(value):
             raise self.error_at(name, f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
@@ -170,10 +176,9 @@ class _TomlTable:
         rows = self.take_entry(name)
         if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
             raise self.error_at(name, "rows of numbers, [[...], [...], ...]")
-        numbers = [number for row in rows for number in row]
-        if any(isinstance(n, bool) or not isinstance(n, int | float) or not abs(n) <= LARGEST for n in numbers):
+        if not all(_is_number(number) for row in rows for number in row):
             raise self.error_at(name, f"rows of numbers of magnitude up to {LARGEST:g}")
-        return tuple(tuple(float(number) for number in row) for row in rows)
+        return tuple(tuple(map(float, row)) for row in rows)
 
     def require_all_taken(self) -> None:
         if self._left:
@@ -182,29 +187,30 @@ class _TomlTable:
             raise FileError(self.path, f"{self.where}{name} is not known", f"the entries {known}")
 
 
+def _built(table: _TomlTable, kind: Callable[..., T], *values: Any) -> T:
+    """Return a value made of a table's entries; a ParameterError becomes a FileError that names the entry."""
+    try:
+        return kind(*values)
+    except ParameterError as error:
+        raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
+
+
 def _parse_joint(table: _TomlTable) -> Joint:
     port = table.take_entry("port")
     if port not in ("A", "B", "C"):
         raise table.error_at("port", '"A", "B" or "C"')
     ratio = table.number("gear_ratio")
-    home, low, high, play = (math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play"))
+    angles = [math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play")]
     stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
-    try:
-        return Joint("ABC".index(port), ratio, home, low, high, play_rad=play, stop_rad=stop)
-    except ParameterError as error:
-        raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
+    return _built(table, Joint, "ABC".index(port), ratio, *angles, stop)
 
 
 def _parse_accuracy(table: _TomlTable) -> Accuracy:
     marks = table.take_entry("marks")
     if not isinstance(marks, int) or isinstance(marks, bool):
         raise table.error_at("marks", "a whole number, 1 or more")
-    place, height, scale = (table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd"))
+    sds = [table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd")]
     if "covariance" not in table.content:
         again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"
         raise FileError(table.path, "accuracy.covariance is missing", again)
-    covariance = table.rows_of_numbers("covariance")
-    try:
-        return Accuracy(marks, place, height, scale, covariance)
-    except ParameterError as error:
-        raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
+    return _built(table, Accuracy, marks, *sds, table.rows_of_numbers("covariance"))

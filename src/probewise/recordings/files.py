@@ -257,20 +257,17 @@ def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArra
     json_name = table.path.with_suffix(".json").name
     if "pattern" not in table.columns:
         if len(names) > 1:
+            found = f"no such column, and {json_name} has {len(names)} patterns"
             raise FileError(
-                table.path, f"no such column, and {json_name} has {len(names)} patterns",
-                f"a column that names one of {known} in each row", row=1, column="pattern",
-            )  # fmt: skip
+                table.path, found, f"a column that names one of {known} in each row", row=1, column="pattern"
+            )
         return np.zeros(len(table), dtype=np.int64)
     code = {name: k for k, name in enumerate(names)}
     cells = table.columns["pattern"]
-    unknown = set(cells).difference(code)
-    if unknown:
+    if unknown := set(cells).difference(code):
         k = next(k for k, cell in enumerate(cells) if cell in unknown)
-        raise FileError(
-            table.path, f"the pattern {shown(cells[k])} is not in {json_name}", f"one of {known}",
-            row=table.rows[k], column="pattern",
-        )  # fmt: skip
+        found = f"the pattern {shown(cells[k])} is not in {json_name}"
+        raise FileError(table.path, found, f"one of {known}", row=table.rows[k], column="pattern")
     return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
 

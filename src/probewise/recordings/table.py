@@ -68,11 +68,8 @@ class CSVTable:
         """Raise FileError if one of these columns is missing."""
         for name in names:
             if name not in self.columns:
-                present = ", ".join(repr(c) for c in self.columns)
-                raise FileError(
-                    self.path, f"no such column; the header has {present}", "a header row with it",
-                    row=self.header_row, column=name,
-                )  # fmt: skip
+                found = f"no such column; the header has {_in_words(list(self.columns))}"
+                raise FileError(self.path, found, "a header row with it", row=self.header_row, column=name)
 
     def column_of_numbers(
         self, name: str, *, missing: bool = False, largest: float | None = LARGEST, allowed: str = ""
@@ -291,14 +288,15 @@ def read_table(
     text = read_text(path, "a CSV file")
     layout = _Layout.of_text(text, wanted)
     text, header = layout.separated(text), layout.header
-    _require_distinct_columns(path, header, layout.at + 1)
+    if twice := next((name for name, n in Counter(header).items() if name and n > 1), None):
+        cure = "each column once: rename or delete one of them"
+        raise FileError(path, "the column comes twice in the header", cure, row=layout.at + 1, column=twice)
     n_lines, number = text.count("\n"), 0
     records, rows, left_out = list[tuple[str, ...]](), list[int](), list[int]()
     failed: csv.Error | None = None
     try:
-        for number, record in enumerate(
-            csv.reader(io.StringIO(text, newline=""), delimiter=layout.mark, strict=True), 1
-        ):
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=layout.mark, strict=True)
+        for number, record in enumerate(reader, 1):
             if number > layout.first and any(map(str.strip, record)):
                 if len(record) != len(header) and layout.is_comment(record):
                     left_out.append(number)
@@ -371,13 +369,6 @@ def _with_plain_numbers(
     notes += said
     said_how = (f"{table.path.name}: {'; '.join(notes)}",) if notes else ()
     return replace(table, columns=columns | rewritten, notes=said_how)
-
-
-def _require_distinct_columns(path: Path, header: Sequence[str], row: int) -> None:
-    for name, n in Counter(name for name in header if name).items():
-        if n > 1:
-            found = "the column comes twice in the header"
-            raise FileError(path, found, "each column once: rename or delete one of them", row=row, column=name)
 
 
 def number_text(value: float) -> str:

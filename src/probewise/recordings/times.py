@@ -59,8 +59,8 @@ def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[Arr
         return values, ""
     try:
         if array.dtype.kind in "mM" and not np.isnat(array).any():
-            seconds = (array - array[:1]) / np.timedelta64(1, "s")
-            return _in_unit(name, np.asarray(seconds, dtype=np.float64), str(array[0]), unit)
+            seconds = np.asarray((array - array[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+            return _in_unit(name, seconds, str(array[0]), unit)
         if all(isinstance(cell, datetime.datetime) for cell in cells):
             if len({cell.utcoffset() is None for cell in cells}) > 1:
                 raise ParameterError(name, values, "dates that all have a time zone, or none of them")
@@ -144,7 +144,8 @@ def _seconds_of_dates(parts: Sequence[dict[str, Any]]) -> tuple[FloatArray, str]
         days = _days(((p["y"], p["m"], p["d"]) for p in parts), strict=True)
         return _DAY * (days - days[0]) + clocks, ""
     if any(p["b"].isalpha() for p in parts):
-        days = _days(((p["y"], _month(p["b"]), p["a"]) for p in parts), strict=True)
+        months = {month: number for number, month in enumerate(_MONTHS, 1)}
+        days = _days(((p["y"], months.get(p["b"][:3].lower(), 0), p["a"]) for p in parts), strict=True)
         return _DAY * (days - days[0]) + clocks, ""
     day_first = _days((p["y"], p["b"], p["a"]) for p in parts)
     month_first = _days((p["y"], p["a"], p["b"]) for p in parts)
@@ -169,11 +170,6 @@ def _days(dates: Iterable[tuple[Any, Any, Any]], *, strict: bool = False) -> Flo
                 raise UnclearCellError(k, "a date that exists, such as 2026-11-28") from error
             return np.empty(0)
     return np.array(out, dtype=np.float64)
-
-
-def _month(text: str) -> int:
-    begun = text[:3].lower()
-    return _MONTHS.index(begun) + 1 if begun in _MONTHS else 0
 
 
 def _seconds_of_zone(zone: str | None) -> float:

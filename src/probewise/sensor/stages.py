@@ -1,8 +1,7 @@
 """The stages of the sensor chain from pose to reading, and the value that each one transforms.
 
-In order: pose, scene, footprint, seen fraction, response curve, gain, offset, lag, saturation,
-noise. (INPUT, PARAMETER, RATE, HYSTERESIS and BEND are stages of systems, not of the light sensor.) An effect is one
-function at one stage; effects are applied in the order of their stages.
+In order: pose, scene, footprint, seen fraction, response curve, gain, offset, lag, saturation, noise. An effect is one
+function at one stage.
 """
 
 from __future__ import annotations

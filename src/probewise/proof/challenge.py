@@ -26,7 +26,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError, ProbewiseErr
 from probewise.investigation import investigate
 from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
-from probewise.proof.null_refit import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
 from probewise.proof.results import RoundsResult, SensorResult, SystemResult, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup

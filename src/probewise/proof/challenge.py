@@ -27,7 +27,7 @@ from probewise.investigation import investigate
 from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
 from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
-from probewise.proof.results import RoundsResult, SensorResult, SystemResult, misfit_of_case
+from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
@@ -39,7 +39,7 @@ from probewise.world.world import World
 
 __all__ = ["RunCaseInRounds", "Task", "run_case", "run_cases", "run_challenge"]
 
-_RESULTS = {"": SensorResult, "systems": SystemResult}
+_RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
@@ -199,7 +199,7 @@ class RunCaseInRounds:
 
 @own_arithmetic
 def run_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its recording alone; return a `SensorResult`, or a `Failure`."""
+    """Draw a case and diagnose it from its recording alone; return a `results.SENSOR_CASE`, or what failed."""
     return _case_result(task, _diagnosis_result)
 
 
@@ -219,7 +219,7 @@ def result_or_failure(
     truth: Callable[[C], dict[str, Any]],
     diagnosed: Callable[[C], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Draw a case; return stratum, truth and diagnosis or, where drawing or diagnosis fails, a `Failure`."""
+    """Draw a case; return stratum, truth and diagnosis or, where drawing or diagnosis fails, what failed."""
     result: dict[str, Any] = asdict(stratum)
     at = "drawing"
     with warnings.catch_warnings():
@@ -402,6 +402,6 @@ def run_cases(
         executor=executor,
         progress=progress,
         noun="cases",
-        misfit=partial(misfit_of_case, kind=_RESULTS.get(of, RoundsResult)),
+        misfit=partial(misfit_of_case, schema=_RESULTS.get(of, ROUNDS_CASE)),
     )
     return tuple(results[task.key] for task in tasks)

@@ -21,13 +21,13 @@ from probewise.progress import Progress, silent
 from probewise.proof.campaign import read_campaign, run_campaign
 from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
 from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
-from probewise.proof.results import TrialResult, misfit
+from probewise.proof.results import TRIAL, misfit
 from probewise.proof.trial import WRONG_MM, Trial, run_trial
 
 __all__ = ["Study", "Summary", "read_study", "run_study", "summarise"]
 
 _CHANCE = 0.01
-_MISFIT = partial(misfit, kind=TrialResult)
+_MISFIT = partial(misfit, schema=TRIAL)
 
 
 @dataclass(frozen=True)

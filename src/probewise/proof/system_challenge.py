@@ -143,7 +143,7 @@ _LIKELY = 0.05
 
 @own_arithmetic
 def run_system_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its files alone; return a `SystemResult`, or a `Failure`."""
+    """Draw a case and diagnose it from its files alone; return a `results.SYSTEM_CASE`, or what failed."""
     refit = SystemRefit()
     return result_or_failure(
         system_stratum_of(task.number)[0],

@@ -16,9 +16,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic
-from probewise._kinds import checked_whole
 from probewise._version import __version__
-from probewise.calibration import FittedSensor, predict
+from probewise.calibration import predict
 from probewise.diagnosis import Diagnosis, EffectFound, ModelSamples, Place, diagnose, model_with
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise_distribution import log_gaussian_density
@@ -36,8 +35,6 @@ from probewise.sensor import footprint_of
 from probewise.world.concealed import Quantisation
 from probewise.world.stages import Disturbs
 from probewise.world.world import World
-
-__all__ = ["RunCaseInRounds", "Task", "run_case", "run_cases", "run_challenge"]
 
 _RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
@@ -66,40 +63,23 @@ def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str
     Names: "u_mm", "v_mm", "var_u_mm2", "var_v_mm2", "cov_uv_mm2", "I_min", "I_max".
     """
     mean, covariance = world.spot.moments()
-    n_ssf = 6 * samples.n_gaussians
-    of_samples = _footprint_moments(samples.theta[:, :n_ssf], samples.n_gaussians)
-    truths = {
-        "u_mm": mean[0],
-        "v_mm": mean[1],
-        "var_u_mm2": covariance[0, 0],
-        "var_v_mm2": covariance[1, 1],
-        "cov_uv_mm2": covariance[0, 1],
-        "I_min": world.black,
-        "I_max": world.white,
-    }
-    values = np.concatenate([of_samples, samples.theta[:, n_ssf : n_ssf + 2]], axis=1)
-    low, high = np.quantile(values, [0.025, 0.975], axis=0)
-    return {
-        name: [float(truth), float(a), float(b)] for (name, truth), a, b in zip(truths.items(), low, high, strict=True)
-    }
-
-
-def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
-    """Return mean u and v, variances of u and v, and covariance of the whole mixture, (n_samples, 5)."""
-    f = footprint_of(theta, n_gaussians)
+    ssf, levels = np.split(samples.theta, [6 * samples.n_gaussians], axis=1)
+    f = footprint_of(ssf, samples.n_gaussians)
 
     def average(values: FloatArray) -> FloatArray:
-        return np.asarray(np.sum(f.weight * values, axis=-1).reshape(len(theta)))
+        return np.asarray(np.sum(f.weight * values, axis=-1).reshape(len(levels)))
 
     u, v = average(f.u_mm), average(f.v_mm)
-    columns = (
-        u,
-        v,
-        average(f.var_u + f.u_mm**2) - u**2,
-        average(f.var_v + f.v_mm**2) - v**2,
-        average(f.cov_uv + f.u_mm * f.v_mm) - u * v,
-    )
-    return np.stack(columns, axis=1)
+    pairs = {
+        "u_mm": (mean[0], u),
+        "v_mm": (mean[1], v),
+        "var_u_mm2": (covariance[0, 0], average(f.var_u + f.u_mm**2) - u**2),
+        "var_v_mm2": (covariance[1, 1], average(f.var_v + f.v_mm**2) - v**2),
+        "cov_uv_mm2": (covariance[0, 1], average(f.cov_uv + f.u_mm * f.v_mm) - u * v),
+        "I_min": (world.black, levels[:, 0]),
+        "I_max": (world.white, levels[:, 1]),
+    }
+    return {name: [float(true), *np.quantile(own, [0.025, 0.975]).tolist()] for name, (true, own) in pairs.items()}
 
 
 def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
@@ -143,20 +123,16 @@ def log_densities_of_scans(
             scores[name] = scores["null"]
             continue
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
-        scores[name] = {scan: _total_log_density(sensor, recording) for scan, recording in scans.items()}
-    scores["true"] = {
-        scan: _true_log_density(case.world.expected_readings(recording.plan), case.world.noise_sd, recording)
-        for scan, recording in scans.items()
-    }
+        scores[name] = {
+            scan: float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
+            for scan, recording in scans.items()
+        }
+    scores["true"] = {}
+    for scan, recording in scans.items():
+        expected = case.world.expected_readings(recording.plan)
+        density = log_gaussian_density(recording.readings, expected, case.world.noise_sd)
+        scores["true"][scan] = float(density[recording.usable].sum())
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
-
-
-def _total_log_density(sensor: FittedSensor, recording: Recording) -> float:
-    return float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
-
-
-def _true_log_density(expected: FloatArray, sd: float, recording: Recording) -> float:
-    return float(log_gaussian_density(recording.readings, expected, sd)[recording.usable].sum())
 
 
 C = TypeVar("C")
@@ -339,50 +315,6 @@ def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Genera
 
 
 def run_challenge(
-    n_cases: int,
-    *,
-    seed: int,
-    work: Callable[[Task], Mapping[str, Any]] = run_case,
-    of: str = "",
-    path: str | os.PathLike[str],
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> tuple[Mapping[str, Any], ...]:
-    """Run the first cases of a challenge, or resume an interrupted one.
-
-    Parameters
-    ----------
-    n_cases
-        Number of cases, from case 0. It may be raised later: cases in the file are not run again.
-    seed
-        The secret seed: with its number, it determines a case.
-    work
-        Function that runs a case; by default the light sensor's.
-    of
-        Name of what is diagnosed, if not the light sensor; a file of another name is refused.
-    path
-        The campaign's file.
-    executor
-        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
-    progress
-        Called with the number of finished cases.
-
-    Returns
-    -------
-    Results of `work`, in the order of the cases.
-
-    Raises
-    ------
-    ParameterError
-        If `n_cases` is less than 1.
-    FileError, NotConvergedError
-        See `run_campaign`.
-    """
-    checked_whole("n_cases", n_cases, most=100_000)
-    return run_cases(range(n_cases), seed=seed, work=work, of=of, path=path, executor=executor, progress=progress)
-
-
-def run_cases(
     numbers: Iterable[int],
     *,
     seed: int,
@@ -392,7 +324,12 @@ def run_cases(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> tuple[Mapping[str, Any], ...]:
-    """Run the cases of these numbers, or resume them; all else is as in `run_challenge`."""
+    """Run the cases of these numbers, or resume an interrupted challenge; return their results, in this order.
+
+    `seed`: the secret seed, which with its number determines a case; `work`: function that runs a case; `of`: name of
+    what is diagnosed, if not the light sensor: a file of another name is refused; all else is as in `run_campaign`,
+    which tells the errors too. Cases in the file are not run again.
+    """
     tasks = [Task(seed, number) for number in numbers]
     results = run_campaign(
         work,

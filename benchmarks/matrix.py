@@ -56,7 +56,7 @@ from probewise.proof.campaign import run_campaign
 from probewise.proof.concealed_study import CONCEALED
 from probewise.proof.refits import NullRefit, SystemRefit
 from probewise.proof.sensors.cases import Stratum
-from probewise.proof.sensors.cases import _draw_effect_of_size as conceal_in_sensor
+from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
 from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
 from probewise.proof.sensors.sizing import EffectSizer
 from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
@@ -119,7 +119,7 @@ def conceal_effect(what: str, plan: Plan, rng: np.random.Generator) -> tuple[Wor
     sizer = EffectSizer(setup, NullRefit())
     for wanted in SIZES:
         with contextlib.suppress(errors.NotConvergedError):
-            hidden = conceal_in_sensor(what, wanted, setup, sizer, rng)
+            hidden = conceal_in_sensor(what, wanted, sizer, rng)
             return dataclasses.replace(world, concealed=(hidden.effect,)), hidden.size_lambda
     amplitude = math.sqrt(INSIDE[what].first * INSIDE[what].limit)
     return dataclasses.replace(world, concealed=(INSIDE[what].draw(setup, rng)(amplitude),)), None

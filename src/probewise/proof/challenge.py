@@ -111,9 +111,9 @@ def log_densities_of_scans(
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
     extent = Extent.of(case.recording)
-    names = [h.name for h in case.truth.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
+    names = [h.name for h in case.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
-    if showing and len(showing) == len(case.truth.hidden):
+    if showing and len(showing) == len(case.hidden):
         with suppress(ParameterError):  # under a model with dropouts, none of these readings was lost
             models["right"] = model_with(case.recording, showing, rng=fitting)
     scans = held_out_recordings(case)
@@ -212,19 +212,17 @@ def result_or_failure(
 
 
 def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
-    truth = case.truth
     plain = replace(case.world, concealed=(), step=None)
-    sizer = EffectSizer(CleanSetup(case.recording.plan, plain), refit)
     return {
-        "plan": truth.plan,
-        "ssf": truth.ssf,
-        "noise_level": truth.noise_level,
-        "noise_model": truth.noise_model,
+        "plan": case.plan,
+        "ssf": case.ssf,
+        "noise_level": case.noise_level,
+        "noise_model": case.noise_model,
         "readings": len(case.recording),
-        "truth": list(truth.combination),
-        "hidden": _effect_results(truth.hidden, sizer, refit),
-        "alias": None if truth.alias is None else truth.alias.effect.name,
-        "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
+        "truth": list(case.combination),
+        "hidden": _effect_results(case.hidden, EffectSizer(CleanSetup(case.recording.plan, plain), refit), refit),
+        "alias": case.alias,
+        "cosine": case.cosine,
     }
 
 
@@ -264,8 +262,8 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     diagnosis = diagnose(case.recording, rng=blind)
     cpu_s = time.process_time() - begun_s
     found = {effect.name: effect for effect in diagnosis.effects}
-    named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
-    region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
+    named = [h for h in case.hidden if h.name in diagnosis.combination and h.name in found]
+    region = case.hidden[0].region if len(case.hidden) == 1 else None
     return {
         **statements_to_score(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
@@ -273,7 +271,7 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
         "parameters": {h.name: effect_truths_and_intervals(h.parameters, found[h.name]) for h in named},
         "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
         "held_out": log_densities_of_scans(case, diagnosis, rng=files),
-        "settled": _result_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
+        "settled": _result_after_advice(case, diagnosis, later) if case.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }
 

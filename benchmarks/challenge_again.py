@@ -14,7 +14,7 @@ from pathlib import Path
 
 from challenges_side_by_side import read_cases
 
-from probewise.proof.challenge import run_cases
+from probewise.proof.challenge import run_challenge
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
         parser.error(f"{options.cases} holds no case of kind {', '.join(options.kind)}")
     seeds, numbers = zip(*(map(int, key.split(" / ")) for key in keys), strict=True)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        run_cases(numbers, seed=seeds[0], path=options.out, executor=pool)
+        run_challenge(numbers, seed=seeds[0], path=options.out, executor=pool)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.proof.campaign import run_campaign
 from probewise.proof.challenge import Task
 from probewise.proof.estimates import estimated_share
-from probewise.proof.null_refit import NullRefit
+from probewise.proof.refits import NullRefit
 from probewise.proof.sensors.cases import draw_case
 from probewise.proof.sensors.plans import PLANS
 

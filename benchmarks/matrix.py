@@ -54,13 +54,13 @@ from probewise.cli import main as command_line
 from probewise.experiment import TRUST, left_out_after_step
 from probewise.proof.campaign import run_campaign
 from probewise.proof.concealed_study import CONCEALED
-from probewise.proof.null_refit import NullRefit
+from probewise.proof.refits import NullRefit, SystemRefit
 from probewise.proof.sensors.cases import Stratum
-from probewise.proof.sensors.cases import _draw_effect_of_size as conceal_in_sensor
+from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
 from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
 from probewise.proof.sensors.sizing import EffectSizer
 from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
-from probewise.proof.systems.cases import _draw_effect_of_size as conceal_in_system
+from probewise.proof.systems.cases import draw_effect_of_size as conceal_in_system
 from probewise.proof.systems.form import Form
 from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
 from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
@@ -119,7 +119,7 @@ def conceal_effect(what: str, plan: Plan, rng: np.random.Generator) -> tuple[Wor
     sizer = EffectSizer(setup, NullRefit())
     for wanted in SIZES:
         with contextlib.suppress(errors.NotConvergedError):
-            hidden = conceal_in_sensor(what, wanted, setup, sizer, rng)
+            hidden = conceal_in_sensor(what, wanted, sizer, rng)
             return dataclasses.replace(world, concealed=(hidden.effect,)), hidden.size_lambda
     amplitude = math.sqrt(INSIDE[what].first * INSIDE[what].limit)
     return dataclasses.replace(world, concealed=(INSIDE[what].draw(setup, rng)(amplitude),)), None
@@ -154,18 +154,19 @@ def _names_of_forms(kind: str) -> frozenset[str]:
 
 def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
     """Draw a system of a kind and its readings with a form or a noise."""
+    refit = SystemRefit()
     for wanted in (*np.repeat(SIZES, 3), None):
         drawn = small_system(kind, rng)
         forms = forms_by_name(drawn).get(what, [])
         effects: list[SystemEffect] = []
         with contextlib.suppress(errors.NotConvergedError):
             if forms and wanted is not None:
-                effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, rng)]
+                effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, refit, rng)]
             elif forms:  # the parameters take it up, whatever its size
                 amplitude = min(20 * forms[0].first, forms[0].limit)
-                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)), 0.0, {}, ())]
+                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)), 0.0)]
             free = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
-            if np.abs(free).max() < 1e3 * np.abs(drawn.fit_without_effects.readings).max():
+            if np.abs(free).max() < 1e3 * np.abs(drawn.true_system.readings).max():
                 break
     name = {"quantisation": "quantised"}.get(what, what if what in OTHER_NOISE else "white")
     seen = drawn.diagnosed_row_numbers, drawn.diagnosed_table
@@ -197,7 +198,7 @@ def commands(cell: Cell, folder: Path) -> tuple[list[list[str]], float | None]:
         return [[verb, *known, "--arm", str(folder / "arm.py"), "--field", "1048,520", "--max-readings", "20"]], None
     if where not in PLANS:
         case = conceal_form(where, what, rng)
-        file, table, test, _ = map(str, write_system_case(case, folder))
+        file, table, test = map(str, write_system_case(case, folder))
         following = ["fit", table] if verb == "audit" else ["predict", "repaired.json", test]
         sizes = [effect.size_lambda for effect in (*case.effects, case.noise)]
         return [[words[0], *words[1:], "--simulator", file] for words in ([verb, table], following)], sizes[0]

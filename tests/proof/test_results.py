@@ -10,12 +10,12 @@ from probewise.cli import main
 from probewise.proof.challenge import Task
 from probewise.proof.concealed_study import ConcealedTrial
 from probewise.proof.configurations import REFERENCE
-from probewise.proof.results import ConcealedResult, SensorResult, TrialResult, misfit, misfit_of_case
+from probewise.proof.results import CONCEALED_TRIAL, SENSOR_CASE, TRIAL, misfit, misfit_of_case
 from probewise.proof.trial import Trial
 
 RUN = {"readings": 3, "error_mm": 1.0, "chance_wrong": 0.01, "held": [True, True, False]}
-TRIAL = RUN | {"reached": True, "first_white": 2, "bits": 9.0, "bits_at_white": 4.0, "arm_s": 30.0, "cpu_s": 0.1}
-TRIAL |= {"widest_mm": [50.0, 20.0, 3.0], "p_value": None}
+SEARCH = RUN | {"reached": True, "first_white": 2, "bits": 9.0, "bits_at_white": 4.0, "arm_s": 30.0, "cpu_s": 0.1}
+SEARCH |= {"widest_mm": [50.0, 20.0, 3.0], "p_value": None}
 HIDDEN = RUN | {"known": True, "p_truth": 0.9, "credible": ["clean"], "noticed": False, "cpu_s": [0.1, 0.2]}
 
 
@@ -31,29 +31,33 @@ def damaged(value, path="result"):
             yield where, other
 
 
-@pytest.mark.parametrize("kind", [TrialResult, ConcealedResult, SensorResult])
+@pytest.mark.parametrize("kind", ["trial", "concealed trial", "case"])
 def test_every_part_that_is_of_another_type_or_missing_is_named(kind, make):
-    whole = {TrialResult: TRIAL, ConcealedResult: HIDDEN, SensorResult: make.single(cosine=0.2)}[kind]
-    assert misfit(whole, kind) is None
+    whole, schema = {
+        "trial": (SEARCH, TRIAL),
+        "concealed trial": (HIDDEN, CONCEALED_TRIAL),
+        "case": (make.single(cosine=0.2), SENSOR_CASE),
+    }[kind]
+    assert misfit(whole, schema) is None
     for path, result in damaged(whole):
-        found = misfit(result, kind)
+        found = misfit(result, schema)
         assert found is not None
         assert found[0].startswith(f"{path} is ")
-    for key in kind.__required_keys__:
+    for key in schema:
         less = {name: value for name, value in whole.items() if name != key}
-        assert misfit(less, kind)[0] == f"result.{key} is missing"
+        assert misfit(less, schema)[0] == f"result.{key} is missing"
 
 
 def test_a_case_conceals_as_many_effects_as_its_kind_says(make):
-    assert misfit_of_case(make.single(), SensorResult) is None
+    assert misfit_of_case(make.single(), SENSOR_CASE) is None
     assert (
-        misfit_of_case(make.case("pair", hides=[make.hidden("lag")]), SensorResult)[0] == "result.hidden has 1 of them"
+        misfit_of_case(make.case("pair", hides=[make.hidden("lag")]), SENSOR_CASE)[0] == "result.hidden has 1 of them"
     )
-    assert "cosine" in misfit_of_case(make.case("alias", hides=[make.hidden("lag")]), SensorResult)[0]
+    assert "cosine" in misfit_of_case(make.case("alias", hides=[make.hidden("lag")]), SENSOR_CASE)[0]
 
 
 FILES = {
-    "study --circles 2 --model ssf": ("trials.jsonl", "study", [Trial(REFERENCE, k).key for k in (0, 1)], TRIAL),
+    "study --circles 2 --model ssf": ("trials.jsonl", "study", [Trial(REFERENCE, k).key for k in (0, 1)], SEARCH),
     "study --concealed --circles 1 --size small": (
         "concealed.jsonl",
         "concealed",

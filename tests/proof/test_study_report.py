@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from probewise.experiment import CLEAN, least_readings
+from probewise.proof import pages as report
 from probewise.proof import plots
-from probewise.proof import study_page as report
 from probewise.proof.concealed_study import ConcealedTrial, concealed_rows
 from probewise.proof.configurations import REFERENCE, SearchConfiguration
 from probewise.proof.study import Study
@@ -43,7 +43,7 @@ def study():
 
 
 def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
-    page = report.page_html(study, command="probewise study")
+    page = report.study_html(study, command="probewise study")
     needed = study.table()[REFERENCE].mean.value
     assert f"{needed:.1f}" in page.split("<figure>")[0]
     assert all(row.name in page for row in ROWS)
@@ -52,7 +52,7 @@ def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
 
 
 def test_the_csv_holds_every_number_and_its_bounds(study):
-    rows = list(csv.DictReader(io.StringIO(report.table_csv(study))))
+    rows = list(csv.DictReader(io.StringIO(report.study_csv(study))))
     assert [row["row"] for row in rows] == [row.name for row in ROWS]
     for row, summary in zip(rows, study.table().values(), strict=True):
         assert float(row["mean"]) == pytest.approx(summary.mean.value, rel=1e-5)
@@ -96,7 +96,7 @@ def test_what_rows_need_is_drawn_with_its_bounds(study):
 @pytest.mark.slow
 def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
     one = Study({ROWS[1]: study.trials[ROWS[1]]}, 40)
-    page = report.page_html(one, command="probewise study --model naive")
+    page = report.study_html(one, command="probewise study --model naive")
     assert "<tbody></tbody>" not in page
     assert max(head.count("<th ") for head in page.split("<thead>")[1:]) <= 7
     assert report.lower_bound_table(one) is None
@@ -118,10 +118,10 @@ def concealed_runs():
 
 def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
     rows = concealed_rows(concealed_runs())
-    assert report.concealed_summary_sentence(rows).startswith(
+    assert report.concealed_sentence(rows).startswith(
         "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
     )
-    page = report.concealed_page_html(rows, command="probewise study --concealed")
+    page = report.concealed_html(rows, command="probewise study --concealed")
     assert "backlash (play) of the arm, 6" in page
     assert "0.00 | 1.00" in page
 

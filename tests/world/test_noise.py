@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm, t
 
-from probewise.proof.sensors.sensors import NOISE_MODELS, with_noise_model
+from probewise.proof.sensors.sensors import OTHER_NOISE, with_noise_model
 from probewise.recordings import Plan, Ramp
 from probewise.world import World, gaussian_spot
 from probewise.world.concealed import (
@@ -104,7 +104,7 @@ def test_without_a_generator_there_is_no_noise_and_nothing_is_lost(ramp):
     np.testing.assert_array_equal(world.simulate(ramp, rng=None).readings, world.expected_readings(ramp))
 
 
-@pytest.mark.parametrize("model", NOISE_MODELS)
+@pytest.mark.parametrize("model", OTHER_NOISE)
 def test_every_kind_of_noise_differs_from_white_as_it_is_called(model, ramp, noise):
     world = with_noise_model(World(SPOT), model, duration_s=float(N))
     assert (world.step == 1.0) == (model == "quantised")

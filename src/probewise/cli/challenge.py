@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
-    from probewise.proof import challenge_page as report
+    from probewise.proof import pages
     from probewise.proof.challenge import RunCaseInRounds, run_case, run_challenge
     from probewise.proof.system_challenge import run_system_case
     from probewise.proof.tables import score, score_rounds, score_systems
@@ -52,7 +52,13 @@ def run(arguments: argparse.Namespace) -> int:
     kept = partial(message_to_resume_campaign, cases, "case", arguments)
     with executor_and_progress(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
-            arguments.cases, seed=arguments.seed, work=work, of=of, path=cases, executor=executor, progress=progress
+            range(arguments.cases),
+            seed=arguments.seed,
+            work=work,
+            of=of,
+            path=cases,
+            executor=executor,
+            progress=progress,
         )
     rows = scored(results)
     options = ["--systems"] if arguments.systems else []
@@ -63,10 +69,12 @@ def run(arguments: argparse.Namespace) -> int:
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
         drawings.write_results(
-            lambda stage: stage.write("table.csv", report.target_table_csv(rows)),
+            lambda stage: stage.write("table.csv", pages.challenge_csv(rows)),
             {},
-            lambda _: report.page_html(results, rows, command=command, systems=arguments.systems, draw=drawings.draw),
+            lambda _: pages.challenge_html(
+                results, rows, command=command, systems=arguments.systems, draw=drawings.draw
+            ),
             progress=progress,
         )
-    summary = report.summary_sentence(rows, len(results))
+    summary = pages.challenge_sentence(rows, len(results))
     return finish(drawings, summary, f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)

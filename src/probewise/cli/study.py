@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
     from probewise._progress import progress_shown
-    from probewise.proof import study_page as report
+    from probewise.proof import pages
     from probewise.proof.study import run_study
 
     out = checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
@@ -87,17 +87,17 @@ def run(arguments: argparse.Namespace) -> int:
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
         drawings.write_results(
-            lambda stage: stage.write("table.csv", report.table_csv(study)),
+            lambda stage: stage.write("table.csv", pages.study_csv(study)),
             {},
-            lambda _: report.page_html(study, command=_command_line(arguments), draw=drawings.draw),
+            lambda _: pages.study_html(study, command=_command_line(arguments), draw=drawings.draw),
             progress=progress,
         )
-    return finish(drawings, report.summary_sentence(study), f"written to {out}", quiet=arguments.quiet)
+    return finish(drawings, pages.study_sentence(study), f"written to {out}", quiet=arguments.quiet)
 
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects; write its table and report; return the exit status."""
-    from probewise.proof import study_page as report
+    from probewise.proof import pages
     from probewise.proof.concealed_study import concealed_csv_rows, concealed_rows, run_concealed
     from probewise.recordings.table import csv_text_of_rows
 
@@ -124,9 +124,9 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     drawings.write_results(
         lambda stage: stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table))),
         {},
-        lambda _: report.concealed_page_html(rows, command=command, draw=drawings.draw),
+        lambda _: pages.concealed_html(rows, command=command, draw=drawings.draw),
     )
-    return finish(drawings, report.concealed_summary_sentence(rows), f"written to {out}", quiet=arguments.quiet)
+    return finish(drawings, pages.concealed_sentence(rows), f"written to {out}", quiet=arguments.quiet)
 
 
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:

@@ -16,9 +16,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic
-from probewise._kinds import checked_whole
 from probewise._version import __version__
-from probewise.calibration import FittedSensor, predict
+from probewise.calibration import predict
 from probewise.diagnosis import Diagnosis, EffectFound, ModelSamples, Place, diagnose, model_with
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise_distribution import log_gaussian_density
@@ -26,8 +25,8 @@ from probewise.errors import DoubtfulResultWarning, ParameterError, ProbewiseErr
 from probewise.investigation import investigate
 from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
-from probewise.proof.null_refit import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
-from probewise.proof.results import RoundsResult, SensorResult, SystemResult, misfit_of_case
+from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
@@ -37,9 +36,7 @@ from probewise.world.concealed import Quantisation
 from probewise.world.stages import Disturbs
 from probewise.world.world import World
 
-__all__ = ["RunCaseInRounds", "Task", "run_case", "run_cases", "run_challenge"]
-
-_RESULTS = {"": SensorResult, "systems": SystemResult}
+_RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
@@ -66,40 +63,23 @@ def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str
     Names: "u_mm", "v_mm", "var_u_mm2", "var_v_mm2", "cov_uv_mm2", "I_min", "I_max".
     """
     mean, covariance = world.spot.moments()
-    n_ssf = 6 * samples.n_gaussians
-    of_samples = _footprint_moments(samples.theta[:, :n_ssf], samples.n_gaussians)
-    truths = {
-        "u_mm": mean[0],
-        "v_mm": mean[1],
-        "var_u_mm2": covariance[0, 0],
-        "var_v_mm2": covariance[1, 1],
-        "cov_uv_mm2": covariance[0, 1],
-        "I_min": world.black,
-        "I_max": world.white,
-    }
-    values = np.concatenate([of_samples, samples.theta[:, n_ssf : n_ssf + 2]], axis=1)
-    low, high = np.quantile(values, [0.025, 0.975], axis=0)
-    return {
-        name: [float(truth), float(a), float(b)] for (name, truth), a, b in zip(truths.items(), low, high, strict=True)
-    }
-
-
-def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
-    """Return mean u and v, variances of u and v, and covariance of the whole mixture, (n_samples, 5)."""
-    f = footprint_of(theta, n_gaussians)
+    ssf, levels = np.split(samples.theta, [6 * samples.n_gaussians], axis=1)
+    f = footprint_of(ssf, samples.n_gaussians)
 
     def average(values: FloatArray) -> FloatArray:
-        return np.asarray(np.sum(f.weight * values, axis=-1).reshape(len(theta)))
+        return np.asarray(np.sum(f.weight * values, axis=-1).reshape(len(levels)))
 
     u, v = average(f.u_mm), average(f.v_mm)
-    columns = (
-        u,
-        v,
-        average(f.var_u + f.u_mm**2) - u**2,
-        average(f.var_v + f.v_mm**2) - v**2,
-        average(f.cov_uv + f.u_mm * f.v_mm) - u * v,
-    )
-    return np.stack(columns, axis=1)
+    pairs = {
+        "u_mm": (mean[0], u),
+        "v_mm": (mean[1], v),
+        "var_u_mm2": (covariance[0, 0], average(f.var_u + f.u_mm**2) - u**2),
+        "var_v_mm2": (covariance[1, 1], average(f.var_v + f.v_mm**2) - v**2),
+        "cov_uv_mm2": (covariance[0, 1], average(f.cov_uv + f.u_mm * f.v_mm) - u * v),
+        "I_min": (world.black, levels[:, 0]),
+        "I_max": (world.white, levels[:, 1]),
+    }
+    return {name: [float(true), *np.quantile(own, [0.025, 0.975]).tolist()] for name, (true, own) in pairs.items()}
 
 
 def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
@@ -131,9 +111,9 @@ def log_densities_of_scans(
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
     extent = Extent.of(case.recording)
-    names = [h.name for h in case.truth.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
+    names = [h.name for h in case.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
-    if showing and len(showing) == len(case.truth.hidden):
+    if showing and len(showing) == len(case.hidden):
         with suppress(ParameterError):  # under a model with dropouts, none of these readings was lost
             models["right"] = model_with(case.recording, showing, rng=fitting)
     scans = held_out_recordings(case)
@@ -143,20 +123,16 @@ def log_densities_of_scans(
             scores[name] = scores["null"]
             continue
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
-        scores[name] = {scan: _total_log_density(sensor, recording) for scan, recording in scans.items()}
-    scores["true"] = {
-        scan: _true_log_density(case.world.expected_readings(recording.plan), case.world.noise_sd, recording)
-        for scan, recording in scans.items()
-    }
+        scores[name] = {
+            scan: float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
+            for scan, recording in scans.items()
+        }
+    scores["true"] = {}
+    for scan, recording in scans.items():
+        expected = case.world.expected_readings(recording.plan)
+        density = log_gaussian_density(recording.readings, expected, case.world.noise_sd)
+        scores["true"][scan] = float(density[recording.usable].sum())
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
-
-
-def _total_log_density(sensor: FittedSensor, recording: Recording) -> float:
-    return float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
-
-
-def _true_log_density(expected: FloatArray, sd: float, recording: Recording) -> float:
-    return float(log_gaussian_density(recording.readings, expected, sd)[recording.usable].sum())
 
 
 C = TypeVar("C")
@@ -199,7 +175,7 @@ class RunCaseInRounds:
 
 @own_arithmetic
 def run_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its recording alone; return a `SensorResult`, or a `Failure`."""
+    """Draw a case and diagnose it from its recording alone; return a `results.SENSOR_CASE`, or what failed."""
     return _case_result(task, _diagnosis_result)
 
 
@@ -219,7 +195,7 @@ def result_or_failure(
     truth: Callable[[C], dict[str, Any]],
     diagnosed: Callable[[C], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Draw a case; return stratum, truth and diagnosis or, where drawing or diagnosis fails, a `Failure`."""
+    """Draw a case; return stratum, truth and diagnosis or, where drawing or diagnosis fails, what failed."""
     result: dict[str, Any] = asdict(stratum)
     at = "drawing"
     with warnings.catch_warnings():
@@ -236,19 +212,17 @@ def result_or_failure(
 
 
 def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
-    truth = case.truth
     plain = replace(case.world, concealed=(), step=None)
-    sizer = EffectSizer(CleanSetup(case.recording.plan, plain), refit)
     return {
-        "plan": truth.plan,
-        "ssf": truth.ssf,
-        "noise_level": truth.noise_level,
-        "noise_model": truth.noise_model,
+        "plan": case.plan,
+        "ssf": case.ssf,
+        "noise_level": case.noise_level,
+        "noise_model": case.noise_model,
         "readings": len(case.recording),
-        "truth": list(truth.combination),
-        "hidden": _effect_results(truth.hidden, sizer, refit),
-        "alias": None if truth.alias is None else truth.alias.effect.name,
-        "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
+        "truth": list(case.combination),
+        "hidden": _effect_results(case.hidden, EffectSizer(CleanSetup(case.recording.plan, plain), refit), refit),
+        "alias": case.alias,
+        "cosine": case.cosine,
     }
 
 
@@ -288,8 +262,8 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     diagnosis = diagnose(case.recording, rng=blind)
     cpu_s = time.process_time() - begun_s
     found = {effect.name: effect for effect in diagnosis.effects}
-    named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
-    region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
+    named = [h for h in case.hidden if h.name in diagnosis.combination and h.name in found]
+    region = case.hidden[0].region if len(case.hidden) == 1 else None
     return {
         **statements_to_score(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
@@ -297,7 +271,7 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
         "parameters": {h.name: effect_truths_and_intervals(h.parameters, found[h.name]) for h in named},
         "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
         "held_out": log_densities_of_scans(case, diagnosis, rng=files),
-        "settled": _result_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
+        "settled": _result_after_advice(case, diagnosis, later) if case.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }
 
@@ -339,50 +313,6 @@ def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Genera
 
 
 def run_challenge(
-    n_cases: int,
-    *,
-    seed: int,
-    work: Callable[[Task], Mapping[str, Any]] = run_case,
-    of: str = "",
-    path: str | os.PathLike[str],
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> tuple[Mapping[str, Any], ...]:
-    """Run the first cases of a challenge, or resume an interrupted one.
-
-    Parameters
-    ----------
-    n_cases
-        Number of cases, from case 0. It may be raised later: cases in the file are not run again.
-    seed
-        The secret seed: with its number, it determines a case.
-    work
-        Function that runs a case; by default the light sensor's.
-    of
-        Name of what is diagnosed, if not the light sensor; a file of another name is refused.
-    path
-        The campaign's file.
-    executor
-        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
-    progress
-        Called with the number of finished cases.
-
-    Returns
-    -------
-    Results of `work`, in the order of the cases.
-
-    Raises
-    ------
-    ParameterError
-        If `n_cases` is less than 1.
-    FileError, NotConvergedError
-        See `run_campaign`.
-    """
-    checked_whole("n_cases", n_cases, most=100_000)
-    return run_cases(range(n_cases), seed=seed, work=work, of=of, path=path, executor=executor, progress=progress)
-
-
-def run_cases(
     numbers: Iterable[int],
     *,
     seed: int,
@@ -392,7 +322,12 @@ def run_cases(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> tuple[Mapping[str, Any], ...]:
-    """Run the cases of these numbers, or resume them; all else is as in `run_challenge`."""
+    """Run the cases of these numbers, or resume an interrupted challenge; return their results, in this order.
+
+    `seed`: the secret seed, which with its number determines a case; `work`: function that runs a case; `of`: name of
+    what is diagnosed, if not the light sensor: a file of another name is refused; all else is as in `run_campaign`,
+    which tells the errors too. Cases in the file are not run again.
+    """
     tasks = [Task(seed, number) for number in numbers]
     results = run_campaign(
         work,
@@ -402,6 +337,6 @@ def run_cases(
         executor=executor,
         progress=progress,
         noun="cases",
-        misfit=partial(misfit_of_case, kind=_RESULTS.get(of, RoundsResult)),
+        misfit=partial(misfit_of_case, schema=_RESULTS.get(of, ROUNDS_CASE)),
     )
     return tuple(results[task.key] for task in tasks)

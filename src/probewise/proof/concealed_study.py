@@ -26,7 +26,7 @@ from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
 from probewise.proof.configurations import FIELD, MOST_CIRCLES, POPULATIONS, REFERENCE
 from probewise.proof.estimates import Estimate, estimated_share
-from probewise.proof.results import ConcealedResult, misfit
+from probewise.proof.results import CONCEALED_TRIAL, misfit
 from probewise.proof.trial import (
     BRIGHT,
     DARK,
@@ -158,7 +158,7 @@ class ConcealedTrial:
 
 @own_arithmetic
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
-    """Search for a circle with a sensor that has a concealed effect; return a `ConcealedResult`."""
+    """Search for a circle with a sensor that has a concealed effect; return a `results.CONCEALED_TRIAL`."""
     experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
     cpu = []
     steps = timed_steps(
@@ -258,7 +258,7 @@ def run_concealed(
         executor=executor,
         progress=progress,
         noun="runs",
-        misfit=partial(misfit, kind=ConcealedResult),
+        misfit=partial(misfit, schema=CONCEALED_TRIAL),
     )
     return {trial: dict(results[trial.key]) for trial in trials}
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,51 +15,28 @@ from scipy.stats import poisson
 
 from probewise._kinds import checked_whole
 from probewise._version import __version__
-from probewise.errors import FileError, ParameterError
+from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
-from probewise.proof.campaign import read_campaign, run_campaign
+from probewise.proof.campaign import run_campaign
 from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
 from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
-from probewise.proof.results import TrialResult, misfit
+from probewise.proof.results import TRIAL, misfit
 from probewise.proof.trial import WRONG_MM, Trial, run_trial
 
-__all__ = ["Study", "Summary", "read_study", "run_study", "summarise"]
-
 _CHANCE = 0.01
-_MISFIT = partial(misfit, kind=TrialResult)
 
 
 @dataclass(frozen=True)
 class Summary:
     """One row of the table.
 
-    Attributes
-    ----------
-    n_runs
-        Number of runs, one per circle.
-    reached
-        Share of runs that reached the target precision within the limit of readings, with its 95 % interval.
-    mean, median
-        Readings needed, a miss counted as the limit; mean with standard error, median with 95 % interval (NaN bounds
-        for fewer than `LEAST_FOR_MEDIAN` runs).
-    to_white
-        Readings up to the first one on white, a run without one counted as the limit.
-    after_white
-        Readings after the first one on white, over runs that reached the precision.
-    bits_each
-        Bits per reading: prior minus posterior differential entropy.
-    error_mm
-        Largest error of a length at the stop, median over runs that reached the precision; NaN if none did.
-    wrong
-        Number of runs that reached the precision with an error above `WRONG_MM`.
-    wrong_expected, wrong_limit
-        Number expected from their own posteriors, and the 99 % quantile of a Poisson distribution with that mean.
-    held
-        Share of the 95 % intervals at the stop that hold the truth, over runs that reached the precision.
-    arm_s
-        Arm time per run in seconds, with the standard error.
-    cpu_s
-        Processor time per decision, median over runs of each run's median, in seconds.
+    Of the runs, one per circle: the share that `reached` the target precision within the limit of readings; `mean` and
+    `median` readings needed, a miss counted as the limit (mean with standard error, median with 95 % interval);
+    readings `to_white`, up to the first one on white (none counted as the limit), and `after_white`; bits per reading,
+    prior minus posterior differential entropy; arm time with standard error; processor time per decision, median over
+    runs of each run's median. Of those that reached the precision: largest error of a length, median (NaN if none);
+    number `wrong` by more than `WRONG_MM`, that which their own posteriors expect, and the 99 % quantile of a Poisson
+    distribution with that mean; share of the 95 % intervals that `held` the truth.
     """
 
     n_runs: int
@@ -133,27 +109,10 @@ def run_study(
 ) -> Study:
     """Run every row over the first circles of its population, or resume an interrupted study; return the results.
 
-    Parameters
-    ----------
-    rows
-        The rows; a mapping gives each its own number of circles.
-    n_circles
-        Circles per row, unless `rows` gives them.
-    path
-        The campaign's file. Rows and circles may be added later: runs in the file are not repeated.
-    max_readings
-        A run that has not reached the target precision after this many readings is a miss.
-    executor
-        Any `concurrent.futures.Executor`: processes here; for many machines `distributed.Client(...).get_executor()`.
-    progress
-        Called with the number of finished runs.
-
-    Raises
-    ------
-    ParameterError
-        If there is no row, or a row has no circle.
-    FileError, NotConvergedError
-        See `run_campaign`.
+    `rows`: the rows; a mapping gives each its own number of circles, else it is `n_circles`; `path`: the campaign's
+    file, whose runs are not repeated when rows and circles are added later; `max_readings`: a run that has not reached
+    the target precision after so many is a miss; all else is as in `run_campaign`. Raises ParameterError if there is no
+    row, or a row has no circle.
     """
     wanted = dict(rows) if isinstance(rows, Mapping) else dict.fromkeys(rows, n_circles or 0)
     if not wanted:
@@ -170,21 +129,7 @@ def run_study(
         executor=executor,
         progress=progress,
         noun="runs",
-        misfit=_MISFIT,
+        misfit=partial(misfit, schema=TRIAL),
     )
     own = {row: tuple(results[Trial(row, k).key] for k in range(n)) for row, n in wanted.items()}
     return Study(own, max_readings)
-
-
-def read_study(path: str | os.PathLike[str], rows: Sequence[SearchConfiguration]) -> Study:
-    """Read the results of these rows from a study's file, finished or not; runs not in the file are left out.
-
-    Raises FileError if the file does not belong to a study.
-    """
-    found = read_campaign(path, misfit=_MISFIT)
-    if "study" not in found.settings or not isinstance(found.settings.get("max_readings"), int):
-        raise FileError(Path(path), "no study's campaign", "a file that `probewise study` wrote")
-    numbers = range(1 + max((int(key.rpartition(" / ")[2]) for key in found.results), default=-1))
-    keys = {row: [Trial(row, k).key for k in numbers] for row in rows}
-    trials = {row: tuple(found.results[k] for k in own if k in found.results) for row, own in keys.items()}
-    return Study(trials, found.settings["max_readings"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import tempfile
 import time
@@ -15,12 +16,13 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise.diagnosis import Diagnosis, ModelSamples
 from probewise.diagnosis.diagnose_simulator import diagnose_system
+from probewise.diagnosis.evidence import covariance_root
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import NotConvergedError
 from probewise.proof.challenge import Task, effect_truths_and_intervals, result_or_failure, statements_to_score
-from probewise.proof.scoring import NOISE, names_in_label
-from probewise.proof.systems.alternatives import nats_of_alternative, right_predictions
+from probewise.proof.refits import SystemRefit, nats_of_alternative, rivals_with_nats, run_table
+from probewise.proof.scoring import HONEST_NATS, NOISE, names_in_label
 from probewise.proof.systems.cases import (
     SystemCase,
     SystemEffect,
@@ -39,13 +41,12 @@ _N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the densi
 
 
 def log_densities_of_runs(
-    case: SystemCase, diagnosis: Diagnosis, later: RunTable, *, rng: np.random.Generator
+    case: SystemCase, diagnosis: Diagnosis, later: RunTable, refit: SystemRefit, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
     """Return the log predictive density of each held-out run under up to four models, in nats, summed over readings.
 
-    "null" and "repaired" are the diagnosis's models without effects and with those found. "right" is the model with
-    exactly the concealed effects, fitted by the simulator; absent without effects or if the fit fails. "true" knows the
-    noise-free reading.
+    "null" and "repaired" are the diagnosis's models without effects and with those found. "right" knows the concealed
+    effects: absent without effects or if the fit fails. "true" knows the noise-free reading.
 
     Returns values by run, "inside" the range of the recorded runs and "beyond" it, then by model; not finite ones are
     left out.
@@ -53,30 +54,49 @@ def log_densities_of_runs(
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
     sd = case.drawn.kind.sd
-    rows = np.flatnonzero(case.drawn.table.run >= case.drawn.table.n_runs - 2)
+    rows = case.drawn.held_out_row_numbers
     about = cast(SimulatorApparatus, diagnosis.apparatus).about
     scores = {
         "null": _log_mean_density(*predict_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
         "true": _log_mean_density(case.noise_free[None, rows], np.array([sd]), readings),
     }
-    same = diagnosis.repaired is diagnosis.null
-    scores["repaired"] = (
-        scores["null"]
-        if same
-        else _log_mean_density(*predict_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings)
-    )
+    scores["repaired"] = scores["null"]
+    if diagnosis.repaired is not diagnosis.null:
+        scores["repaired"] = _log_mean_density(
+            *predict_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings
+        )
     if case.effects:
-        try:
-            right = right_predictions(case, _N_OF_A_RUN if case.drawn.kind.per_run else _N_SAMPLES, rng=fitting)
-            scores["right"] = _log_mean_density(right, np.full(len(right), sd), readings)
-        except NotConvergedError:
-            pass  # no fit was possible, so the case does not count for the share
+        with contextlib.suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
+            scores["right"] = _log_mean_density(*_right_predictions(case, refit, rng=fitting), readings)
     run = case.drawn.table.run[rows]
     names = {case.drawn.table.n_runs - 2: "inside", case.drawn.table.n_runs - 1: "beyond"}
     return {
         name: {model: float(own[run == k].sum()) for model, own in scores.items() if np.isfinite(own[run == k]).all()}
         for k, name in names.items()
     }
+
+
+def _right_predictions(
+    case: SystemCase, refit: SystemRefit, *, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Predict the held-out runs, as `predict_runs` does, by the model without effects fitted beside the true ones.
+
+    It is fitted to the readings without the change by the effects at the true parameters, which is added to what it
+    predicts. An effect's values for the held-out runs, which nobody can know, are the mean of the others.
+    """
+    drawn, known = case.drawn, []
+    for form, values in case.forms_with_parameters():
+        of_runs = [v for name, v in values.items() if name.startswith("values[")]
+        unseen = [f"values[{k}]" for k in (drawn.table.n_runs - 2, drawn.table.n_runs - 1)] if of_runs else []
+        known.append((form, {**values, **dict.fromkeys(unseen, float(np.mean(of_runs[:-2])) if of_runs else 0.0)}))
+    change = drawn.simulate_all_rows(known) - drawn.simulate_all_rows([])
+    seen, rows, sd = drawn.diagnosed_row_numbers, drawn.held_out_row_numbers, drawn.kind.sd
+    found = refit.refit(drawn, (case.readings - change)[seen])
+    z = found.z + rng.standard_normal((_N_SAMPLES, len(found.z))) @ covariance_root(found.slopes, sd**2).T
+    samples = ModelSamples(found.model.chain, found.model.theta(z), np.full(len(z), sd), (), 0)
+    later = run_table(drawn.table.select_rows(rows), drawn.kind, case.readings[rows])
+    predicted, sds = predict_runs(samples, refit.reference(found), later, rng=rng)
+    return predicted + change[rows], sds
 
 
 def predict_runs(
@@ -123,16 +143,17 @@ _LIKELY = 0.05
 
 @own_arithmetic
 def run_system_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its files alone; return a `SystemResult`, or a `Failure`."""
+    """Draw a case and diagnose it from its files alone; return a `results.SYSTEM_CASE`, or what failed."""
+    refit = SystemRefit()
     return result_or_failure(
         system_stratum_of(task.number)[0],
-        lambda: draw_system_case(task.seed, task.number),
-        _truth_json,
-        lambda case: _diagnosis_result(case, task),
+        lambda: draw_system_case(task.seed, task.number, after_refit=refit),
+        lambda case: _truth_json(case, refit),
+        lambda case: _diagnosis_result(case, task, refit),
     )
 
 
-def _truth_json(case: SystemCase) -> dict[str, Any]:
+def _truth_json(case: SystemCase, refit: SystemRefit) -> dict[str, Any]:
     kind = case.drawn.kind
     of_noise = {"white": [], "quantised": [], "t4": ["outliers"]}.get(case.noise.name, [case.noise.name])
     names = [effect.name for effect in case.effects]
@@ -144,31 +165,31 @@ def _truth_json(case: SystemCase) -> dict[str, Any]:
         "noise_text": case.noise_text,
         "readings": len(case.drawn.diagnosed_row_numbers),
         "truth": ["unknown"] if strange else sorted([*names, *of_noise]),
-        "hidden": [_effect_json(effect) for effect in case.effects],
+        "hidden": [_effect_json(effect, rivals_with_nats(refit, case, effect)) for effect in case.effects],
         "alias": None,
         "cosine": case.cosine,
     }
 
 
-def _effect_json(effect: SystemEffect) -> dict[str, Any]:
+def _effect_json(effect: SystemEffect, rivals: Mapping[str, float]) -> dict[str, Any]:
     """Return an effect as a dict; an alias's loss in nats is converted to a cosine, sqrt(1 - 2 nats / lambda^2)."""
-    squared = effect.size_lambda**2
+    squared, aliases = effect.size_lambda**2, {name: nats for name, nats in rivals.items() if nats < HONEST_NATS}
     return {
         "name": effect.name,
         "size_lambda": effect.size_lambda,
         "on_noise": False,
         "in_vocabulary": effect.in_vocabulary,
         "shows_in": list(effect.covariates),
-        "cosines": {name: math.sqrt(max(1 - 2 * nats / squared, 0.0)) for name, nats in effect.aliases.items()},
-        "rival_nats": dict(effect.rivals),
-        "parameters": {name: value for name, value in effect.parameters.items() if isinstance(value, float)},
+        "cosines": {name: math.sqrt(max(1 - 2 * nats / squared, 0.0)) for name, nats in aliases.items()},
+        "rival_nats": dict(rivals),
+        "parameters": {name: value for name, value in effect.values.items() if not name.startswith("values[")},
     }
 
 
-def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
+def _diagnosis_result(case: SystemCase, task: Task, refit: SystemRefit) -> dict[str, Any]:
     blind, later = task.generators(2)
     with tempfile.TemporaryDirectory() as directory:
-        file, table, test, _ = write_system_case(case, directory)
+        file, table, test = write_system_case(case, directory)
         simulator = read_simulator(file)
         seen, kept_back = (read_table_for(simulator, path) for path in (table, test))
         begun_s = time.process_time()
@@ -178,26 +199,26 @@ def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
     named = [e for e in case.effects if e.name in diagnosis.combination and e.name in found]
     return {
         **(said := statements_to_score(diagnosis)),
-        "alternative_nats": nats_of_alternatives(case, said),
+        "alternative_nats": nats_of_alternatives(case, said, refit),
         "where": [place.covariate for place in diagnosis.where],
         "parameters": {e.name: effect_truths_and_intervals(_truths(e, case), found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),
-        "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
+        "held_out": log_densities_of_runs(case, diagnosis, kept_back, refit, rng=later),
         "cpu_s": cpu_s,
     }
 
 
 def _truths(effect: SystemEffect, case: SystemCase) -> dict[str, Any]:
     """Return the parameters of an effect, values per run by the names of the runs, as in a diagnosis."""
-    values: list[float] = effect.parameters.get("values", [])
-    return {**effect.parameters, **{f"values[{run}]": v for run, v in zip(case.labels, values, strict=False)}}
+    of_run = {f"values[{k}]": f"values[{run}]" for k, run in enumerate(case.labels)}
+    return {of_run.get(name, name): value for name, value in effect.values.items()}
 
 
-def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any]) -> dict[str, float]:
+def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any], refit: SystemRefit) -> dict[str, float]:
     """Return how much worse what was said in other words explains a case, by its names joined with "+".
 
     Said are the hypotheses of more than 5 % and those of the credible set (`statements_to_score`), without effects on
-    the noise. The loss is that of `world.systems.nats_of_alternative`; infinite ones are left out.
+    the noise. The loss is that of `nats_of_alternative`; infinite ones are left out.
     """
     if not case.effects:
         return {}
@@ -205,7 +226,7 @@ def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any]) -> dict[str,
     labels = {*likely, *map(names_in_label, said["credible_set"])}
     own = tuple(sorted(effect.name for effect in case.effects))
     others = {tuple(sorted(set(names) - NOISE - {"unknown"})) for names in labels} - {(), own}
-    nats = {"+".join(names): nats_of_alternative(case, names) for names in sorted(others)}
+    nats = {"+".join(names): nats_of_alternative(refit, case, names) for names in sorted(others)}
     return {label: loss for label, loss in nats.items() if math.isfinite(loss)}
 
 

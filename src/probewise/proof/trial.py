@@ -109,7 +109,7 @@ def experiment_of_trial(trial: Trial) -> Experiment:
 
 @own_arithmetic
 def run_trial(trial: Trial) -> dict[str, Any]:
-    """Search for a circle; return a `TrialResult`."""
+    """Search for a circle; return a `results.TRIAL`."""
     experiment = experiment_of_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
     for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):

@@ -15,7 +15,7 @@ from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.search.search import UnknownEffects, prune_out_of_vocabulary, search
 from probewise.diagnosis.sensors import sensor_from_samples
 from probewise.experiment import experiment_for
-from probewise.proof.null_refit import NullRefit
+from probewise.proof.refits import NullRefit
 from probewise.proof.sensors.cases import Case, draw_case
 from probewise.scene import Circle, Field
 from probewise.systems import Noise, Simulator, table_for

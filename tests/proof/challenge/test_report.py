@@ -7,7 +7,7 @@ import json
 import pytest
 
 from probewise.cli import main
-from probewise.proof import challenge_page as report
+from probewise.proof import pages as report
 from probewise.proof import plots
 from probewise.proof.challenge import Task
 from probewise.proof.scoring import confusion_counts, reliability_bins
@@ -22,14 +22,14 @@ def results(make):
 
 def test_the_answer_counts_targets(results):
     rows = score(results)
-    assert report.summary_sentence(rows, 6).startswith("6 cases of concealed physics: ")
+    assert report.challenge_sentence(rows, 6).startswith("6 cases of concealed physics: ")
     open_rows = sum(row.decision == "open" for row in rows)
-    assert f"{open_rows} undecided by so few cases" in report.summary_sentence(rows, 6)
-    assert len(report.summary_sentence(rows, 6).split()) <= 20
+    assert f"{open_rows} undecided by so few cases" in report.challenge_sentence(rows, 6)
+    assert len(report.challenge_sentence(rows, 6).split()) <= 20
 
 
 def test_the_csv_leaves_out_what_is_not_there(results):
-    lines = list(csv.DictReader(io.StringIO(report.target_table_csv(score(results)))))
+    lines = list(csv.DictReader(io.StringIO(report.challenge_csv(score(results)))))
     by_name = {line["what"]: line for line in lines}
     assert by_name["right name first, lambda 8"]["found"] == "0.5"
     assert by_name["right name first, lambda 6"]["found"] == ""
@@ -38,14 +38,16 @@ def test_the_csv_leaves_out_what_is_not_there(results):
 
 
 def test_the_page_stands_alone_and_tells_of_failures(results):
-    page = report.page_html(results, score(results), command="probewise challenge")
+    page = report.challenge_html(results, score(results), command="probewise challenge")
     assert "no &lt;plan&gt;" in page
     assert page.count("data:image/png;base64,") == 2
     assert "http://" not in page
 
 
 def test_nothing_but_failures_still_makes_a_page(results):
-    assert "Cases that failed" in report.page_html(results[-1:], score(results[-1:]), command="probewise challenge")
+    assert "Cases that failed" in report.challenge_html(
+        results[-1:], score(results[-1:]), command="probewise challenge"
+    )
 
 
 def test_the_matrix_writes_every_count(results):

@@ -6,9 +6,8 @@ from multiprocessing import get_context
 import pytest
 
 from probewise.errors import FileError, ParameterError
-from probewise.proof.campaign import run_campaign
 from probewise.proof.configurations import REFERENCE, SearchConfiguration, paper_comparison_rows
-from probewise.proof.study import read_study, run_study
+from probewise.proof.study import run_study
 from probewise.proof.trial import Trial, experiment_of_trial, run_trial
 
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
@@ -110,14 +109,9 @@ def test_what_a_file_holds_is_not_done_again(study):
     assert told == [("runs", 1, 1)]
     assert again.trials[REFERENCE] == study[0].trials[REFERENCE][:1]
     assert list(again.table()) == []
-    assert read_study(study[1], ROWS).trials == study[0].trials
 
 
 def test_wrong_files_and_numbers_are_refused(study, tmp_path):
-    path = tmp_path / "other.jsonl"
-    run_campaign(dict, {}, path=path, settings={"something": "else"})
-    with pytest.raises(FileError, match="no study's"):
-        read_study(path, [REFERENCE])
     with pytest.raises(FileError, match="other settings"):
         run_study([REFERENCE], 1, path=study[1])
     with pytest.raises(ParameterError, match="1 or more"):

@@ -38,31 +38,19 @@ def rates(s, p, u):
         "t_s",
         n_runs,
     )
-    return kind, rows, {"k": np.array([[k]])}
+    return kind, rows, {"k": k}
 
 
-def with_forms(names, numbers, **options):
-    """Simulate the small system with forms, (n_samples, n_points); also return its rows and the readings without."""
+def with_form(name, numbers, **options):
+    """Simulate the small system with a form, (n_points,); also return its rows and the readings without."""
     kind, rows, parameters = small(**options)
     bare = simulate_noise_free(kind, rows, parameters)
-    true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
-    forms = {form.name: form for form in forms_of(true)}
-    placed = [(forms[name], own) for name, own in zip(names, numbers, strict=True)]
-    return simulate_noise_free(kind, rows, parameters, placed).readings, rows, bare.readings[0]
+    true = TrueSystem(kind, rows, parameters, bare.readings, bare.states)
+    form = next(form for form in forms_of(true) if form.name == name)
+    return simulate_noise_free(kind, rows, parameters, [(form, numbers)]).readings, rows, bare.readings
 
 
 @pytest.fixture
 def solve():
-    """Readings of the small system with one form of the vocabulary and its numbers."""
-
-    def run(name, numbers, **options):
-        found, rows, bare = with_forms([name], [numbers], **options)
-        return found[0], rows, bare
-
-    return run
-
-
-@pytest.fixture
-def simulate_pair():
-    """Readings of the small system with two forms of the vocabulary and their numbers, (n_samples, n_points)."""
-    return lambda names, numbers, **options: with_forms(names, numbers, **options)[0]
+    """Readings of the small system with one form of the vocabulary and its numbers, its rows, and those without."""
+    return with_form

@@ -1,7 +1,14 @@
 """What acts within a law acts in continuous time: against solutions by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+
+from probewise.errors import NotConvergedError
+from probewise.proof.systems.simulate import simulate_noise_free
+
+from .conftest import small
 
 SINCE = np.tile([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0], 3)
 
@@ -109,18 +116,11 @@ def test_an_input_that_comes_late_jumps_between_the_rows(solve):
     np.testing.assert_allclose(found, 2 + np.maximum(SINCE - 1.25, 0), atol=1e-6)
 
 
-@pytest.mark.parametrize("linear", [False, True])
-def test_of_samples_together_each_reads_its_own_late_input(simulate_pair, linear):
-    """A gain of the input that differs between the samples, beside a delay: as each alone."""
-
-    def pair(gains):
-        numbers = [{"a": np.array(gains)[:, None]}, {"tau_s": np.array([[0.25]])}]
-        return simulate_pair(("input_gain:u", "input_delay:u"), numbers, u=[0, 1, 2, 0, 1, 3, 1], linear=linear)
-
-    together = pair([0.0, 0.3])
-    assert np.abs(together[1] - together[0]).max() > 0.05
-    for k, gain in enumerate([0.0, 0.3]):
-        np.testing.assert_allclose(together[k], pair([gain])[0], rtol=1e-9)
+def test_a_law_that_runs_away_between_two_rows_is_refused():
+    kind, rows, _ = small()
+    runaway = replace(kind, text=kind.text.replace('u["u"] - p["k"] * s["x"]', 'p["k"] * 50 * s["x"] ** 2'))
+    with np.errstate(all="ignore"), pytest.raises(NotConvergedError, match="runs away"):
+        simulate_noise_free(runaway, rows, {"k": 0.9})
 
 
 def test_a_clock_that_runs_fast_hastens_the_law(solve):

@@ -7,7 +7,7 @@ from probewise.proof.systems.cases import KINDS, draw_system
 from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
 
 DRAWN = draw_system(KINDS[3], rng=np.random.default_rng(4))
-CLEAN = DRAWN.fit_without_effects.readings
+CLEAN = DRAWN.true_system.readings
 
 
 def _noise(name, wanted=12.0, seed=0):

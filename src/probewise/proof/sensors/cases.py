@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
@@ -21,7 +19,7 @@ from probewise.proof.sensors.sizing import (
     amplitude_of_size,
     region_of_effect,
 )
-from probewise.recordings.plan import Instrumentation, Plan, Recording
+from probewise.recordings.plan import Plan, Recording
 from probewise.world.stages import Concealed, Disturbs
 from probewise.world.world import World
 
@@ -109,75 +107,6 @@ class HiddenEffect:
         return dict(vars(self.effect))
 
 
-@dataclass(frozen=True)
-class AliasedEffect:
-    """An effect aliased with the concealed one, not itself in the recording, and their cosine after the refit."""
-
-    effect: Concealed
-    cosine: float
-
-
-@dataclass(frozen=True)
-class Truth:
-    """The truth of a case.
-
-    `seed`, `number`: seed and number of the case; `stratum`: stratum of the case; `ssf`, `noise_level`, `noise_model`,
-    `plan`: names in SSFS, NOISE_LEVELS, NOISE_MODELS and PLANS; `noise_sd`, `black`, `white`: noise sd and levels of
-    the sensor, in reading units; `hidden`: concealed effects, in the order of the vocabulary; `cosine`: cosine of a
-    pair after the refit; None: no pair; `alias`: the alias of the concealed effect, in the stratum of aliases;
-    otherwise None.
-    """
-
-    seed: int
-    number: int
-    stratum: Stratum
-    ssf: str
-    noise_level: str
-    noise_model: str
-    plan: str
-    noise_sd: float
-    black: float
-    white: float
-    hidden: tuple[HiddenEffect, ...] = ()
-    cosine: float | None = None
-    alias: AliasedEffect | None = None
-
-    @property
-    def combination(self) -> tuple[str, ...]:
-        """Names that a perfect diagnosis gives, sorted; ("unknown",) if any effect is outside the vocabulary.
-
-        A noise model that the vocabulary has is among them, "ssf_order" is not; () if none is left.
-        """
-        if any(not hidden.in_vocabulary for hidden in self.hidden):
-            return ("unknown",)
-        names = {hidden.name for hidden in self.hidden} - NO_PHYSICS
-        if self.noise_model in NOISE_NAMES:
-            names.add(NOISE_NAMES[self.noise_model])
-        return tuple(sorted(names))
-
-    def to_json(self) -> str:
-        """Return the truth as a string of strict JSON, "format": "truth/1"."""
-        content = {
-            "format": "truth/1",
-            **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)},
-            "stratum": dataclasses.asdict(self.stratum),
-            "combination": self.combination,
-            "hidden": [
-                {
-                    "name": hidden.name,
-                    "in_vocabulary": hidden.in_vocabulary,
-                    "parameters": hidden.parameters,
-                    "size_lambda": hidden.size_lambda,
-                    "shows_in": hidden.residual_covariates,
-                    "region": None if hidden.region is None else dataclasses.asdict(hidden.region),
-                }
-                for hidden in self.hidden
-            ],
-            "alias": None if self.alias is None else {"name": self.alias.effect.name, "cosine": self.alias.cosine},
-        }
-        return json.dumps(content, indent=1, allow_nan=False) + "\n"
-
-
 ALIASES: tuple[tuple[str, str], ...] = (
     ("backlash", "edge_misplacement"),
     ("height_gradient", "albedo_gradient"),
@@ -196,16 +125,39 @@ _ATTEMPTS = 6
 class Case:
     """One case of a challenge.
 
-    `recording`: the recording to diagnose; `truth`: the truth that the diagnosis is scored against; `world`: the
-    simulated sensor with its concealed effects; `test_plans`: plans of the held-out readings, by name: "angle",
-    "pattern", "direction" (`held_out_plans`); `test_seed`: seed sequence of the noise of the held-out readings.
+    `recording`: the recording to diagnose; `world`: the simulated sensor with its concealed effects; `test_plans`:
+    plans of the held-out readings, by name: "angle", "pattern", "direction" (`held_out_plans`); `test_seed`: seed
+    sequence of their noise; `ssf`, `noise_level`, `noise_model`, `plan`: names in SSFS, NOISE_LEVELS, OTHER_NOISE or
+    "white", and PLANS; `hidden`: concealed effects, in the order of the vocabulary; `alias`: in the stratum of aliases,
+    the name of an effect, not in the recording, that is aliased with the concealed one; `cosine` of the two, or of a
+    pair, after the refit; None: neither.
     """
 
     recording: Recording
-    truth: Truth
     world: World
     test_plans: Mapping[str, Plan]
     test_seed: np.random.SeedSequence
+    stratum: Stratum
+    ssf: str
+    noise_level: str
+    noise_model: str
+    plan: str
+    hidden: tuple[HiddenEffect, ...]
+    cosine: float | None
+    alias: str | None
+
+    @property
+    def combination(self) -> tuple[str, ...]:
+        """Names that a perfect diagnosis gives, sorted; ("unknown",) if any effect is outside the vocabulary.
+
+        A noise model that the vocabulary has is among them, "ssf_order" is not; () if none is left.
+        """
+        if any(not hidden.in_vocabulary for hidden in self.hidden):
+            return ("unknown",)
+        names = {hidden.name for hidden in self.hidden} - NO_PHYSICS
+        if self.noise_model in NOISE_NAMES:
+            names.add(NOISE_NAMES[self.noise_model])
+        return tuple(sorted(names))
 
 
 def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Case:
@@ -219,36 +171,45 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
-    rng = np.random.default_rng(drawing)
+    rng, plan_rng = np.random.default_rng(drawing), np.random.default_rng(plan_seed)
     ssf = "gaussian" if stratum.kind == "ssf_order" else str(rng.choice(list(SSFS)))
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
-    plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    plan_name, setup, chosen = _draw_plan_and_effects(
-        stratum, n_earlier, plan_names, sensor, norm_after_refit, rng=rng, plan_rng=np.random.default_rng(plan_seed)
-    )
-    if any(isinstance(hidden.effect, Disturbs) for hidden in chosen.hidden):
+    plans = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
+    failure = NotConvergedError("no plan to try")
+    for attempt in range(_ATTEMPTS * len(plans)):
+        if attempt % _ATTEMPTS == 0:
+            plan_name = plans[attempt // _ATTEMPTS]
+            setup = CleanSetup(draw_plan_with_displaced_patterns(plan_name, rng=plan_rng), sensor)
+            sizer = EffectSizer(setup, norm_after_refit)
+        try:
+            hidden, cosine, alias = _draw_effects(stratum, n_earlier, sizer, rng)
+            break
+        except NotConvergedError as error:
+            failure = error
+    else:
+        raise failure
+    if any(isinstance(each.effect, Disturbs) for each in hidden):
         model = "white"  # only one noise fault at a time
-    plan = replace(setup.plan, instrumentation=_simulated_instrumentation(setup.plan, model))
-    concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in chosen.hidden))
+    step = 1.0 if model == "quantised" else None
+    told = replace(setup.plan.instrumentation, step=step, description="Simulated readings of a challenge")
+    plan = replace(setup.plan, instrumentation=told)
+    concealing = replace(sensor, concealed=tuple(each.effect for each in hidden))
     world = with_noise_model(concealing, model, duration_s=setup.duration_s)
-    truth = Truth(
-        seed=seed,
-        number=number,
-        stratum=stratum,
-        ssf=ssf,
-        noise_level=level,
-        noise_model=model,
-        plan=plan_name,
-        noise_sd=world.noise_sd,
-        black=world.black,
-        white=world.white,
-        hidden=chosen.hidden,
-        cosine=chosen.cosine,
-        alias=chosen.alias,
+    return Case(
+        world.simulate(plan, rng=np.random.default_rng(noise)),
+        world,
+        held_out_plans(plan, rng=np.random.default_rng(test)),
+        test_noise,
+        stratum,
+        ssf,
+        level,
+        model,
+        plan_name,
+        hidden,
+        cosine,
+        alias,
     )
-    recording = world.simulate(plan, rng=np.random.default_rng(noise))
-    return Case(recording, truth, world, held_out_plans(plan, rng=np.random.default_rng(test)), test_noise)
 
 
 def held_out_recordings(case: Case) -> dict[str, Recording]:
@@ -260,81 +221,44 @@ def held_out_recordings(case: Case) -> dict[str, Recording]:
     return {name: case.world.simulate(plan, rng=rng) for name, plan in case.test_plans.items()}
 
 
-@dataclass(frozen=True)
-class _ConcealedEffects:
-    """Effects chosen for a case; the cosine of a pair, or the alias, is None in other strata."""
-
-    hidden: tuple[HiddenEffect, ...] = ()
-    cosine: float | None = None
-    alias: AliasedEffect | None = None
-
-
-def _draw_plan_and_effects(
-    stratum: Stratum,
-    n_earlier: int,
-    plan_names: list[str],
-    sensor: World,
-    norm_after_refit: NormAfterRefit,
-    *,
-    rng: np.random.Generator,
-    plan_rng: np.random.Generator,
-) -> tuple[str, CleanSetup, _ConcealedEffects]:
-    """Draw a plan and up to six times the stratum's effects, plan after plan, until the effects fit the stratum.
-
-    Return the plan's name, the plan with its effect-free world, and the effects; raise NotConvergedError if none fit.
-    """
-    failure = NotConvergedError("no plan to try")
-    for plan_name in plan_names:
-        setup = CleanSetup(draw_plan_with_displaced_patterns(plan_name, rng=plan_rng), sensor)
-        if stratum.kind == "clean":
-            return plan_name, setup, _ConcealedEffects()
-        sizer = EffectSizer(setup, norm_after_refit)
-        for _ in range(_ATTEMPTS):
-            try:
-                return plan_name, setup, _draw_effects(stratum, n_earlier, setup, sizer, rng)
-            except NotConvergedError as error:
-                failure = error
-    raise failure
-
-
 def _draw_effects(
-    stratum: Stratum, n_earlier: int, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
-) -> _ConcealedEffects:
-    """Draw the effects of a stratum once.
+    stratum: Stratum, n_earlier: int, sizer: EffectSizer, rng: np.random.Generator
+) -> tuple[tuple[HiddenEffect, ...], float | None, str | None]:
+    """Draw the effects of a stratum once; return them, the cosine of a pair or with an alias, and that alias's name.
 
     Raises NotConvergedError if they cannot have the size, a pair's abs(cosine) is 0.5 or more, an alias loses 3.
     """
 
     def draw_effect(name: str) -> HiddenEffect:
-        return _draw_effect_of_size(name, stratum.size, setup, sizer, rng)
+        return draw_effect_of_size(name, stratum.size, sizer, rng)
 
     match stratum.kind:
+        case "clean":
+            return (), None, None
         case "single":
-            return _ConcealedEffects((draw_effect(SINGLES[n_earlier % len(SINGLES)]),))
+            return (draw_effect(SINGLES[n_earlier % len(SINGLES)]),), None, None
         case "outside":
-            return _ConcealedEffects((draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),))
+            return (draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),), None, None
         case "pair":
             first, second = (draw_effect(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
             cosine = sizer.cosine(first.effect, second.effect)
             if abs(cosine) >= _MOST_COSINE:
                 raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
-            return _ConcealedEffects((first, second), cosine=cosine)
+            return (first, second), cosine, None
         case "alias":
             hidden, other = (draw_effect(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
             cosine = sizer.cosine(hidden.effect, other.effect)
             if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
-            return _ConcealedEffects((hidden,), alias=AliasedEffect(other.effect, cosine))
+            return (hidden,), cosine, other.name
         case _:
-            return _ConcealedEffects((draw_effect(stratum.kind),))
+            return (draw_effect(stratum.kind),), None, None
 
 
-def _draw_effect_of_size(
-    name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
-) -> HiddenEffect:
+def draw_effect_of_size(name: str, wanted: float, sizer: EffectSizer, rng: np.random.Generator) -> HiddenEffect:
     """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
     sampler = INSIDE.get(name) or OUTSIDE[name]
-    of_amplitude = sampler.draw(setup, rng)
+    of_amplitude = sampler.draw(sizer.setup, rng)
     amplitude = sampler.first
     if sampler.scalable:
         amplitude = amplitude_of_size(
@@ -342,9 +266,3 @@ def _draw_effect_of_size(
         )
     effect = of_amplitude(amplitude)
     return HiddenEffect(effect, sizer.size(effect), region_of_effect(effect, sizer))
-
-
-def _simulated_instrumentation(plan: Plan, model: str) -> Instrumentation:
-    """Return a plan's instrumentation, described as simulated; rounding step 1 for "quantised" noise, else None."""
-    step = 1.0 if model == "quantised" else None
-    return replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")

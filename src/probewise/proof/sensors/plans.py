@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,16 +16,6 @@ from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_t
 PLANS: Mapping[str, Callable[[], Plan]] = {"paper": paper_plan, "two_way": two_way_plan}
 
 _READING_S, _BREAK_S = 1.2, 30.0
-
-
-@dataclass(frozen=True)
-class _HeldOutScan:
-    """One held-out scan over one pattern: positions (n, 2) in mm, one orientation in rad."""
-
-    name: str
-    pattern: Pattern
-    places_mm: FloatArray
-    orientation_rad: float
 
 
 def draw_plan_with_displaced_patterns(name: str, *, rng: np.random.Generator) -> Plan:
@@ -55,21 +45,15 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     else:
         pattern = _randomly_displaced_pattern(Disc((0.0, 0.0), 30.0), rng)
     slant = math.radians(rng.uniform(30, 60))
-    other = (
-        _HeldOutScan("test_direction", boundary, line[::-1], 0.0)
-        if one_way
-        else _HeldOutScan(
-            "test_direction", HalfPlane(slant, 0.0), line[:, :1] * [math.cos(slant), math.sin(slant)], math.pi / 2
-        )
-    )
-    scans = {
-        "angle": _HeldOutScan("test_angle", boundary, line, angle),
-        "pattern": _HeldOutScan("test_pattern", pattern, line + beside, 0.0),
-        "direction": other,
+    oblique = HalfPlane(slant, 0.0), line[:, :1] * [math.cos(slant), math.sin(slant)], math.pi / 2
+    scans: dict[str, tuple[Pattern, FloatArray, float]] = {
+        "angle": (boundary, line, angle),
+        "pattern": (pattern, line + beside, 0.0),
+        "direction": (boundary, line[::-1], 0.0) if one_way else oblique,
     }
     start_s, plans = float(plan.time_s[-1]), {}
-    for name, scan in scans.items():
-        plans[name] = _single_scan_plan(plan, scan, start_s + _BREAK_S)
+    for name, (surface, places_mm, turn) in scans.items():
+        plans[name] = _single_scan_plan(plan, name, surface, places_mm, turn, start_s + _BREAK_S)
         start_s = float(plans[name].time_s[-1])
     return plans
 
@@ -92,9 +76,11 @@ def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> P
             return pattern
 
 
-def _single_scan_plan(plan: Plan, scan: _HeldOutScan, start_s: float) -> Plan:
+def _single_scan_plan(
+    plan: Plan, name: str, pattern: Pattern, places_mm: FloatArray, orientation_rad: float, start_s: float
+) -> Plan:
     """Return a plan of one scan from `start_s`; each covariate continues the line in time fitted to that of `plan`."""
-    n_points = len(scan.places_mm)
+    n_points = len(places_mm)
     time_s = start_s + _READING_S * np.arange(n_points)
     # The battery keeps draining at the same rate.
     covariates = {
@@ -102,15 +88,15 @@ def _single_scan_plan(plan: Plan, scan: _HeldOutScan, start_s: float) -> Plan:
         for name, values in plan.covariates.items()
     }
     return Plan(
-        x_mm=scan.places_mm[:, 0],
-        y_mm=scan.places_mm[:, 1],
-        orientation_rad=np.full(n_points, scan.orientation_rad),
+        x_mm=places_mm[:, 0],
+        y_mm=places_mm[:, 1],
+        orientation_rad=np.full(n_points, orientation_rad),
         time_s=np.round(time_s, 3),
         scan=np.zeros(n_points, dtype=np.int64),
-        scan_names=(scan.name,),
+        scan_names=(f"test_{name}",),
         pattern=np.zeros(n_points, dtype=np.int64),
-        pattern_names=(scan.name.removeprefix("test_"),),
-        patterns={scan.name.removeprefix("test_"): scan.pattern},
+        pattern_names=(name,),
+        patterns={name: pattern},
         covariates=covariates,
         instrumentation=plan.instrumentation,
     )

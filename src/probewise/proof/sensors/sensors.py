@@ -24,8 +24,7 @@ _PIXEL_MM = 0.5  # resolution of the raster: an SSF may be constant over half a 
 NOISE_LEVELS: Mapping[str, float] = {"low": 0.4, "middle": 0.6, "high": 1.0}
 """Sd of a reading's noise, in reading units."""
 
-NOISE_MODELS = ("white", "ar1", "drifting", "t4", "outliers", "quantised", "signal_dependent", "dropouts")
-OTHER_NOISE = NOISE_MODELS[1:]
+OTHER_NOISE = ("ar1", "drifting", "t4", "outliers", "quantised", "signal_dependent", "dropouts")
 
 NOISE_NAMES: Mapping[str, str] = {
     "ar1": "correlated_noise",
@@ -37,40 +36,31 @@ NOISE_NAMES: Mapping[str, str] = {
 """Names of noise models in the vocabulary; the other models are declared in the plan or out of vocabulary."""
 
 
+def _about(rng: np.random.Generator, value: float) -> float:
+    """Draw a length within 15 % of a LEGO light sensor's."""
+    return value * float(rng.uniform(0.85, 1.15))
+
+
+def _center(rng: np.random.Generator) -> tuple[float, float]:
+    return float(rng.uniform(-0.8, 0.8)), float(rng.uniform(0.8, 2.2))
+
+
 def _draw_gaussian_spot(rng: np.random.Generator) -> Spot:
-    blob = Blob(
-        1.0,
-        _draw_spot_center(rng),
-        (4.0 * _draw_factor_about_one(rng), 2.5 * _draw_factor_about_one(rng)),
-        float(rng.uniform(-0.4, 0.4)),
-    )
-    return gaussian_spot([blob], pixel_mm=_PIXEL_MM)
+    center, sd = _center(rng), (_about(rng, 4.0), _about(rng, 2.5))
+    return gaussian_spot([Blob(1.0, center, sd, float(rng.uniform(-0.4, 0.4)))], pixel_mm=_PIXEL_MM)
 
 
 def _draw_two_lobed_spot(rng: np.random.Generator) -> Spot:
-    u, v = _draw_spot_center(rng)
-    apart = 3.5 * _draw_factor_about_one(rng)
-    blobs = [
-        Blob(
-            float(rng.uniform(0.5, 0.7)),
-            (u - apart, v),
-            (2.2 * _draw_factor_about_one(rng), 2.5 * _draw_factor_about_one(rng)),
-            0.2,
-        ),
-        Blob(
-            float(rng.uniform(0.3, 0.5)),
-            (u + apart, v - 1.0),
-            (2.0 * _draw_factor_about_one(rng), 3.0 * _draw_factor_about_one(rng)),
-            -0.2,
-        ),
-    ]
-    return gaussian_spot(blobs, pixel_mm=_PIXEL_MM)
+    (u, v), apart = _center(rng), _about(rng, 3.5)
+    left = Blob(float(rng.uniform(0.5, 0.7)), (u - apart, v), (_about(rng, 2.2), _about(rng, 2.5)), 0.2)
+    right = Blob(float(rng.uniform(0.3, 0.5)), (u + apart, v - 1.0), (_about(rng, 2.0), _about(rng, 3.0)), -0.2)
+    return gaussian_spot([left, right], pixel_mm=_PIXEL_MM)
 
 
 def _draw_ridge_spot(rng: np.random.Generator) -> Spot:
     return ridge_spot(
-        9.0 * _draw_factor_about_one(rng),
-        center_mm=_draw_spot_center(rng),
+        _about(rng, 9.0),
+        center_mm=_center(rng),
         lobes=float(rng.uniform(0.15, 0.35)),
         ridge_mm=float(rng.uniform(-4.0, -2.0)),
         ridge_width_mm=1.5,
@@ -80,19 +70,13 @@ def _draw_ridge_spot(rng: np.random.Generator) -> Spot:
 
 
 def _draw_ring_spot(rng: np.random.Generator) -> Spot:
-    off_axis = float(rng.uniform(0.2, 0.6))
-    return ring_spot(
-        3.3 * _draw_factor_about_one(rng),
-        2.0 * _draw_factor_about_one(rng),
-        center_mm=_draw_spot_center(rng),
-        off_axis=off_axis,
-        pixel_mm=_PIXEL_MM,
-    )
+    off_axis, radius, width = float(rng.uniform(0.2, 0.6)), _about(rng, 3.3), _about(rng, 2.0)
+    return ring_spot(radius, width, center_mm=_center(rng), off_axis=off_axis, pixel_mm=_PIXEL_MM)
 
 
 def _draw_skewed_spot(rng: np.random.Generator) -> Spot:
-    core = (1.6 * _draw_factor_about_one(rng), 1.1 * _draw_factor_about_one(rng))
-    return tailed_spot(core, center_mm=_draw_spot_center(rng), skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
+    core, center = (_about(rng, 1.6), _about(rng, 1.1)), _center(rng)
+    return tailed_spot(core, center_mm=center, skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
 
 
 SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
@@ -106,40 +90,26 @@ SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
 middle noise level: a good but inexact model."""
 
 
-def draw_spot(ssf: str, *, rng: np.random.Generator) -> Spot:
-    """Draw a footprint of the kind `ssf`, a key of SSFS, with sizes within 15 % of a LEGO light sensor's."""
-    return SSFS[ssf](rng)
-
-
 def draw_sensor(ssf: str, noise_level: str, *, rng: np.random.Generator) -> World:
     """Draw a sensor, as a World without effects: SSF of a kind of SSFS, black, white, noise sd of NOISE_LEVELS."""
     black, white = float(rng.uniform(8, 14)), float(rng.uniform(55, 70))
-    return World(draw_spot(ssf, rng=rng), black=black, white=white, noise_sd=NOISE_LEVELS[noise_level])
+    return World(SSFS[ssf](rng), black=black, white=white, noise_sd=NOISE_LEVELS[noise_level])
 
 
 def with_noise_model(world: World, model: str, *, duration_s: float) -> World:
-    """Return the world with a noise model of NOISE_MODELS added; its `noise_sd` is unchanged.
+    """Return the world with noise that is "white" or a model of OTHER_NOISE; its `noise_sd` is unchanged.
 
     This sd is that at the start for "drifting", on black for "signal_dependent", of the core for "outliers".
     "quantised" readings are rounded to whole units, which the plan should declare.
     """
-    if model == "quantised":
-        return replace(world, step=1.0)
-    more: Mapping[str, tuple[Concealed, ...]] = {
-        "white": (),
-        "ar1": (CorrelatedNoise(0.3),),
-        "drifting": (RisingNoiseSd(2.0, duration_s),),
-        "t4": (HeavyTails(4.0),),
-        "outliers": (Outliers(0.02, 8.0),),
-        "signal_dependent": (SignalDependentNoise(2.0),),
-        "dropouts": (Dropouts(0.01, 0.0),),
+    more: Mapping[str, Concealed] = {
+        "ar1": CorrelatedNoise(0.3),
+        "drifting": RisingNoiseSd(2.0, duration_s),
+        "t4": HeavyTails(4.0),
+        "outliers": Outliers(0.02, 8.0),
+        "signal_dependent": SignalDependentNoise(2.0),
+        "dropouts": Dropouts(0.01, 0.0),
     }
-    return replace(world, concealed=(*world.concealed, *more[model]))
-
-
-def _draw_factor_about_one(rng: np.random.Generator) -> float:
-    return float(rng.uniform(0.85, 1.15))
-
-
-def _draw_spot_center(rng: np.random.Generator) -> tuple[float, float]:
-    return float(rng.uniform(-0.8, 0.8)), float(rng.uniform(0.8, 2.2))
+    if model in more:
+        return replace(world, concealed=(*world.concealed, more[model]))
+    return replace(world, step=1.0) if model == "quantised" else world

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,18 +16,11 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.proof.sensors.cases import Stratum, stratum_in_wheel
 from probewise.proof.sensors.sizing import amplitude_of_size
-from probewise.proof.systems.fit import (
-    AddedForm,
-    LeastSquaresFit,
-    ModelWithForms,
-    project_out,
-)
-from probewise.proof.systems.form import Form, FormWithParameters, TrueSystem, parameter_arrays
+from probewise.proof.systems.form import Form, FormWithParameters, Numbers, TrueSystem
 from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
 from probewise.proof.systems.kind import SystemKind, SystemTable, design_runs
 from probewise.proof.systems.kinds import FORMULAS, LAWS
 from probewise.proof.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
-from probewise.proof.systems.rivals import TELLING_NATS, residual_covariates_of, rivals_with_nats, vocabulary_name
 from probewise.proof.systems.simulate import simulate_noise_free
 from probewise.proof.systems.unlisted import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.recordings import write_text_atomically
@@ -60,6 +52,7 @@ KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
 _ATTEMPTS = 16
 _APART = 0.5  # upper bound on the cosine of a pair
 _TOLERANCE = 0.008  # relative tolerance of a size
+_SHOWS = 1e-3  # least share of an effect's change that the nominal model does not absorb
 _RUN_AWAY = 1e3  # times the largest reading: larger ones count as divergence
 
 
@@ -81,39 +74,26 @@ class DrawnSystem:
         """Indices in `table` of the rows that are not held out."""
         return np.flatnonzero(self.table.run < self.table.n_runs - 2)
 
+    @property
+    def held_out_row_numbers(self) -> IntArray:
+        """Indices in `table` of the rows of the last two runs."""
+        return np.flatnonzero(self.table.run >= self.table.n_runs - 2)
+
     @cached_property
     def diagnosed_table(self) -> SystemTable:
         """The table of the rows that are not held out."""
         return self.table.select_rows(self.diagnosed_row_numbers)
 
     @cached_property
-    def nominal_model(self) -> ModelWithForms:
-        """The model without effects, over the rows that are not held out."""
-        return ModelWithForms(self.kind, self.diagnosed_table)
-
-    @cached_property
-    def true_coordinates(self) -> FloatArray:
-        """Coordinates of the true parameters in `nominal_model`, (n_coordinates,)."""
-        return self.nominal_model.coordinates_of(self.shared, self.by_run)
-
-    @cached_property
-    def fit_without_effects(self) -> LeastSquaresFit:
-        """The nominal model at the true parameters, as a fit with chi-square 0: its readings and their derivatives."""
-        readings, slopes = self.nominal_model.predict_with_slopes(self.true_coordinates)
-        return LeastSquaresFit(self.true_coordinates, readings, slopes, 0.0)
-
-    @cached_property
     def true_system(self) -> TrueSystem:
         """The system at its true parameters with readings and states, over the rows that are not held out."""
-        parameters = self.nominal_model.parameters_at(self.true_coordinates[None, :])
-        trace = simulate_noise_free(self.kind, self.diagnosed_table, parameters)
-        return TrueSystem(
-            self.kind,
-            self.diagnosed_table,
-            parameters,
-            trace.readings[0],
-            {name: v[0] for name, v in trace.states.items()},
-        )
+        parameters = self._parameters(self.diagnosed_table)
+        found = simulate_noise_free(self.kind, self.diagnosed_table, parameters)
+        return TrueSystem(self.kind, self.diagnosed_table, parameters, found.readings, found.states)
+
+    def _parameters(self, table: SystemTable) -> dict[str, Any]:
+        per_run = {name: values[table.run] for name, values in self.by_run.items()}
+        return {name: per_run[name] if name in per_run else self.shared[name] for name in self.kind.parameters}
 
     def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
@@ -130,55 +110,38 @@ class DrawnSystem:
         return readings
 
     def _simulate(self, table: SystemTable, effects: Sequence[FormWithParameters]) -> FloatArray:
-        model = ModelWithForms(self.kind, table)
         with np.errstate(all="ignore"):
-            at = model.coordinates_of(self.shared, self.by_run)
-            found = simulate_noise_free(self.kind, table, model.parameters_at(at[None, :]), effects)
-        return np.asarray(found.readings[0])
+            return simulate_noise_free(self.kind, table, self._parameters(table), effects).readings
 
-    def size_of_effects(self, effects: Sequence[FormWithParameters]) -> float:
-        """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
-        return math.sqrt(
-            self.nominal_model.fit(self.simulate_diagnosed_rows(effects), self.true_coordinates).chi_square
-        )
+
+AfterRefit: TypeAlias = Callable[[DrawnSystem, FloatArray], FloatArray]
+"""Residuals, in noise sds, (n_points,), of noise-free readings of the rows that are not held out after a refit of the
+model without effects. Its own error, the residuals without effects, must not be counted. NotConvergedError: no fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class SystemEffect:
-    """A concealed effect: form, parameters, size lambda, covariates, and rivals by name with their loss in nats."""
+    """A concealed effect: form, parameters, size lambda, and the covariates along which it shows."""
 
     form: Form
-    values: Mapping[str, float]
+    values: Numbers
     size_lambda: float
-    rivals: Mapping[str, float]
-    covariates: tuple[str, ...]
+    covariates: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
         """The effect's name, with its target."""
-        return vocabulary_name(self.form)
+        return self.form.vocabulary_name
 
     @property
     def in_vocabulary(self) -> bool:
         """Whether the effect is one that a diagnosis can name."""
-        return not self.form.shape
-
-    @property
-    def aliases(self) -> dict[str, float]:
-        """The rivals that no diagnosis can tell from it: loss below TELLING_NATS, by name."""
-        return {name: nats for name, nats in self.rivals.items() if nats < TELLING_NATS}
+        return not self.form.outside
 
     @property
     def form_with_parameters(self) -> FormWithParameters:
-        """The pair of the form and its parameters by name, (1, 1) each."""
-        return self.form, parameter_arrays([self.values])
-
-    @property
-    def parameters(self) -> dict[str, Any]:
-        """Parameters and constants by name; `values` lists those of all runs, held-out runs last."""
-        values = [v for name, v in self.values.items() if name.startswith("values[")]
-        own = {name: v for name, v in self.values.items() if not name.startswith("values[")}
-        return {**own, **({"values": values} if values else {}), **self.form.also_in_truth}
+        """The pair of the form and its parameters by name."""
+        return self.form, self.values
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +166,10 @@ class SystemCase:
     readings: FloatArray
     cosine: float | None = None
 
+    def forms_with_parameters(self) -> list[FormWithParameters]:
+        """Return every concealed effect's form with its parameters."""
+        return [effect.form_with_parameters for effect in self.effects]
+
 
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
     """Draw a system of this kind: the table of all runs and the true parameters."""
@@ -213,7 +180,7 @@ def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
     )
 
 
-def draw_system_case(seed: int, number: int) -> SystemCase:
+def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> SystemCase:
     """Draw case `number` of a challenge on systems; it depends on the seed and the number alone.
 
     Raises NotConvergedError if in none of 16 systems the effects can have the requested size (a pair: cosine in +-0.5).
@@ -226,9 +193,9 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         family = str(shuffled[(n_earlier + (attempt // 8)) % len(shuffled)])
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
         try:
-            effects, cosine = _draw_effects(stratum, n_earlier, family, drawn, drawing)
+            effects, cosine = _draw_effects(stratum, n_earlier, family, drawn, after_refit, drawing)
             everywhere = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
-            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.fit_without_effects.readings).max():
+            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.true_system.readings).max():
                 raise NotConvergedError("the held-out runs diverge")
         except NotConvergedError as error:
             failure = error
@@ -268,29 +235,38 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
 
 
 def _draw_effects(
-    stratum: Stratum, n_earlier: int, family: str, drawn: DrawnSystem, rng: np.random.Generator
+    stratum: Stratum,
+    n_earlier: int,
+    family: str,
+    drawn: DrawnSystem,
+    after_refit: AfterRefit,
+    rng: np.random.Generator,
 ) -> tuple[tuple[SystemEffect, ...], float | None]:
     """Draw the effects of a stratum once; return them and the cosine of a pair (None: no pair)."""
     if stratum.kind == "clean":
         return (), None
     forms = forms_of(drawn.true_system)
-    if stratum.kind in ("outside", "single"):
-        if stratum.kind == "outside":
-            family = OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]
-            strange = forms_out_of_vocabulary(drawn.true_system, rng)
-            own = [f for f in strange if f.name.removeprefix("strange_").split(":")[0] == family]
-        else:
-            own = [f for f in forms if family_of(f) == family]
-        one = _draw_effect_of_size(_draw_form(own, family, rng), stratum.size, drawn, rng)
-        return (_effect_with_rivals(one, forms, drawn, ()),), None
-    names = rng.choice(FAMILIES, 2, replace=False)
-    both = [_draw_form([f for f in forms if family_of(f) == name], str(name), rng) for name in names]
-    first, second = (_draw_effect_of_size(form, stratum.size, drawn, rng) for form in both)
-    cosine = _cosine_of_effects(drawn, first, second)
-    if abs(cosine) >= _APART:
-        raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
-    pair = (first, second), (second, first)
-    return tuple(_effect_with_rivals(one, forms, drawn, (other,)) for one, other in pair), cosine
+    families = [family]
+    if stratum.kind == "outside":
+        families = [OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]]
+        strange = forms_out_of_vocabulary(drawn.true_system, rng)
+        own = [[f for f in strange if f.name.removeprefix("strange_").split(":")[0] == families[0]]]
+    else:
+        if stratum.kind == "pair":
+            families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
+        own = [[f for f in forms if family_of(f) == name] for name in families]
+    chosen = [_draw_form(of, name, rng) for of, name in zip(own, families, strict=True)]
+    effects = tuple(draw_effect_of_size(form, stratum.size, drawn, after_refit, rng) for form in chosen)
+    left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e.form_with_parameters])) for e in effects]
+    cosine = None
+    if len(effects) == 2:
+        cosine = float(left[0] @ left[1] / np.sqrt((left[0] @ left[0]) * (left[1] @ left[1])))
+        if abs(cosine) >= _APART:
+            raise NotConvergedError(f"{effects[0].name} and {effects[1].name} are alike: cosine {cosine:.2f}")
+    return tuple(
+        replace(effect, covariates=_residual_covariates(effect.form, residuals, drawn.true_system))
+        for effect, residuals in zip(effects, left, strict=True)
+    ), cosine
 
 
 def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
@@ -300,87 +276,90 @@ def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Fo
     return forms[int(rng.integers(len(forms)))]
 
 
-def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Generator) -> SystemEffect:
-    """Return an effect of this form with lambda `wanted`, other parameters drawn, without rivals and covariates."""
+def draw_effect_of_size(
+    form: Form, wanted: float, drawn: DrawnSystem, after_refit: AfterRefit, rng: np.random.Generator
+) -> SystemEffect:
+    """Return an effect of this form with lambda `wanted`, other parameters drawn, without covariates.
+
+    Lambda is the norm of its change after a full refit of the model without effects, in noise sds. Raises
+    NotConvergedError if no amplitude within the form's limit has it.
+    """
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
-    def at_amplitude(amplitude: float) -> list[FormWithParameters]:
-        return [(form, parameter_arrays([form.of_amplitude(sign * amplitude, more)]))]
+    def readings_at(amplitude: float) -> FloatArray:
+        return drawn.simulate_diagnosed_rows([(form, form.of_amplitude(sign * amplitude, more))])
 
-    change = (
-        drawn.simulate_diagnosed_rows(at_amplitude(form.first)) - drawn.fit_without_effects.readings
-    ) / drawn.kind.sd
-    seen = float(np.linalg.norm(project_out(change, drawn.fit_without_effects.slopes)))
-    if not seen > 1e-6:
+    def size_at(amplitude: float) -> float:
+        return float(np.linalg.norm(after_refit(drawn, readings_at(amplitude))))
+
+    whole = float(np.linalg.norm(readings_at(form.first) - drawn.true_system.readings)) / drawn.kind.sd
+    seen = size_at(form.first)
+    if not seen > _SHOWS * whole:
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
-    first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
     amplitude = amplitude_of_size(
-        lambda a: drawn.size_of_effects(at_amplitude(a)),
+        size_at,
         wanted,
-        first=first,
+        first=min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit),
         limit=form.limit,
         tolerance=_TOLERANCE,
         acceptable=0.01,
         max_calls=14,
     )
-    return SystemEffect(
-        form, form.of_amplitude(sign * amplitude, more), drawn.size_of_effects(at_amplitude(amplitude)), {}, ()
-    )
+    return SystemEffect(form, form.of_amplitude(sign * amplitude, more), size_at(amplitude))
 
 
-def _form_with_true_step_time_in_bank(form: Form, values: Mapping[str, float]) -> Form:
-    """Add the true time (or row) of the concealed step to a step form's template bank; return other forms unchanged."""
-    at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
-    return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
+_BINS = 20
+_AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts as equal
+_PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def _cosine_of_effects(drawn: DrawnSystem, one: SystemEffect, other: SystemEffect) -> float:
-    plain, changes = drawn.fit_without_effects, []
-    for effect in (one, other):
-        change = drawn.simulate_diagnosed_rows([effect.form_with_parameters]) - plain.readings
-        changes.append(project_out(change, plain.slopes))
-    a, b = changes
-    return float(a @ b / np.sqrt((a @ a) * (b @ b)))
+def _residual_covariates(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
+    """Return names that a diagnosis may rank first: the form's covariates, then others that explain about as much.
+
+    `residuals`: those of the effect after the refit, (n_points,).
+    """
+    rows, change = true.table, np.zeros(len(true.table))
+    for own in rows.rows_by_run:
+        change[own[1:]] = np.diff(true.readings[own])
+    pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
+    pooled |= {"level": true.readings, "previous": change}
+    pooled |= {f"state:{name}": values for name, values in true.states.items()}
+    if rows.time is not None:
+        pooled["time"] = rows.t
+    shares = {name: _excess_share_explained(residuals, _bin_numbers(values)) for name, values in pooled.items()}
+    if len(rows.rows_by_run) > 1:
+        shares["run"] = _excess_share_explained(residuals, rows.run)
+    best = max(shares.values())
+    plain = [name for name, share in shares.items() if share >= _AS_PLAIN * best and share > _PLAIN]
+    return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
 
 
-def _effect_with_rivals(
-    effect: SystemEffect, forms: Sequence[Form], drawn: DrawnSystem, others: Sequence[SystemEffect]
-) -> SystemEffect:
-    """Return the effect with its rivals and covariates, found in a model that has the other concealed effects."""
-    target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
-    beside = [AddedForm(e.form, e.values) for e in others]
-    model = ModelWithForms(drawn.kind, drawn.diagnosed_table, beside)
-    start = model.coordinates_of(drawn.shared, drawn.by_run)
-    fitted = model.fit(target, start)
-    rivals = rivals_with_nats(
-        drawn.true_system,
-        [_form_with_true_step_time_in_bank(form, effect.values) for form in forms],
-        target,
-        fitted,
-        model,
-        frozenset({effect.name, *(e.name for e in others)}),
-    )
-    left = (target - fitted.readings) / drawn.kind.sd
-    return replace(effect, rivals=rivals, covariates=residual_covariates_of(effect.form, left, drawn.true_system))
+def _bin_numbers(values: FloatArray) -> IntArray:
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
 
 
-def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path, Path]:
-    """Write simulator.py, table.csv, table_test.csv and truth.json into a directory; return the paths in this order."""
+def _excess_share_explained(residuals: FloatArray, groups: IntArray) -> float:
+    """Return the share of the sum of squares that group means explain, minus its expectation for white noise."""
+    n, of_group = np.bincount(groups), np.bincount(groups, residuals)
+    explained = float(np.sum(of_group[n > 0] ** 2 / n[n > 0]))
+    return explained / float(residuals @ residuals) - np.count_nonzero(n) / len(residuals)
+
+
+def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path]:
+    """Write simulator.py, table.csv and table_test.csv into a directory; return the paths in this order."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    seen = case.drawn.diagnosed_row_numbers
-    later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
     texts = {
         "simulator.py": simulator_file_text(case),
-        "table.csv": table_text(case, seen),
-        "table_test.csv": table_text(case, later),
-        "truth.json": json.dumps(truth_json(case), indent=1, allow_nan=False) + "\n",
+        "table.csv": table_text(case, case.drawn.diagnosed_row_numbers),
+        "table_test.csv": table_text(case, case.drawn.held_out_row_numbers),
     }
     for name, text in texts.items():
         write_text_atomically(directory / name, text)
-    simulator, table, test, truth = (directory / name for name in texts)
-    return simulator, table, test, truth
+    simulator, table, test = (directory / name for name in texts)
+    return simulator, table, test
 
 
 def simulator_file_text(case: SystemCase) -> str:
@@ -400,45 +379,3 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
     for name in (*names, *(n for n in laid.columns if n not in names), kind.reading):
         columns[name] = [f"{value:.{decimals[name]}f}" for value in values[name][rows].tolist()]
     return csv_text(dict(columns))
-
-
-def truth_json(case: SystemCase) -> dict[str, Any]:
-    """Return a dict for truth.json: effects, their aliases ("rivals"), parameters, noise, noise-free readings."""
-    seen = case.drawn.diagnosed_row_numbers
-    later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
-    pair = len(case.effects) == 2
-    effects = [_effect_json(effect) for effect in case.effects]
-    if case.noise.name not in ("white", "quantised", "t4"):
-        effects.append(
-            {
-                "name": case.noise.name,
-                "side": "noise",
-                "parameters": dict(case.noise.parameters),
-                "lambda": case.noise.size_lambda,
-            }
-        )
-    return {
-        "effects": effects,
-        "rivals": [] if pair or not case.effects else _alias_name_and_nats_rows(case.effects[0]),
-        "rivals_of": {effect.name: _alias_name_and_nats_rows(effect) for effect in case.effects} if pair else {},
-        "covariates": list(case.effects[0].covariates) if len(case.effects) == 1 else [],
-        "parameters": dict(case.drawn.shared),
-        "noise_sd": case.drawn.kind.sd,
-        "noise_free": case.noise_free[seen].tolist(),
-        "noise_free_test": case.noise_free[later].tolist(),
-        "system": case.drawn.kind.name,
-        "stratum": {"kind": case.stratum.kind, "size": case.stratum.size},
-        "noise": case.noise.name,
-        "seed": case.seed,
-        "number": case.number,
-    }
-
-
-def _effect_json(effect: SystemEffect) -> dict[str, Any]:
-    own = {"name": effect.name, "side": effect.form.side, "parameters": effect.parameters, "lambda": effect.size_lambda}
-    outside = {"side": "strange", "on_the_list": False, "formula": effect.form.shape}
-    return own if effect.in_vocabulary else own | outside
-
-
-def _alias_name_and_nats_rows(effect: SystemEffect) -> list[list[Any]]:
-    return [[name, round(nats, 3)] for name, nats in effect.aliases.items()]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -15,15 +15,11 @@ from probewise.proof.systems.kind import SystemKind, SystemTable
 
 Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
 
-Numbers: TypeAlias = Mapping[str, Any]
-"""A form's parameters by name: (n_samples, 1), or floats."""
+Numbers: TypeAlias = Mapping[str, float]
+"""A form's parameters by name."""
 
 OfAmplitude: TypeAlias = Callable[[float, dict[str, float]], dict[str, float]]
 Draw: TypeAlias = Callable[[np.random.Generator], dict[str, float]]
-StartValues: TypeAlias = Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
-
-Bank: TypeAlias = Sequence[Sequence[dict[str, float]]]
-"""Template bank of a form: groups of settings that may be combined linearly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +39,7 @@ class Instants:
     @classmethod
     def at_rows(cls, rows: SystemTable) -> Self:
         """Return the instants of all rows of a table."""
-        return cls(rows.t[None, :], rows.time_since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
-
-
-def scaled_start_values(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Return the first setting of a group; an amplitude "a" in it is multiplied by the first fitted coefficient."""
-    first = group[0]
-    return {**first, "a": first["a"] * float(amounts[0])} if "a" in first else dict(first)
+        return cls(rows.t, rows.time_since_start, rows.columns, rows.run, np.arange(float(len(rows))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +55,14 @@ class Form:
     act
         Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
         add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.
+    first, limit
+        First amplitude tried, and the largest.
+    covariates
+        Covariates along which its residual is visible.
     of_amplitude
         Function of the amplitude and the values from `draw`; returns all parameters by name.
     draw
         Draws all parameters except the amplitude and its sign.
-    bank
-        Template bank: groups of parameter settings; templates within a group may be combined linearly.
-    start_values
-        Function of a group of the bank and the fitted coefficient of each setting; returns start values of a fit.
-    steps
-        Scale of a change of each parameter, for derivatives; 0: not fitted.
-    first, limit
-        First amplitude tried, and the largest.
     signed
         Whether the amplitude may be negative.
     target
@@ -85,50 +71,42 @@ class Form:
         Forms of side "reading" act in ascending order.
     uses
         Columns that it uses.
-    covariates
-        Covariates along which its residual is visible.
     breaks
-        Function of the parameters that returns times of discontinuities.
+        Function of the parameters that returns the time of a discontinuity.
     late
         Column that it delays.
     sticks, stops
         Whether it is dry friction, or an upper bound, of the target.
-    shape
-        Its formula in words, if it is outside the vocabulary, else "".
-    also_in_truth
-        Constants of its formula, by name, which the truth lists beside the parameters.
+    outside
+        Whether it is outside the vocabulary of a diagnosis.
     """
 
     name: str
     side: Side
     act: Callable[..., Any]
-    bank: Bank
-    steps: Mapping[str, float]
     first: float
     limit: float
     covariates: tuple[str, ...]
     of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
     draw: Draw = lambda rng: {}
-    start_values: StartValues = scaled_start_values
     signed: bool = True
     target: str = ""
     order: int = 0
     uses: tuple[str, ...] = ()
-    breaks: Callable[[Numbers], FloatArray] | None = None
+    breaks: Callable[[Numbers], float] | None = None
     late: str = ""
     sticks: bool = False
     stops: bool = False
-    shape: str = ""
-    also_in_truth: Mapping[str, Any] = field(default_factory=dict)
+    outside: bool = False
+
+    @property
+    def vocabulary_name(self) -> str:
+        """Name in the vocabulary: that of "saturation (floor)" is "saturation"."""
+        return self.name.removesuffix(" (floor)")
 
 
 FormWithParameters: TypeAlias = tuple[Form, Numbers]
 """A form with its parameters."""
-
-
-def parameter_arrays(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
-    """Stack parameter settings into one array per parameter, (n_settings, 1)."""
-    return {name: np.array([[each[name]] for each in settings]) for name in settings[0]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +114,12 @@ class TrueSystem:
     """A system at its true parameters.
 
     `kind`, `table`: the system, and the table of the rows that are not held out; `parameters`: true parameters by name,
-    (1, 1) or (1, n_points); `readings`, `states`: noise-free and without any effect, (n_points,); the states by name.
+    numbers or (n_points,); `readings`, `states`: noise-free and without any effect, (n_points,); the states by name.
     """
 
     kind: SystemKind
     table: SystemTable
-    parameters: Mapping[str, FloatArray]
+    parameters: Mapping[str, Any]
     readings: FloatArray
     states: Mapping[str, FloatArray]
 
@@ -155,13 +133,15 @@ class TrueSystem:
         """Names of the columns that vary, except time."""
         return tuple(name for name, v in self.table.columns.items() if name != self.table.time and np.ptp(v) > 0)
 
-    def mean_of(self, column: str) -> float:
-        """Return the mean of a column over the rows that are not held out."""
-        return float(self.table.columns[column].mean())
+    @property
+    def names_runs(self) -> bool:
+        """Whether the table names its runs, of which there are several."""
+        return self.kind.run is not None and len(self.table.rows_by_run) > 1
 
-    def sd_of(self, column: str) -> float:
-        """Return the sd of a column over the rows that are not held out."""
-        return float(self.table.columns[column].std())
+    def deviation(self, column: str) -> tuple[float, float]:
+        """Return mean and sd of a column over the rows that are not held out."""
+        values = self.table.columns[column]
+        return float(values.mean()), float(values.std())
 
     def rms_rate(self, state: str) -> float:
         """Return the root-mean-square rate of a state, from differences between successive rows of a run."""
@@ -186,148 +166,85 @@ def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float
 
 @dataclass(frozen=True, eq=False)
 class Modulation:
-    """A variation in proportion to an amplitude; attributes as of `Form`, `bank` and `steps` functions of amplitude.
+    """A variation in proportion to an amplitude; attributes as of `Form`.
 
     `value_at` is a function of instants and parameters, `reach` its typical magnitude at amplitude 1.
     """
 
     value_at: Callable[[Instants, Numbers], Any]
-    bank: Callable[[float], Bank]
-    steps: Callable[[float], Mapping[str, float]]
     covariates: tuple[str, ...]
-    reach: float
+    reach: float = 1.0
     of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
     draw: Draw = lambda rng: {}
-    start_values: StartValues = scaled_start_values
     uses: tuple[str, ...] = ()
-    breaks: Callable[[Numbers], FloatArray] | None = None
+    breaks: Callable[[Numbers], float] | None = None
     signed: bool = True
 
     def form(
-        self,
-        name: str,
-        side: Side,
-        first: float,
-        *,
-        limit: float,
-        bank: float = 1.0,
-        act: Callable[..., Any] | None = None,
-        **more: Any,
+        self, name: str, side: Side, first: float, *, limit: float, act: Callable[..., Any] | None = None, **more: Any
     ) -> Form:
-        """Return the form that varies so, by default a term added; `limit` and `bank` are in the first amplitude."""
+        """Return the form that varies so, by default a term added; `limit` is in the first amplitude."""
         return Form(
             name,
             side,
-            act=act or self.value_at,
-            of_amplitude=self.of_amplitude,
-            draw=self.draw,
-            bank=self.bank(bank * first),
-            start_values=self.start_values,
-            steps=self.steps(first),
-            first=first,
-            limit=limit * first,
-            covariates=self.covariates,
-            signed=self.signed,
+            act or self.value_at,
+            first,
+            limit * first,
+            self.covariates,
+            self.of_amplitude,
+            self.draw,
+            self.signed,
             uses=self.uses,
             breaks=self.breaks,
             **more,
         )
 
 
-def _amplitude_only_modulation(
-    value_at: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
-) -> Modulation:
-    return Modulation(
-        value_at,
-        bank=lambda a: [[{"a": a}]],
-        steps=lambda a: {"a": a},
-        covariates=covariates,
-        reach=reach,
-        uses=uses,
-    )
-
-
 def linear_drift(true: TrueSystem) -> Modulation:
     """Return the modulation a t, t the recorded time."""
-    names = ("time",) if true.table.time in (None, "time") else ("time", str(true.table.time))
-    return _amplitude_only_modulation(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
+    names = tuple(dict.fromkeys(("time", true.table.time or "time")))
+    return Modulation(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
 
 
 def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
     """Return the modulation a (column - its mean over the recording)."""
-    middle = true.mean_of(column)
-    return _amplitude_only_modulation(
-        lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.sd_of(column), (column,)
-    )
+    middle, sd = true.deviation(column)
+    return Modulation(lambda now, v: v["a"] * (now.u[column] - middle), (column,), sd, uses=(column,))
 
 
 def step_at_change_point(true: TrueSystem) -> Modulation:
     """Return the modulation 0, then a after a time "at_s", or after a row "at_row" if the table has no time."""
-    at, timed = ("at_s", True) if true.table.time is not None else ("at_row", False)
-    moments = np.quantile(np.unique(true.table.t), np.linspace(0.02, 0.98, 40))
-
-    def value_at(now: Instants, v: Numbers) -> Any:
-        return v["a"] * ((now.t if timed else now.row) > v[at])
-
+    timed = true.table.time is not None
+    at = "at_s" if timed else "at_row"
     return Modulation(
-        value_at,
+        lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at]),
+        ("time", str(true.table.time)) if timed else ("row",),
         draw=lambda rng: {at: true.random_time(rng)},
-        bank=lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        steps=lambda a: {"a": a, at: 0.0},
-        covariates=("time", str(true.table.time)) if timed else ("row",),
-        reach=1.0,
-        breaks=(lambda v: np.asarray(v[at])) if timed else None,
+        breaks=(lambda v: v[at]) if timed else None,
     )
 
 
 def value_per_run(true: TrueSystem) -> Modulation:
     """Return a modulation with one normal random value per run, held-out runs included, times the amplitude."""
-    n = true.table.n_runs
-    names = [f"values[{k}]" for k in range(n)]
-    present = [int(true.table.run[own[0]]) for own in true.table.rows_by_run]
-
-    def value_at(now: Instants, v: Numbers) -> Any:
-        values = np.concatenate(np.broadcast_arrays(*(np.atleast_2d(v[name]) for name in names)), axis=1)
-        return values[:, now.run]
-
-    def start_values(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-        return {name: float(sum(m * each[name] for m, each in zip(amounts, group, strict=True))) for name in names}
-
+    names = [f"values[{k}]" for k in range(true.table.n_runs)]
     return Modulation(
-        value_at,
+        lambda now, v: np.array([v[name] for name in names])[now.run],
+        ("run",),
         of_amplitude=lambda a, drawn: {name: a * drawn[name] for name in names},
-        draw=lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
-        bank=lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
-        start_values=start_values,
-        steps=lambda a: {name: (a if k in present else 0.0) for k, name in enumerate(names)},
-        covariates=("run",),
-        reach=1.0,
+        draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
     )
 
 
-def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
-    """Return the template bank of a wave: a group of sine and cosine of amplitude `a` for each rate (key `name`)."""
-    return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
-
-
-def start_values_of_wave(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Return amplitude and phase of the wave that is the sum of a group's sine and cosine times their coefficients."""
-    sine, cosine = amounts * group[0]["a"]
-    return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
-
-
-def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
-    """Return a sinusoid in time, its period from four rows to two thirds of the recording; its bank has n rates."""
+def sinusoid_in_time(true: TrueSystem) -> Modulation:
+    """Return a sinusoid in time, its period from four rows to two thirds of the recording."""
     rows = true.table
-    slowest, fastest = 1.5 / rows.duration, 0.25 / rows.median_gap
     return Modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
-        draw=lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
-        bank=lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
-        start_values=start_values_of_wave,
-        steps=lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
-        covariates=("time", str(rows.time)),
-        reach=1.0,
+        ("time", str(rows.time)),
+        draw=lambda rng: {
+            "hz": draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap),
+            "phase": float(rng.uniform(0, 2 * np.pi)),
+        },
         signed=False,
     )
 
@@ -335,12 +252,8 @@ def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
 def settling(true: TrueSystem) -> Modulation:
     """Return the modulation a exp(-t / tau_s), t the time since the start of the run."""
     longest = float(true.table.time_since_start.max())
-    taus = np.geomspace(true.table.median_gap, longest, 12)
     return Modulation(
-        lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
+        lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"]),
+        ("time", "run", str(true.table.time)),
         draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
-        bank=lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        steps=lambda a: {"a": a, "tau_s": 0.05 * longest},
-        covariates=("time", "run", str(true.table.time)),
-        reach=1.0,
     )

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeAlias, cast
 
 import numpy as np
-from scipy.special import ndtri
 
 from probewise._arrays import FloatArray, IntArray
 
@@ -87,41 +85,6 @@ class Law:
     rates: Callable[[Values, Values, Values], dict[str, Any]]
     read: Callable[[Values, Values, Values], Any]
     linear: bool = False
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Prior of a parameter in the simulator file: `shape` "uniform" or "log" (low, high), or "normal" (mean, sd)."""
-
-    shape: str
-    a: float
-    b: float
-
-    @property
-    def coordinate_unit(self) -> float:
-        """Unit of the coordinate: the range of "uniform", the sd of "normal", 1 of "log" (a logarithm)."""
-        return {"uniform": self.b - self.a, "normal": self.b}.get(self.shape, 1.0)
-
-    def coordinate(self, value: FloatArray) -> FloatArray:
-        """Return the coordinate of a value: its logarithm for "log", else the value in units of `coordinate_unit`."""
-        return np.log(value) if self.shape == "log" else np.asarray(value / self.coordinate_unit)
-
-    def value(self, coordinate: FloatArray) -> FloatArray:
-        """Return the value at a coordinate."""
-        return (
-            np.exp(np.clip(coordinate, -60.0, 60.0))
-            if self.shape == "log"
-            else np.asarray(coordinate * self.coordinate_unit)
-        )
-
-    def stratified_draws(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw n values, one from each of n intervals of equal probability, in random order."""
-        u = (rng.permutation(n) + rng.random(n)) / n
-        if self.shape == "normal":
-            return np.asarray(self.a + self.b * ndtri(u))
-        if self.shape == "log":
-            return np.exp(math.log(self.a) + u * math.log(self.b / self.a))
-        return self.a + u * (self.b - self.a)
 
 
 @dataclass(frozen=True)
@@ -217,11 +180,10 @@ class SystemKind:
         """Names of the parameters with a value in each run."""
         return tuple(self._file.get("per_run", ()))
 
-    @cached_property
-    def priors(self) -> Mapping[str, Prior]:
-        """Priors by parameter."""
-        stated = self._file["parameters"].items()
-        return {name: Prior(*(prior if len(prior) == 3 else ("uniform", *prior))) for name, prior in stated}
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self._file["parameters"])
 
     @property
     def defines_states(self) -> bool:
@@ -242,11 +204,6 @@ class SystemKind:
     def formula(self) -> Formula:
         """The formula of a system without a law."""
         return cast(Formula, self._file["simulate"])
-
-    @property
-    def shared_parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters that all runs share."""
-        return tuple(name for name in self.priors if name not in self.per_run)
 
 
 _PAUSE = 0.15  # pause between runs, as a share of the first run's length

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -50,68 +51,64 @@ def noise_of_size(
 
     If none suffices, at the largest. "white", "outliers", "dropouts", "t4" and "quantised" have a fixed strength.
     """
-    whole = rows.n_runs
+    n = len(rows)
+
+    def of(in_sds: Callable[..., FloatArray], **parameters: Any) -> SystemNoise:
+        """Return noise that is added, of a fixed strength; `in_sds`: function of readings, table and generator."""
+        return SystemNoise(name, lambda y, rows, rng: y + sd * in_sds(y, rows, rng), parameters)
+
+    def white(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
+        return rng.standard_normal(len(y))
+
     match name:
         case "white":
-            return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_normal(len(y)))
+            return of(white)
         case "correlated_noise":
-            pairs = len(rows) - len(rows.rows_by_run)
-            rho = math.sqrt(1 - math.exp(-(wanted**2) / pairs))
-            return SystemNoise(name, lambda y, rows, rng: y + sd * _ar1_noise(rows, rho, rng), {"rho": rho}, wanted)
+            rho = math.sqrt(1 - math.exp(-(wanted**2) / (n - len(rows.rows_by_run))))
+            return replace(of(lambda y, rows, rng: _ar1_noise(rows, rho, rng), rho=rho), size_lambda=wanted)
         case "random_walk":
-            spectrum = _walk_covariance_eigenvalues(len(rows))
+            spectrum = _walk_covariance_eigenvalues(n)
             q, size = _strength_and_size(lambda a: _lambda_of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
-            return SystemNoise(
-                name,
-                lambda y, rows, rng: (
-                    y + sd * (rng.standard_normal(len(y)) + q * np.cumsum(rng.standard_normal(len(y))))
-                ),
-                {"sd_per_row": q * sd},
-                size,
-            )
+            walk = of(lambda y, rows, rng: white(y, rows, rng) + q * np.cumsum(white(y, rows, rng)), sd_per_row=q * sd)
+            return replace(walk, size_lambda=size)
         case "signal_dependent_noise":
-            share = (readings - readings.min()) / np.ptp(readings)
             low, span = float(readings.min()), float(np.ptp(readings))
-            ratio, size = _strength_and_size(lambda a: _lambda_of_variances(1 + a * share), wanted, 1e-3, 1e4)
-            return SystemNoise(
-                name,
-                lambda y, rows, rng: (
-                    y + sd * np.sqrt(1 + ratio * np.clip((y - low) / span, 0, None)) * rng.standard_normal(len(y))
-                ),
-                {"ratio": ratio},
-                size,
-            )
+
+            def variance(y: FloatArray, ratio: float) -> FloatArray:
+                return 1 + ratio * np.clip((y - low) / span, 0, None)
+
+            ratio, size = _strength_and_size(lambda a: _lambda_of_variances(variance(readings, a)), wanted, 1e-3, 1e4)
+            own = of(lambda y, rows, rng: np.sqrt(variance(y, ratio)) * white(y, rows, rng), ratio=ratio)
+            return replace(own, size_lambda=size)
         case "noise_per_run":
-            logs = rng.standard_normal(whole)
+            logs = rng.standard_normal(rows.n_runs)
             power, size = _strength_and_size(
                 lambda a: _lambda_of_variances(np.exp(2 * a * logs)[rows.run]), wanted, 1e-2, 3.0
             )
-            own = np.exp(power * logs)
-            return SystemNoise(
-                name,
-                lambda y, rows, rng: y + sd * own[rows.run] * rng.standard_normal(len(y)),
-                {"values": (sd * own).tolist()},
-                size,
-            )
+            each = np.exp(power * logs)
+            per_run = of(lambda y, rows, rng: each[rows.run] * white(y, rows, rng), values=(sd * each).tolist())
+            return replace(per_run, size_lambda=size)
         case "outliers":
-            return SystemNoise(
-                name,
-                lambda y, rows, rng: y + sd * _noise_with_outliers(len(y), 0.03, 7.0, rng),
-                {"share": 0.03, "size": 7.0},
+            share, wide = 0.03, 7.0
+            return of(
+                lambda y, rows, rng: (
+                    white(y, rows, rng) + np.where(rng.random(len(y)) < share, wide * white(y, rows, rng), 0.0)
+                ),
+                share=share,
+                size=wide,
             )
         case "dropouts":
+            share, value = 0.02, 0.0
             return SystemNoise(
                 name,
-                lambda y, rows, rng: np.where(rng.random(len(y)) < 0.02, 0.0, y + sd * rng.standard_normal(len(y))),
-                {"share": 0.02, "value": 0.0},
+                lambda y, rows, rng: np.where(rng.random(len(y)) < share, value, y + sd * white(y, rows, rng)),
+                {"share": share, "value": value},
             )
         case "t4":  # its scale is the sd of the normal that matches its centre
-            return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_t(4.0, len(y)), {"freedom": 4.0})
+            return of(lambda y, rows, rng: rng.standard_t(4.0, len(y)), freedom=4.0)
         case _:
             step = _nearest_preferred_number(2.0 * sd)
-            return SystemNoise(
-                "quantised", lambda y, rows, rng: y + sd * rng.standard_normal(len(y)), {"step": step}, step=step
-            )
+            return replace(of(white, step=step), step=step)
 
 
 def _ar1_noise(rows: SystemTable, rho: float, rng: np.random.Generator) -> FloatArray:
@@ -121,11 +118,6 @@ def _ar1_noise(rows: SystemTable, rho: float, rng: np.random.Generator) -> Float
         for before, row in pairwise(run):
             own[row] = rho * own[before] + math.sqrt(1 - rho**2) * own[row]
     return own
-
-
-def _noise_with_outliers(n: int, share: float, size: float, rng: np.random.Generator) -> FloatArray:
-    """Draw noise of sd 1, with additional noise of sd `size` in a share of the readings, (n,)."""
-    return rng.standard_normal(n) + np.where(rng.random(n) < share, size * rng.standard_normal(n), 0.0)
 
 
 def _walk_covariance_eigenvalues(n: int) -> FloatArray:

@@ -12,8 +12,8 @@ from probewise.proof.tables import score_systems
 @pytest.mark.slow
 def test_a_case_is_diagnosed_from_its_files_and_the_campaign_goes_on(tmp_path):
     path = tmp_path / "cases.jsonl"
-    first = run_challenge(1, seed=5, work=run_system_case, of="systems", path=path)
-    both = run_challenge(2, seed=5, work=run_system_case, of="systems", path=path)
+    first = run_challenge([0], seed=5, work=run_system_case, of="systems", path=path)
+    both = run_challenge(range(2), seed=5, work=run_system_case, of="systems", path=path)
     assert both[0] == first[0]
     assert "failed" not in both[0]
     assert set(both[0]["held_out"]) == {"inside", "beyond"}

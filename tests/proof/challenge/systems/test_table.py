@@ -2,7 +2,7 @@
 
 import pytest
 
-from probewise.proof.challenge_page import _case_cells, page_html
+from probewise.proof.pages import _case_cells, challenge_html
 from probewise.proof.tables import gains_on_held_out_runs, name_without_target, score_systems
 
 
@@ -197,6 +197,6 @@ def test_the_page_tells_every_case():
     failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
     strange = _case("outside", 20.0, truth=["unknown"], hides=[_hidden("strange_switch:u", 20.0, on_the_list=False)])
     results = [_case(), _single("drifts:k"), strange, failed]
-    text = page_html(results, score_systems(results), command="probewise challenge", systems=True)
+    text = challenge_html(results, score_systems(results), command="probewise challenge", systems=True)
     for expected in ("drifts:k", "strange_switch:u", "ParameterError: no", "right covariate first, lambda 12"):
         assert expected in text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.effects import VOCABULARY
-from probewise.proof.null_refit import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
 from probewise.proof.tables import score
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan

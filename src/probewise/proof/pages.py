@@ -1,0 +1,425 @@
+"""The pages of studies and challenges: what each run or case contributes to, as tables, figures and a sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+
+from probewise._words import count_with_noun
+from probewise.experiment import least_readings
+from probewise.proof.concealed_study import ConcealedRow
+from probewise.proof.configurations import REFERENCE, SearchConfiguration
+from probewise.proof.estimates import LEAST_FOR_MEDIAN, Estimate
+from probewise.proof.plots import (
+    confusion_matrix,
+    doubt_against_trust,
+    effect_and_size_in_words,
+    posterior_widths_of_runs,
+    readings_needed,
+    reliability_diagram,
+)
+from probewise.proof.scoring import NOISE, are_names_right, confusion_counts, leading_hypothesis, reliability_bins
+from probewise.proof.study import Study, Summary
+from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, gains_on_held_out_runs, name_without_target
+from probewise.proof.trial import experiment_of
+from probewise.recordings.table import csv_text_of_rows
+from probewise.report.html import (
+    Draw,
+    Markup,
+    Section,
+    definition_list,
+    draw_or_raise,
+    figure,
+    fragment,
+    page,
+    paragraph,
+    table,
+)
+from probewise.report.plots.canvas import png
+from probewise.report.words import number_text, typeset_numbers, value_with_error
+
+T = TypeVar("T")
+Columns: TypeAlias = Mapping[str, Callable[[T], str]]
+"""Columns of a table: header, and the cell as a function of what its row is about."""
+
+
+def table_of(columns: Columns[T], rows: Iterable[T], *, caption: str = "") -> Markup:
+    """Return the table of some rows for a page."""
+    return table(tuple(columns), (tuple(cell(row) for cell in columns.values()) for row in rows), caption=caption)
+
+
+_COLUMNS: tuple[tuple[str, str], ...] = (
+    ("reached", "share that reached the precision, 95 % interval"),
+    ("mean", "mean readings, standard error (a miss counted as the limit)"),
+    ("median", "median readings, 95 % interval"),
+    ("to_white", "mean readings up to the first on white, standard error (none counted as the limit)"),
+    ("after_white", "mean readings after the first on white, standard error"),
+    ("bits_each", "bits per reading, standard error"),
+    ("held", "share of 95 % intervals that hold the truth, standard error"),
+    ("arm_s", "arm time (s), standard error"),
+)
+_INTERVALS = (
+    "Readings that a run needs. The 95 % interval of the share is Wilson's, for the number of runs beside it; that of "
+    f"the median lies between two of the runs, and takes {LEAST_FOR_MEDIAN} of them."
+)
+
+
+def study_sentence(study: Study) -> str:
+    """Summarise a study's first row: mean and median readings, and the share of runs that reached the precision."""
+    row, found = next(iter(study.table().items()))
+    share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
+    return (
+        f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, _half_width(found.mean))} readings "
+        f"on average, median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
+    )
+
+
+Row: TypeAlias = tuple[SearchConfiguration, Summary]
+
+_READINGS: Columns[Row] = {
+    "row": lambda r: r[0].name,
+    "runs": lambda r: str(r[1].n_runs),
+    "reached (95 % interval)": lambda r: (
+        f"{number_text(100 * r[1].reached.value, 1)} % "
+        f"({number_text(100 * r[1].reached.low, 1)} to {number_text(100 * r[1].reached.high, 1)})"
+    ),
+    "mean": lambda r: _with_error(r[1].mean),
+    "median (95 % interval)": lambda r: (
+        f"{r[1].median.value:g}"
+        + (f" ({r[1].median.low:g} to {r[1].median.high:g})" if math.isfinite(r[1].median.low) else " (too few runs)")
+    ),
+    "up to the first on white": lambda r: _with_error(r[1].to_white),
+    "after it": lambda r: _with_error(r[1].after_white),
+}
+_WORTH: Columns[Row] = {
+    "row": lambda r: r[0].name,
+    "bits per reading": lambda r: _with_error(r[1].bits_each),
+    "error (mm)": lambda r: number_text(r[1].error_mm, 1),
+    "sure and wrong (expected, limit)": lambda r: (
+        f"{count_with_noun(r[1].wrong, 'run')} ({number_text(r[1].wrong_expected, 1)}, {r[1].wrong_limit})"
+    ),
+    "95 % intervals that hold": lambda r: (
+        f"{_with_error(r[1].held, scale=100)} %" if math.isfinite(r[1].held.value) else "–"
+    ),
+    "arm time (s)": lambda r: _with_error(r[1].arm_s),
+    "processor time per decision (s)": lambda r: number_text(r[1].cpu_s, 2),
+}
+
+
+def result_tables(study: Study) -> Markup:
+    """Build two tables, a line for each row of the study: readings needed; information, errors, and time spent."""
+    rows = list(study.table().items())
+    return fragment(
+        table_of(_READINGS, rows, caption=_INTERVALS),
+        table_of(_WORTH, rows, caption="Information per reading, errors of the runs, and cost."),
+    )
+
+
+def lower_bound_table(study: Study) -> Markup | None:
+    """Build the table of lower bounds, for any strategy, on mean readings up to the first on white, and after it.
+
+    Measured means are beside; None if no row has default options (but for circles and noise) and the correct model.
+    """
+
+    def over(bits: float, capacity: float) -> str:
+        return f"{number_text(bits / capacity, 1)} = {number_text(bits, 1)} / {number_text(capacity, 2)}"
+
+    lines = []
+    for row, found in study.table().items():
+        if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
+            least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
+            search = over(least.search_bits, least.search_capacity_bits), _with_error(found.to_white)
+            lines.append(
+                (row.name, *search, over(least.refinement_bits, least.capacity_bits), _with_error(found.after_white))
+            )
+    places = "up to white, at least (bits over bits per reading)", "from there, at least"
+    return table(("row", places[0], "measured", places[1], "measured"), lines) if lines else None
+
+
+def study_csv(study: Study) -> str:
+    """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
+    bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
+    rows = []
+    for row, found in study.table().items():
+        estimates = [getattr(found, name) for name, _ in _COLUMNS]
+        values = [value for e in estimates for value in (e.value, e.low, e.high)]
+        values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
+        rows.append([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])
+    return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
+
+
+def study_html(study: Study, *, command: str, draw: Draw = draw_or_raise) -> str:
+    """Return the HTML of a study's page; `command` is the command line that made the study, `draw` makes figures."""
+    summaries = study.table()
+    curves = {
+        row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]
+        for row in summaries
+        if (row.utility == REFERENCE.utility or row.method == "paper")
+        and row.noise_sd == 1.0
+        and row.width == 1.0
+        and row.batch == 1
+    }
+    needed = figure(
+        draw("readings needed", lambda: png(readings_needed({row.name: found for row, found in summaries.items()}))),
+        f"Readings until every length is known to 4 mm, of at most {study.max_readings}; a miss counts as that many.",
+    )
+    sections = [Section("The table", (result_tables(study), _study_legend()))]
+    if curves:
+        drawn = figure(
+            draw("widths", lambda: png(posterior_widths_of_runs(curves))),
+            "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
+            "width.",
+        )
+        sections.insert(0, Section("How fast", (drawn,)))
+    least = lower_bound_table(study)
+    if least is not None:
+        bounds = paragraph(
+            "Bits needed over the capacity of a reading in bits. Up to the first reading on white, a reading answers "
+            "yes or no, with the largest probability of yes that any place has; after that, the capacity is the "
+            "sensor's."
+        )
+        sections.append(Section("Lower bound for any strategy", (least, bounds)))
+    sections.append(Section("How it was made", (definition_list([("command", command)]),)))
+    return page("How many measurements?", answer=study_sentence(study), key_figure=needed, sections=sections)
+
+
+def _study_legend() -> Markup:
+    return paragraph(
+        "± is the standard error. Every row uses the same circles and the same noise. On white: "
+        "a reading at least a tenth of the way from dark to bright. Error: of the worst length, median over the runs "
+        "that reached the target precision. Sure and wrong: stopped with a length off by more than 12 mm, with the "
+        "number that the runs' own posteriors predict and the number that chance exceeds in one study in a hundred."
+    )
+
+
+def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
+    """Write an estimate, times a scale, with its error; without, if that is 0 or unknown."""
+    value, half = scale * estimate.value, scale * _half_width(estimate)
+    return value_with_error(value, half) if half > 0 else number_text(value, 1)
+
+
+def _half_width(estimate: Estimate) -> float:
+    return 0.5 * (estimate.high - estimate.low)
+
+
+def concealed_sentence(rows: Sequence[ConcealedRow]) -> str:
+    """Count in one sentence the runs that ended by the robot's rule but over 12 mm off: at full trust, and at less."""
+    wrong = {
+        doubts: _sure_and_wrong_text([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)
+    }
+    return (
+        f"Sure and wrong: {wrong[False]} where the robot trusts its sensor, {wrong[True]} where it doubts it, "
+        "on the same circles with the same noise."
+    )
+
+
+def concealed_html(rows: Sequence[ConcealedRow], *, command: str, draw: Draw = draw_or_raise) -> str:
+    """Return the HTML of the page of a study of concealed effects; parameters as in `study_html`."""
+    drawn = figure(
+        draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
+        "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
+        "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
+    )
+    sections = [
+        Section("The table", (_doubt_against_trust_table(rows), _concealed_table_legend())),
+        Section("How it was made", (definition_list([("command", command)]),)),
+    ]
+    return page("A robot with a concealed fault", answer=concealed_sentence(rows), key_figure=drawn, sections=sections)
+
+
+def _sure_and_wrong_text(rows: Sequence[ConcealedRow]) -> str:
+    n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
+    return f"{n_wrong} of {count_with_noun(sum(row.runs for row in rows), 'run')}"
+
+
+def _of_both(name: str) -> Callable[[tuple[ConcealedRow, ConcealedRow]], str]:
+    return lambda pair: " | ".join(f"{getattr(row, name).value:.2f}" for row in pair)
+
+
+_PAIRS: Columns[tuple[ConcealedRow, ConcealedRow]] = {
+    "concealed": lambda pair: effect_and_size_in_words(pair[0]),
+    "runs": lambda pair: str(pair[0].runs),
+    "readings, median": lambda pair: " | ".join(f"{row.readings:g}" for row in pair),
+    "sure and wrong": _of_both("sure_and_wrong"),
+    "intervals that hold": _of_both("intervals_hold"),
+    "noticed": _of_both("noticed"),
+    "in the credible set": lambda pair: f"{pair[0].in_credible_set.value:.2f}",
+    "names in it": lambda pair: f"{pair[0].names:g}",
+    "seconds per decision": lambda pair: " | ".join(f"{row.cpu_s_median:.2g}" for row in pair),
+}
+
+
+def _doubt_against_trust_table(rows: Sequence[ConcealedRow]) -> Markup:
+    doubting, trusting = (
+        {(r.concealed, r.size): r for r in rows if (r.trust < 1) is doubts} for doubts in (True, False)
+    )
+    return table_of(_PAIRS, [(row, trusting[key]) for key, row in doubting.items()])
+
+
+def _concealed_table_legend() -> Markup:
+    return paragraph(
+        "Before the bar: the robot doubts its sensor; after it: it trusts it. Noticed: something left out is the most "
+        "probable, or the readings do not fit. In the credible set: what is concealed is among the fewest explanations "
+        "that hold 95 %. Seconds of processor time. The file concealed.csv has the intervals of all shares."
+    )
+
+
+Results = Sequence[Mapping[str, Any]]
+
+_DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
+
+
+def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
+    """Summarise a challenge in one sentence: number of cases; how many targets are met, missed and undecided."""
+    n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
+    return (
+        f"{count_with_noun(n_cases, 'case')} of concealed physics: {count_with_noun(n['met'], 'target')} met, "
+        f"{n['missed']} missed, {n['open']} undecided by so few cases."
+    )
+
+
+_TARGETS: Columns[ScoreRow] = {
+    "what": lambda row: _indented_row_name(row.name),
+    "found": lambda row: _value_text(row.found) if row.found.n else "–",
+    "95 % interval": lambda row: typeset_numbers(_interval_text(row.found)),
+    "of": lambda row: str(row.found.n),
+    "target": lambda row: _target_text(row),
+    "decision": lambda row: "undecided" if row.decision == "open" else _DECISIONS[row.decision],
+}
+
+
+def _indented_row_name(name: str) -> str:
+    """Write a row's name with spaces for underscores, indented by an em space, since HTML drops plain spaces."""
+    own = name.lstrip()
+    return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
+
+
+def challenge_csv(rows: Sequence[ScoreRow]) -> str:
+    """Return a challenge's table as CSV text: quantity, value, interval, cases, target's bounds, decision."""
+    cells = []
+    for row in rows:
+        numbers, bounds = (row.found.value, row.found.low, row.found.high), (row.least, row.most)
+        cells.append(
+            [row.name.strip(), *map(_csv_cell, numbers), row.found.n, *map(_csv_cell, bounds), _DECISIONS[row.decision]]
+        )
+    return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
+
+
+def challenge_html(
+    results: Results,
+    rows: Sequence[ScoreRow],
+    *,
+    command: str,
+    systems: bool = False,
+    draw: Draw = draw_or_raise,
+) -> str:
+    """Return the HTML of a challenge's page from the cases' results and the table's `rows`.
+
+    `command` is the command line that made the results; `systems`: the cases are simulators, not light sensors;
+    `draw` makes figures.
+    """
+    done = [r for r in results if "failed" not in r]
+    sections = [Section("The table", (table_of(_TARGETS, rows), _challenge_legend()))]
+    if done:
+        drawn = figure(
+            draw(
+                "confusion matrix",
+                lambda: png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
+            ),
+            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
+            "truth." + (" Targets are left out." if systems else ""),
+        )
+        sections.append(Section("Confusion matrix", (drawn,)))
+        sections.append(
+            Section("Case by case", (_case_table(results),))
+            if systems
+            else Section("Each effect at lambda 8", (_effect_table(done),))
+        )
+    failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
+    if failures:
+        sections.append(Section("Cases that failed", (definition_list(failures),)))
+    sections.append(Section("How it was made", (definition_list([("command", command)]),)))
+    honest = figure(
+        draw("reliability", lambda: png(reliability_diagram(reliability_bins(done)))),
+        "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
+    )
+    return page(
+        "How good a diagnosis is",
+        answer=challenge_sentence(rows, len(results)),
+        key_figure=honest,
+        sections=sections,
+        terms_in=honest,
+    )
+
+
+def _effect_table(done: Results) -> Markup:
+    return table(
+        ("effect", "cases", "detected at alpha .01", "named first"),
+        (
+            (name, str(detected.n), *(f"{_value_text(e)} ({_interval_text(e)})" for e in (detected, named)))
+            for name, (detected, named) in detected_and_named_by_effect(done).items()
+        ),
+    )
+
+
+def _case_table(results: Results) -> Markup:
+    gained = "held-out gain, and that of the right model (nats)"
+    return table(
+        ("case", "system", "concealed", "lambda", "said", "probability", "right", gained),
+        (_case_cells(number, result) for number, result in enumerate(results)),
+    )
+
+
+def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
+    concealed = " and ".join(h["name"] for h in result.get("hidden", ())) or result.get("noise_model", "")
+    begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
+    if "failed" in result:
+        return (*begun, f"failed: {result['failed']}", "", "no", "")
+    names, probability = leading_hypothesis(result, clean=True)
+    # Beside a concealed effect, all of which act on the mean, names of noise effects are ignored.
+    physics = tuple(name for name in names if name not in NOISE) if result["hidden"] else names
+    right = are_names_right(result, physics, noise=not result["hidden"])
+    gains = gains_on_held_out_runs(result, "right")
+    said = " and ".join(names) or "clean"
+    return (
+        *begun,
+        said,
+        f"{probability:.2f}",
+        "yes" if right else "no",
+        "" if gains is None else f"{gains[0]:.1f} of {gains[1]:.1f}",
+    )
+
+
+def _challenge_legend() -> Markup:
+    return paragraph(
+        "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is "
+        "undecided. "
+        "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
+        "Rows on detection and covariates count effects on the mean; those on held-out gain, cases with white noise. "
+        "Aliases are effects that a plan of this many readings could tell apart by less than 3 nats."
+    )
+
+
+def _value_text(found: Estimate) -> str:
+    return "no case" if not found.n else f"{found.value:.3g}"
+
+
+def _interval_text(found: Estimate) -> str:
+    return f"{found.low:.3g} to {found.high:.3g}" if math.isfinite(found.high - found.low) else ""
+
+
+def _target_text(row: ScoreRow) -> str:
+    if row.decision is None:
+        return ""
+    if math.isinf(row.least):
+        return f"at most {row.most:g}"
+    return f"at least {row.least:g}" if math.isinf(row.most) else f"{row.least:g} to {row.most:g}"
+
+
+def _csv_cell(value: float) -> str:
+    """Write a number as a cell of a CSV file; one that is not finite is empty."""
+    return f"{value:.6g}" if math.isfinite(value) else ""

@@ -113,7 +113,7 @@ CONTRADICTIONS = [
         for truth, (name, value, allowed) in TRUTHS.items()
     ),
     ((*EXPLORE, "--field", "10"), "--field is '10'; allowed: WIDTH,HEIGHT in mm"),
-    ((*EXPLORE, "--field", "-5,20"), "-5"),
+    ((*EXPLORE, "--field=-5,20"), "-5"),
     ((*EXPLORE, "--seed", "x"), "'x' is not a whole number of 0 or more"),
     ((*EXPLORE, "--model", "perfect"), "'perfect' is not one of ssf, naive"),
     ((*EXPLORE, "--arm", "emulatr"), "did you mean emulator?"),

@@ -98,7 +98,7 @@ def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     said, answers = [], iter(["", "x 4 y -2", "sideways", "down 55", "up 3", "ok"])
     with arm:
-        met = bring_to_mark(arm, (520.0, 260.0), 32.0, lambda look: next(answers), said.append, named="mark 1")
+        met = bring_to_mark(arm, (520.0, 260.0), 32.0, lambda: next(answers), said.append)
     homes = np.array([joint.home_rad for joint in geometry.joints])
     x, y, height = geometry.position_mm((np.array(met.turned_rad) + homes)[None, :])[0]
     assert (x, y, height) == pytest.approx((524, 258, 60 - 5 + 3), abs=1.0)

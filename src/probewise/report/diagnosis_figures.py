@@ -64,14 +64,8 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
-        drawers["gain.svg"] = lambda: svg(
-            heldout_gain_by_scan(
-                gain.heldout_by_scan,
-                gain.heldout_log_density_per_reading,
-                gain.heldout_sd,
-                part=noun_of_held_out_part(diagnosis),
-            )
-        )
+        mean_and_sd, part = (gain.heldout_log_density_per_reading, gain.heldout_sd), noun_of_held_out_part(diagnosis)
+        drawers["gain.svg"] = lambda: svg(heldout_gain_by_scan(gain.heldout_by_scan, *mean_and_sd, part=part))
     for effect in cast(Sequence[Form], diagnosis.repaired.chain.effects):
         if effect.name.startswith("curve:"):
             drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
@@ -206,19 +200,13 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
 
 def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
-    plan = diagnosis.recording.plan
-    unit = plan.instrumentation.unit
-    models = [
-        (BEFORE, diagnosis.repair.before.residuals),
-        (diagnosis.repair.after_in_words, diagnosis.repair.after.residuals),
-    ]
+    plan, repair = diagnosis.recording.plan, diagnosis.repair
+    models = [(BEFORE, repair.before.residuals), (repair.after_in_words, repair.after.residuals)]
+    models = models if repair.changes_predictions else models[:1]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
-    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.repair.before.readings))
-    return svg(
-        residuals_against_covariates(
-            covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_after_number(unit)
-        )
-    )
+    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), repair.before.readings))
+    unit = unit_after_number(plan.instrumentation.unit)
+    return svg(residuals_against_covariates(covariates, models, unit=unit))
 
 
 def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:

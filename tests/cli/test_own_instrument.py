@@ -123,7 +123,7 @@ def test_ctrl_c_closes_the_instrument_and_keeps_the_journal(arm_file, ten_bits, 
 def test_a_plan_is_recorded_in_the_instruments_own_unit_and_goes_on_when_it_was_cut(
     arm_file, tmp_path, capsys, monkeypatch, closed
 ):
-    monkeypatch.setattr("probewise.cli._record.prompter_for_answer", lambda arm: lambda text: "")
+    monkeypatch.setattr("probewise.cli._bench.prompter_for_answer", lambda arm: lambda text: "")
     plan = tmp_path / "plan.csv"
     write_plan(
         Plan.from_arrays(

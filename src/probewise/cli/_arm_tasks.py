@@ -25,17 +25,8 @@ from probewise.arm.carry_out import reachable_places_of
 from probewise.arm.fitting import spread_mark_places
 from probewise.arm.geometry import JOINTS
 from probewise.arm.height_check import HeightReading, check_heights
+from probewise.cli import _bench
 from probewise.cli._arm import SCENE, parse_arm, parse_place
-from probewise.cli._bench import (
-    SimulatedBench,
-    enable_confirmed_lowering,
-    open_arm_and_bench,
-    open_brick,
-    open_nxt_arm,
-    prompter,
-    warn_and_confirm_lowering,
-    warn_if_clearance_doubtful,
-)
 from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_result, print_warning
 from probewise.errors import LinkError, ParameterError
 from probewise.recordings import write_bytes_atomically
@@ -58,12 +49,12 @@ def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s:
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
         )
-    return open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
+    return _bench.open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
 
 
 def open_instrument(
     arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0, n_taken: int = 0, scene: str = SCENE
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, _bench.SimulatedBench | None]:
     """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":
@@ -76,7 +67,7 @@ def open_instrument(
     default = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
     given = {name: getattr(arguments, name, None) for name in default}
     given = {name: default[name] if value is None else value for name, value in given.items()}
-    opened = open_arm_and_bench(chosen, geometry, arguments.geometry, **given, start_s=start_s, n_taken=n_taken)
+    opened = _bench.open_arm_and_bench(chosen, geometry, arguments.geometry, **given, start_s=start_s, n_taken=n_taken)
     print_result(f"seed {given['seed']}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
     return opened
 
@@ -84,7 +75,7 @@ def open_instrument(
 def confirm_lowering(arguments: argparse.Namespace, instrument: Instrument, geometry: Geometry) -> None:
     """Warn if the sensor may hit the table and let a person confirm its first lowering, unless nothing moves."""
     if arguments.arm is not None and not arguments.dry_run:
-        warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
+        _bench.warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
 
 
 def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
@@ -106,7 +97,7 @@ def nxt_port(name: str) -> str:
 
 def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
     """Return a function that prompts the person; in a dry run, it only prints the request."""
-    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
+    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else _bench.prompter(arm)
 
 
 # The tasks
@@ -149,7 +140,7 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
         say(f"drawn        {drawing}")
     if port is None:
         return
-    with open_brick(port) as brick:  # nothing moves
+    with _bench.open_brick(port) as brick:  # nothing moves
         version, battery_v = brick.version(), brick.battery_mv() / 1000
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
         say(f"brick        {brick.name()}, firmware {firmware}, battery {battery_v:.2f} V")
@@ -169,10 +160,10 @@ def jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> No
             if arguments.steps and not arguments.down:
                 raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
             if arguments.down and not arguments.dry_run and not arguments.steps:
-                warn_if_clearance_doubtful(geometry)
+                _bench.warn_if_clearance_doubtful(geometry)
             with open_lego_arm(arguments, geometry) as arm:
                 if arguments.steps and not arguments.dry_run:
-                    enable_confirmed_lowering(arm)
+                    _bench.enable_confirmed_lowering(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _print_position(arm, quiet=arguments.quiet)
                 if arguments.down:

@@ -1,6 +1,5 @@
 """Investigations: rounds until an explanation is settled, the budget, the folder that keeps the readings."""
 
-import math
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -124,15 +123,6 @@ def test_it_is_known_whether_hands_are_there(diagnosed):
     assert calls[0][1]["hands"] is False
 
 
-def test_wrong_kinds_are_refused_before_anything_is_read():
-    with pytest.raises(ParameterError, match="record"):
-        investigate(None, scans(0), rng=np.random.default_rng(0))
-    with pytest.raises(ParameterError, match="rounds"):
-        investigate(record, scans(0), rng=np.random.default_rng(0), rounds=0)
-    with pytest.raises(ParameterError, match="rng"):
-        investigate(record, scans(0), rng=3)
-
-
 class Fixed:
     """An instrument at one height that its arm cannot change."""
 
@@ -182,11 +172,6 @@ def first_scans(n):
     return plan.take(plan.scan < n)
 
 
-def test_a_plan_that_can_be_afforded_is_taken_whole():
-    plan = first_scans(2)
-    assert Budget(len(plan)).affordable_scans(plan, 0.0) is plan
-
-
 def test_scans_are_taken_whole_or_not_at_all():
     plan = first_scans(2)
     n_first = int((plan.scan == 0).sum())
@@ -195,35 +180,11 @@ def test_scans_are_taken_whole_or_not_at_all():
     assert cut.scan_names == plan.scan_names[:1]
 
 
-def test_what_is_too_dear_is_not_taken():
-    plan = first_scans(1)
-    assert Budget(len(plan) - 1).affordable_scans(plan, 0.0) is None
-    assert Budget(minutes=0.001).affordable_scans(plan, 0.0) is None
-
-
 def test_minutes_count_from_the_end_of_the_last_round():
     plan = first_scans(1)
     minutes = float(plan.time_s.max() + 600.0) / 60
     assert Budget(minutes=minutes + 0.01).affordable_scans(plan, -600.0) is plan
     assert Budget(minutes=minutes - 0.01).affordable_scans(plan, -600.0) is None
-
-
-def test_spending_never_leaves_less_than_nothing():
-    left = Budget(10, 1.0).minus(first_scans(1), 0.0)
-    assert (left.readings, left.minutes) == (0, pytest.approx(max(1.0 - first_scans(1).time_s.max() / 60, 0.0)))
-
-
-@pytest.mark.parametrize("wrong", [-1, math.nan])
-def test_a_budget_below_nothing_is_refused(wrong):
-    with pytest.raises(ParameterError, match="0 or more"):
-        Budget(readings=wrong)
-    with pytest.raises(ParameterError, match="0 or more"):
-        Budget(minutes=wrong)
-
-
-def test_an_empty_budget_affords_nothing():
-    assert Budget(0).affordable_scans(first_scans(1), 0.0) is None
-    assert np.isinf(Budget().minutes)
 
 
 TAKE = SimulatedRecorder(true_world("paper"), seed=3)
@@ -287,12 +248,6 @@ def test_two_investigations_do_not_mix(tmp_path):
     (tmp_path / "rounds" / "settings.json").write_text("[1]")
     with pytest.raises(FileError, match="no JSON object"):
         begin({"seed": 1}, resume=True)
-
-
-def test_a_round_that_was_cut_goes_on_to_the_same_readings():
-    take = SimulatedRecorder(true_world("paper"), seed=3)
-    whole = list(take(2, few_rows(), "", ()))
-    assert list(take(2, few_rows(), "", whole[:7])) == whole[7:]
 
 
 def test_each_round_has_noise_of_its_own():

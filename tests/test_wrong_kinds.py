@@ -17,23 +17,22 @@ from probewise.diagnosis import (
     audit_system,
     diagnose_system,
     diagnosis_json,
-    fit_json,
     fit_simulator,
     model_with,
     repaired_of,
 )
 from probewise.effects import VOCABULARY, Effect
 from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
-from probewise.experiment import Experiment, Exploration, as_shape, experiment_for, explore, result_json, samples_csv
+from probewise.experiment import Experiment, Exploration, as_shape
 from probewise.inference import GaussianKnown, Naive, Rounded, SensorProblem, StudentT
-from probewise.investigation import Budget, investigate
-from probewise.nested import NestedResult, RemainingEvidence, SliceMove, diversify, run
-from probewise.priors import Joint, LogUniform, Normal, Product, Uniform
-from probewise.recordings import HalfPlane, Plan, Recording, read_plan, read_recording, write_plan, write_recording
-from probewise.report.plots import corner_plot, readings_by_orientation, spatial_sensitivity
-from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, Rectangle, RegularPolygon
-from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture, NaiveSensor
-from probewise.systems import Law, Simulator, predict_system, write_fitted_system
+from probewise.investigation import investigate
+from probewise.nested import NestedResult, RemainingEvidence, diversify, run
+from probewise.priors import Joint, Product, Uniform
+from probewise.recordings import HalfPlane, Plan, Recording, read_recording, write_plan, write_recording
+from probewise.report.plots import corner_plot, spatial_sensitivity
+from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, RegularPolygon
+from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture
+from probewise.systems import Law, Simulator, predict_system
 from probewise.world import Blob, World, gaussian_spot
 
 RNG = np.random.default_rng(0)
@@ -146,74 +145,43 @@ A_SENSOR = "allowed: a FittedSensor: read_sensor"
 MISTAKES = {
     # randomness
     "a seed to calibrate": (lambda: probewise.calibrate(RECORDING, rng=0), r"rng is 0; .*default_rng\(0\)"),
-    "another seed": (lambda: probewise.diagnose(RECORDING, rng=42), r"rng is 42; .*default_rng\(42\)"),
     "no generator": (lambda: probewise.explore(SENSOR, rng=None), f"rng is None; {A_GENERATOR}"),
-    "a module": (lambda: run(Bell(), rng=np.random), A_GENERATOR),
-    "a legacy state": (lambda: run(Bell(), rng=np.random.RandomState(0)), A_GENERATOR),
     "a seed to samples": (lambda: EXPERIMENT and diversify([[0.0, 0.0]], Bell(), rng=1), r"default_rng\(1\)"),
-    "a seed to the engine": (lambda: probewise.diagnosis.diagnose(RECORDING, rng=0), A_GENERATOR),
-    "a seed to a run": (lambda: list(explore(ARM, EXPERIMENT, rng=0)), A_GENERATOR),
     # calibrate
     "a path": (lambda: probewise.calibrate("mine.csv", rng=RNG), f"recording is 'mine.csv'; {A_RECORDING}"),
-    "a table": (lambda: probewise.calibrate(Frame(), rng=RNG), f"{A_RECORDING}"),
-    "None": (lambda: probewise.calibrate(None, rng=RNG), f"recording is None; {A_RECORDING}"),
     "a plan": (lambda: probewise.calibrate(PLAN, rng=RNG), A_RECORDING),
-    "several": (lambda: probewise.calibrate([RECORDING], rng=RNG), A_RECORDING),
     "an unknown pattern": (lambda: probewise.calibrate(UNDESCRIBED, rng=RNG), "'edge' is named but not described"),
     "one order": (lambda: probewise.calibrate(RECORDING, orders=2, rng=RNG), "orders is 2; allowed: one or more whole"),
-    "orders as text": (lambda: probewise.calibrate(RECORDING, orders="12", rng=RNG), "orders is '12'"),
     "half an order": (lambda: probewise.calibrate(RECORDING, orders=[1.5], rng=RNG), r"orders is \(1.5,\)"),
     "live points as text": (lambda: probewise.calibrate(RECORDING, n_live="300", rng=RNG), "n_live is '300'; allowed"),
-    "half a live point": (lambda: probewise.calibrate(RECORDING, n_live=99.5, rng=RNG), "n_live is 99.5; allowed"),
     # predict
     "swapped": (lambda: probewise.predict(PLAN, SENSOR), "sensor is .*order predict"),
-    "a sensor's path": (lambda: probewise.predict("sensor.json", PLAN), f"sensor is 'sensor.json'; {A_SENSOR}"),
-    "places": (lambda: probewise.predict(SENSOR, [(0, 0)]), f"plan is .*; {A_PLAN}"),
     "a plan's path": (lambda: probewise.predict(SENSOR, "plan.csv"), f"plan is 'plan.csv'; {A_PLAN}"),
-    "an unknown pattern to predict": (lambda: probewise.predict(SENSOR, UNDESCRIBED), "'edge' is named but not"),
     "readings twice": (
         lambda: probewise.calibration.predict(SENSOR, RECORDING, RECORDING.readings),
         "none together with a recording",
     ),
     # audit
-    "a path to audit": (lambda: probewise.audit("plan.csv"), f"plan is 'plan.csv'; {A_PLAN}"),
-    "a table to audit": (lambda: probewise.audit(Frame()), A_PLAN),
-    "a sensor's path to audit": (lambda: probewise.audit(PLAN, sensor="s.json"), f"sensor is 's.json'; {A_SENSOR}"),
     "a misspelt word of an audit": (
         lambda: probewise.audit(PLAN).effects_with_detectability("invisibel"),
         "detectability is 'invisibel'; .*; did you mean invisible",
     ),
-    "an unknown pattern to audit": (lambda: probewise.audit(UNDESCRIBED), "'edge' is named but not described"),
     # diagnose
     "a path to diagnose": (lambda: probewise.diagnose("mine.csv", rng=RNG), A_RECORDING),
-    "paths to diagnose": (lambda: probewise.diagnose(["a.csv", "b.csv"], rng=RNG), f"'a.csv'; {A_RECORDING}"),
-    "a table to diagnose": (lambda: probewise.diagnose(Frame(), rng=RNG), A_RECORDING),
     "nothing to diagnose": (lambda: probewise.diagnose([], rng=RNG), r"recordings is \(\); allowed: one or more"),
-    "an unknown pattern to diagnose": (lambda: probewise.diagnose(UNDESCRIBED, rng=RNG), "'edge' is named but not"),
-    "a sensor's path to diagnose": (lambda: probewise.diagnose(RECORDING, sensor="s.json", rng=RNG), A_SENSOR),
     # explore
     "a path to explore": (lambda: probewise.explore("s.json", rng=RNG), f"sensor is 's.json'; {A_SENSOR}"),
-    "a recording to explore": (lambda: probewise.explore(RECORDING, rng=RNG), A_SENSOR),
     "an unknown shape": (
         lambda: probewise.explore(SENSOR, shape="heart", rng=RNG),
         "shape is 'heart'; allowed: one of",
     ),
     "a class of shapes": (lambda: probewise.explore(SENSOR, shape=Circle, rng=RNG), r"a value of it is Circle\("),
-    "no shape": (lambda: probewise.explore(SENSOR, shape=None, rng=RNG), "shape is None; allowed: a shape such as"),
     "a size as field": (lambda: probewise.explore(SENSOR, field=(1048, 520), rng=RNG), r"allowed: a Field: Field\("),
     "an unknown model": (lambda: probewise.explore(SENSOR, model="SSF", rng=RNG), "model is 'SSF'; allowed: 'ssf' or"),
-    "an unknown method": (
-        lambda: probewise.explore(SENSOR, method="p", rng=RNG),
-        "method is 'p'; allowed: 'particles' or",
-    ),
     "levels for nobody": (lambda: probewise.explore(SENSOR, levels=RECORDING, rng=RNG), "levels is .*; allowed: None"),
     "no levels": (
         lambda: probewise.explore(SENSOR, method="paper", model="naive", arm=ARM, rng=RNG),
         "levels is None; allowed: a recording with readings over black and over white",
-    ),
-    "a path to the paper's robot": (
-        lambda: probewise.explore("s.json", method="paper", model="naive", rng=RNG),
-        A_SENSOR,
     ),
     "another calibration": (
         lambda: probewise.calibrate(RECORDING, method="paper's", rng=RNG),
@@ -224,24 +192,18 @@ MISTAKES = {
         "nested_stop is 'change'; allowed: None",
     ),
     "an unknown utility": (lambda: probewise.explore(SENSOR, utility="bits", rng=RNG), "utility is 'bits'; allowed"),
-    "a number as utility": (lambda: probewise.explore(SENSOR, utility=3, rng=RNG), "utility is 3; allowed: a utility"),
     "readings as text": (lambda: probewise.explore(SENSOR, max_readings="9", rng=RNG), "max_readings is '9'; allowed"),
     "a port as arm": (
         lambda: probewise.explore(SENSOR, arm="nxt:COM5", rng=RNG),
         "arm is 'nxt:COM5'; allowed: an Inst",
     ),
-    "swapped to run": (lambda: list(explore(EXPERIMENT, ARM, rng=RNG)), "instrument is .*; allowed: an Instrument"),
-    "no experiment": (lambda: list(explore(ARM, CIRCLE, rng=RNG)), "experiment is .*; allowed: an Experiment"),
-    "swapped to pose": (lambda: experiment_for(CIRCLE, SENSOR, Field()), "sensor is .*in the order experiment_for"),
     "a shape that is none": (lambda: as_shape(["blob"], Field()), "shape is 'blob'; allowed: one of circle"),
-    "a number as likelihood": (lambda: Experiment(CIRCLE, MODEL, 0.7, 0.7), "likelihood is 0.7; allowed: a likelihood"),
     "swapped experiment": (lambda: Experiment(MODEL, CIRCLE, GaussianKnown(1), 0.7), "shape is .*; allowed: a shape"),
     # nested sampling
     "a function as problem": (
         lambda: run(lambda theta: 0.0, rng=RNG),
         "allowed: a problem with a prior and a log_likel",
     ),
-    "a class as problem": (lambda: run(Bell, rng=RNG), r"this is the class, a value of it is Bell\("),
     "a dict as prior": (lambda: run(NoPrior(), rng=RNG), "problem.prior is .*; allowed: a prior of named parameters"),
     "a scalar likelihood": (
         lambda: run(Bell(lambda theta: -0.5 * float((theta**2).sum())), rng=RNG),
@@ -251,19 +213,12 @@ MISTAKES = {
         lambda: run(Bell(lambda theta: -abs(theta[2])), rng=RNG, n_live=20),
         r"theta is a batch of shape|a batch theta of shape \(20, 2\)",
     ),
-    "a text as likelihood": (lambda: run(Bell(lambda theta: "high"), rng=RNG), "something other than numbers"),
     "live points in quotes": (lambda: run(Bell(), rng=RNG, n_live="100"), "n_live is '100'; allowed: a whole number"),
-    "no live point": (lambda: run(Bell(), rng=RNG, n_live=0), "n_live is 0; allowed: 10 or more"),
     "a bar of nested sampling": (lambda: run(Bell(), rng=RNG, progress=True), "progress is True; allowed: a function"),
     "a number as stopping rule": (lambda: run(Bell(), rng=RNG, stop=0.1), r"stop is 0.1; .*RemainingEvidence\(dlogz"),
     "a text as move": (lambda: run(Bell(), rng=RNG, move="slice"), r"move is 'slice'; .*SliceMove\(\)"),
-    "a class as move": (lambda: run(Bell(), rng=RNG, move=SliceMove), r"a value of it is SliceMove\("),
-    "half a replacement": (lambda: run(Bell(), rng=RNG, n_replaced=2.5), "n_replaced is 2.5; allowed: a whole number"),
-    "calls as text": (lambda: run(Bell(), rng=RNG, max_calls="many"), "max_calls is 'many'; allowed: a whole number"),
     "a number as checkpoint": (lambda: run(Bell(), rng=RNG, checkpoint=3), "checkpoint is 3; allowed: the name of"),
-    "seconds as text": (lambda: run(Bell(), rng=RNG, checkpoint_every_s="1"), "checkpoint_every_s is '1'; allowed"),
     "a count as executor": (lambda: run(Bell(), rng=RNG, executor=4), "executor is 4; allowed: an executor"),
-    "half a worker": (lambda: run(Bell(), rng=RNG, n_workers=1.5), "n_workers is 1.5; allowed: a whole number"),
     "a text as flag": (lambda: run(Bell(), rng=RNG, return_interrupted="no"), "'no'; allowed: True or False"),
     "an interval by name": (lambda: found().interval("x"), "mass is 'x'; .*columns of the result are x 0, y 1"),
     # priors
@@ -271,17 +226,10 @@ MISTAKES = {
         lambda: Product({"a": (0, 1)}),
         r"marginals\['a'\] is \(0, 1\); .*Uniform\(low, high",
     ),
-    "a number for one": (lambda: Product({"a": 1.0}), r"marginals\['a'\] is 1.0; allowed: a distribution"),
-    "a class for one": (lambda: Product({"a": Uniform}), r"a value of it is Uniform\("),
-    "a list of them": (lambda: Product([Uniform(0, 1)]), "marginals is .*; allowed: distributions by name"),
     "a number as name": (lambda: Product({1: Uniform(0, 1)}), "name of a marginal is 1; allowed: a text"),
     "a marginal to join": (lambda: Joint((Uniform(0, 1),)), r"parts\[0\] is .*; allowed: a prior of named parameters"),
-    "a prior to join": (lambda: Joint(Bell.prior), "parts is .*; allowed: priors: Joint"),
     "bounds as text": (lambda: Uniform("0", "1"), "low is '0'; allowed: a number"),
-    "bounds as a pair": (lambda: Uniform((0, 1), None), r"low is \(0, 1\); allowed: a number"),
     "swapped bounds": (lambda: Uniform(1, 0), "low < high"),
-    "a scale as text": (lambda: LogUniform(1, "10"), "high is '10'; allowed: a number"),
-    "no sd": (lambda: Normal(0.0, None), "sd is None; allowed: a number"),
     "parameters as text": (lambda: Bell.prior.log_prob("x"), "parameters is 'x'; allowed: numbers"),
     "one hypothesis": (lambda: Bell.prior.log_prob([1.0, 2.0]), r"allowed: \(n_samples, 2\) for \('x', 'y'\)"),
     # poses and readings
@@ -289,12 +237,7 @@ MISTAKES = {
         lambda: Reading(Pose(0, 0), 3.0, 0.0),
         r"value is Pose\(.*order Reading\(value, pose, time_s",
     ),
-    "a pair as its pose": (lambda: Reading(3.0, (0, 0), 0.0), r"pose is \(0, 0\); allowed: a Pose: Pose\(x_mm, y_mm"),
-    "a text as its value": (lambda: Reading("3", Pose(0, 0), 0.0), "value is '3'; allowed: a number"),
-    "no time": (lambda: Reading(3.0, Pose(0, 0), None), "time_s is None; allowed: a number"),
     "a pair in a pose": (lambda: Pose((1.0, 2.0), 0.0), r"x_mm is \(1.0, 2.0\); allowed: a number"),
-    "a text in a pose": (lambda: Pose("1", 0.0), "x_mm is '1'; allowed: a number"),
-    "a pair to measure": (lambda: ARM.measure((500.0, 200.0)), r"pose is \(500.0, 200.0\); allowed: a Pose"),
     "one place": (lambda: ARM.reachable([500.0, 200.0]), r"places_mm has shape \(2,\); allowed: \(n_places, 2\)"),
     "a world as light": (
         lambda: SimulatedArm(World(gaussian_spot([Blob(1.0, (0.0, 0.0), (4.0, 4.0))]))),
@@ -309,23 +252,16 @@ MISTAKES = {
         lambda: probewise.explore(SENSOR, arm=Own(None), rng=RNG, max_readings=1),
         "what measure returned is None; allowed: a finite number, or a dict",
     ),
-    "an arm that measures several": (
-        lambda: probewise.explore(SENSOR, arm=Own(np.array([1.0, 2.0])), rng=RNG, max_readings=1),
-        r"what measure returned is array\(\[1., 2.\]\); allowed: a finite number",
-    ),
     "an arm that cannot measure": (
         lambda: probewise.explore(SENSOR, arm=Bell(), rng=RNG),
         r"object with measure\(pose",
     ),
-    "a class as arm": (lambda: probewise.explore(SENSOR, arm=Own, rng=RNG), r"a value of it is Own\("),
     "a batch as text": (lambda: probewise.explore(SENSOR, batch="2", rng=RNG), "batch is '2'; allowed: a whole number"),
-    "half a repeat": (lambda: probewise.explore(SENSOR, repeats=1.5, rng=RNG), "repeats is 1.5; allowed: a whole"),
     "an angle as text": (lambda: probewise.explore(SENSOR, orientations_rad="0", rng=RNG), "a number, or several in a"),
     "a number as journal": (
         lambda: probewise.explore(SENSOR, journal=3, rng=RNG),
         "journal is 3; allowed: the name of",
     ),
-    "a number as progress": (lambda: probewise.explore(SENSOR, progress=3, rng=RNG), "progress is 3; allowed: True"),
     "a Calibration to explore": (
         lambda: probewise.explore(CALIBRATION, rng=RNG),
         "take its .sensor, this is the OfOne",
@@ -335,40 +271,24 @@ MISTAKES = {
         "truth is .*; allowed: one number for each of x_mm, y_mm, radius_mm",
     ),
     # files
-    "a Calibration to write": (lambda: write_sensor(CALIBRATION, "s.json"), "take its .sensor, this is the OfOne"),
-    "a Calibration to predict": (lambda: probewise.predict(CALIBRATION, PLAN), "take its .sensor, this is the OfOne"),
-    "a Calibration to audit": (
-        lambda: probewise.audit(PLAN, sensor=CALIBRATION),
-        "take its .sensor, this is the OfOne",
-    ),
     "a sensor to nowhere": (lambda: write_sensor(SENSOR, None), "path is None; allowed: the name of a file"),
     "a method to write": (
         lambda: write_recording(Exploration(EXPERIMENT, ()).recording, "r.csv"),
         r"this is the method recording, call it: recording\(\)",
     ),
-    "a recording's path to write": (
-        lambda: write_recording("r.csv", RECORDING),
-        f"recording is 'r.csv'; {A_RECORDING}",
-    ),
     "a recording as plan": (lambda: write_plan(RECORDING, "p.csv"), A_PLAN),
     "a table to read": (lambda: read_recording(Frame()), r"Recording.from_table\(\.\.\.\)"),
-    "a table to read as plan": (lambda: read_plan(Frame()), r"Recording.from_table\(\.\.\.\)"),
     "a sensor to read": (
         lambda: read_sensor(SENSOR),
         "allowed: the name of a sensor.json file; a FittedSensor needs no",
     ),
-    "nothing to load": (lambda: NestedResult.load(None), "path is None; allowed: the name of a file"),
     "a result that is none": (
         lambda: NestedResult.load(__file__),
         r"unreadable \(no NumPy archive\); allowed: a file wr",
     ),
     "a result that is not there": (lambda: NestedResult.load("nowhere.npz"), "nowhere.npz: there is no such file"),
-    "one Exploration for another result": (lambda: result_json(CALIBRATION), "run is .*; allowed: an Exploration"),
-    "no run for samples": (lambda: samples_csv(None), "run is None; allowed: an Exploration"),
     "no diagnosis to write": (lambda: diagnosis_json(CALIBRATION), "diagnosis is .*; allowed: a Diagnosis"),
-    "no fit to write": (lambda: fit_json(CALIBRATION), "fit is .*; allowed: a SystemFit"),
     "no diagnosis of a simulator": (lambda: repaired_of(CALIBRATION), "allowed: the Diagnosis of a simulator"),
-    "no system to write": (lambda: write_fitted_system(CALIBRATION, "s.json"), "fitted is .*; allowed: a FittedSystem"),
     "a run for a recording": (
         lambda: write_recording(Exploration(EXPERIMENT, ()), "r.csv"),
         r"take its .recording\(\), this is the Exploration",
@@ -382,13 +302,8 @@ MISTAKES = {
         lambda: diagnose_system(TABLE, OVEN, rng=RNG),
         r"simulator is .*; allowed: a Simulator\(",
     ),
-    "a path for a table": (
-        lambda: fit_simulator(OVEN, "oven.csv", rng=RNG),
-        "table is 'oven.csv'; allowed: columns by name",
-    ),
     "a recording for a table": (lambda: audit_system(OVEN, RECORDING), "table is .*; allowed: columns by name"),
     "a table of no row": (lambda: fit_simulator(OVEN, {"t_s": [], "temp_c": []}, rng=RNG), "table is 'without a row'"),
-    "a seed for a simulator": (lambda: fit_simulator(OVEN, TABLE, rng=1), r"rng is 1; .*default_rng\(1\)"),
     "a simulator for its fit": (lambda: predict_system(OVEN, TABLE, rng=RNG), "fitted is .*; allowed: a FittedSystem"),
     "a file for a function": (
         lambda: simulator(simulate="oven.py"),
@@ -404,9 +319,7 @@ MISTAKES = {
         r"per_run is 'tau_s'; .*in a list: \['tau_s'\]",
     ),
     "a prior for an effect": (lambda: simulator(extra={"drag": (0, 1)}), r"extra\['drag'\] is .*; allowed: an Extra\("),
-    "a column that is none": (lambda: simulator(reading=3), "reading is 3; allowed: the name of the column"),
     "a law of lists": (lambda: Law(["temp_c"], 2), "states is .*; allowed: where each state starts"),
-    "a law of numbers": (lambda: Law({"temp_c": 20.0}, 2), "rates is 2; allowed: a function rates"),
     # models and effects of one's own
     "a function for a null": (
         lambda: diagnosis.diagnose(RECORDING, null=lambda p, plan: 0, rng=RNG),
@@ -415,10 +328,6 @@ MISTAKES = {
     "names for effects": (
         lambda: diagnosis.diagnose(RECORDING, effects=["lag"], rng=RNG),
         "effects is .*; allowed: effects by name",
-    ),
-    "a number for an effect": (
-        lambda: diagnosis.diagnose(RECORDING, effects={"lag": 3}, rng=RNG),
-        r"effects\['lag'\] is 3",
     ),
     "an effect by another name": (
         lambda: diagnosis.diagnose(RECORDING, effects={"lagg": VOCABULARY["lag"]}, rng=RNG),
@@ -444,7 +353,6 @@ MISTAKES = {
         r"log_prob of OneNumber returned shape \(\)",
     ),
     # investigations
-    "a name for a plan": (lambda: investigate(record, "paper", rng=RNG), "plan is 'paper'; allowed: a Plan"),
     "a number for a budget": (
         lambda: investigate(record, PLAN, budget=300, rng=RNG),
         r"budget is 300; allowed: a Budget\(",
@@ -453,7 +361,6 @@ MISTAKES = {
         lambda: investigate(lambda plan: RECORDING, PLAN, rng=RNG),
         "record is .*; allowed: a function of",
     ),
-    "a budget of texts": (lambda: Budget(readings="400"), "readings is '400'; allowed: a number"),
     # the verbs
     "a bar of another kind": (
         lambda: probewise.calibrate(RECORDING, rng=RNG, progress=lambda done: None),
@@ -463,7 +370,6 @@ MISTAKES = {
         lambda: probewise.explore(SENSOR, learn_sensor="yes", rng=RNG),
         "learn_sensor is 'yes'; allowed: True",
     ),
-    "no trust": (lambda: probewise.explore(SENSOR, trust="no", rng=RNG), "trust is 'no'; allowed: a number"),
     "a folder that cannot be": (
         lambda: probewise.explore(SENSOR, journal="/proc/nowhere/run.jsonl", rng=RNG, progress=False),
         "/proc/nowhere: cannot be made",
@@ -474,59 +380,31 @@ MISTAKES = {
         "ax is <Figure.*; allowed: axes of mat",
     ),
     "a figure as many": (lambda: corner_plot(found(), axes=Figure()), r"axes have shape \(\)"),
-    "texts as many": (lambda: corner_plot(found(), axes=[["a"] * 2] * 2), "axes is 'a'; allowed: axes of matplotlib"),
     "a sensor to draw": (lambda: spatial_sensitivity(SENSOR), "field is .*; allowed: an SSFField"),
-    "a plan to draw": (lambda: readings_by_orientation(PLAN), A_RECORDING),
-    "a run to draw": (lambda: corner_plot(Bell()), "result is .*; allowed: a NestedResult"),
     # recordings and plans
     "arrays as plan": (lambda: Recording(np.zeros(3), np.zeros(3)), f"plan is .*; {A_PLAN}"),
-    "a swapped recording": (lambda: Recording(RECORDING.readings, PLAN), f"plan is .*; {A_PLAN}"),
-    "readings as texts": (lambda: Recording(PLAN, ["a"] * 30), "readings is .*; allowed: numbers"),
     "covariates without names": (lambda: arrays(covariates=[1.0]), "covariates is .*; allowed: what was logged"),
     "a covariate with a place": (
         lambda: arrays(covariates={"x_mm": range(30)}),
         "covariates is 'x_mm'; allowed: a name",
     ),
-    "objects for readings": (lambda: arrays(readings=[object()] * 30), "readings is .*; allowed: numbers"),
     "a number for a pattern's name": (lambda: arrays(patterns={0: EDGE}), "a name in patterns is 0; allowed: a text"),
     "a row that is not there": (
         lambda: RECORDING.take([30]),
         "rows is .*; allowed: numbers of rows in a list, up to 29",
     ),
-    "half a row": (lambda: PLAN.take(0.5), "rows is 0.5; allowed: numbers of rows"),
     "too few truths": (lambda: RECORDING.take([True, False]), "rows is .*; 30 truth values; or a slice"),
     # scenes
     "a radius": (lambda: Circle(radius_mm=90.0), r"radius_mm is 90.0; allowed: \(low, high\)"),
-    "a radius first": (lambda: Circle(90.0), r"field is 90.0; allowed: a Field: Field\("),
-    "sides as text": (lambda: Rectangle(sides_mm="40,300"), "sides_mm is '40,300'; allowed"),
     "half a side": (lambda: RegularPolygon(5.5), "n_sides is 5.5; allowed: a whole number"),
-    "a field of texts": (lambda: Field("1048", "520"), "width_mm is '1048'; allowed: a number"),
     "a list of shapes": (lambda: AnyOf([CIRCLE]), "shapes is .*; allowed: shapes by name"),
-    "classes of shapes": (lambda: AnyOf({"circle": Circle}), r"shapes\['circle'\] is .*a value of it is Circle\("),
-    "a class in a scene": (lambda: HypothesisScene(Circle), r"a value of it is Circle\("),
     "a list of patterns": (lambda: KnownScene([EDGE]), "patterns is .*; allowed: patterns by name"),
     # sensors
-    "a chain swapped": (lambda: Chain(MIXTURE, HypothesisScene(CIRCLE), FreeLevels()), "levels is .*order Chain"),
     "a shape as scene": (lambda: Chain(MIXTURE, FreeLevels(), CIRCLE), "scene is .*; allowed: a scene such as"),
-    "no SSF": (lambda: Chain(2, FreeLevels(), HypothesisScene(CIRCLE)), "ssf is 2; allowed: an SSF such as"),
-    "a shape for the naive": (lambda: NaiveSensor(FreeLevels(), CIRCLE), "scene is .*; allowed: a scene such as"),
-    "a naive unknown pattern": (
-        lambda: NaiveSensor(FixedLevels(0, 1), KnownScene({"a": EDGE})).predict(np.empty((1, 0)), PLAN),
-        "'edge' is named but not described",
-    ),
-    "levels as text": (lambda: FixedLevels("10", 60), "i_min is '10'; allowed: a number"),
     "one and a half Gaussians": (lambda: FreeMixture(1.5), "n_gaussians is 1.5; allowed: a whole number"),
-    "weights as text": (lambda: FixedMixture("1", [[0, 0]], [np.eye(2)]), "weights is '1'; allowed: numbers"),
     # likelihoods and problems
     "an sd as text": (lambda: GaussianKnown("0.7"), "sd is '0.7'; allowed: numbers"),
-    "a level as text": (lambda: Naive("10", 1, 60, 1), "mu_black is '10'; allowed: a number"),
-    "a step as text": (lambda: Rounded(0.7, "1"), "step is '1'; allowed: a number"),
     "an sd for a likelihood": (lambda: SensorProblem(CIRCLE.prior, MODEL, 0.7, RECORDING), "likelihood is 0.7"),
-    "a shape for a prior": (lambda: SensorProblem(CIRCLE, MODEL, GaussianKnown(1), RECORDING), "prior is .*; allowed"),
-    "readings for a recording": (
-        lambda: SensorProblem(CIRCLE.prior, MODEL, GaussianKnown(1), RECORDING.readings),
-        A_RECORDING,
-    ),
 }
 
 

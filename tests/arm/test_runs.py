@@ -11,7 +11,7 @@ import pytest
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.calibration import FittedSensor, write_sensor
-from probewise.cli import _arm_tasks, main
+from probewise.cli import _bench, main
 from probewise.errors import LinkError
 from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
 from probewise.sensor import footprint_of, mean_ssf_field
@@ -44,7 +44,6 @@ def bricks(monkeypatch, make_paper_brick):
         machine = BrickMachine(Brick(Link(paper, clock=clock), clock=clock), geometry)
         return LegoArm(machine, geometry, clock=clock, start_s=start_s)
 
-    monkeypatch.setattr("probewise.cli._arm_tasks.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("probewise.cli._bench.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
     deaths["opened"] = opened
@@ -290,7 +289,7 @@ def test_a_stop_while_the_sensor_rises_is_raised_by_what_comes_next(n_poses, sto
     readings = []
 
     def measure():
-        with _arm_tasks.open_nxt_arm("x", geometry) as arm:
+        with _bench.open_nxt_arm("x", geometry) as arm:
             readings.extend(arm.measure(pose) for _ in range(n_poses))
 
     stop_as_it_rises(1)

@@ -32,7 +32,7 @@ def test_check_names_what_is_wrong_with_a_file(tmp_path, capsys):
 @pytest.fixture
 def at_port(paper_brick, clock, monkeypatch):
     monkeypatch.setattr(
-        "probewise.cli._arm_tasks.open_brick", lambda port: Brick(Link(paper_brick, clock=clock), clock=clock)
+        "probewise.cli._bench.open_brick", lambda port: Brick(Link(paper_brick, clock=clock), clock=clock)
     )
     return paper_brick
 

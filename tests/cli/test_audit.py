@@ -93,28 +93,3 @@ def test_readings_filled_into_a_cure_plan_are_not_replaced_by_the_next(recording
     assert (tmp_path / "out" / "cure_plan_kept.csv").read_text().endswith("1,2,40\n")
     assert (tmp_path / "out" / "cure_plan_kept.json").read_text() == "{}"
     assert "cure_plan_kept.csv" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("harm", ["no file", "no json", "unknown pattern", "no rows", "nan place", "damaged sensor"])
-def test_input_that_cannot_be_used_is_refused_in_one_line(harm, recording_file, tmp_path, capsys):
-    more = []
-    match harm:
-        case "no file":
-            recording_file.unlink()
-        case "no json":
-            recording_file.with_suffix(".json").unlink()
-        case "unknown pattern":
-            recording_file.write_text(recording_file.read_text().replace("boundary", "nobody"))
-        case "no rows":
-            recording_file.write_text(recording_file.read_text().splitlines()[0] + "\n")
-        case "nan place":
-            recording_file.write_text(recording_file.read_text().replace("-50", "nan"))
-        case "damaged sensor":
-            more = ["--sensor", tmp_path / "damaged.json"]
-            more[1].write_text("{")
-    assert run("audit", recording_file, *more, "--out", tmp_path / "out") == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("probewise audit: ")
-    assert captured.err.count("\n") == 1
-    assert not (tmp_path / "out").exists()

@@ -49,11 +49,15 @@ def test_a_cell_that_cannot_be_used_is_named_with_its_row_and_column(
     assert column in said
 
 
-@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
-@pytest.mark.parametrize("harm", ["no json", "torn json", "unknown kind", "no x_mm", "no rows", "empty", "binary"])
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose", "audit"])
+@pytest.mark.parametrize(
+    "harm", ["no file", "no json", "torn json", "unknown kind", "no x_mm", "no rows", "empty", "binary"]
+)
 def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, tmp_path, capsys):
     description = recording_file.with_suffix(".json")
     match harm:
+        case "no file":
+            recording_file.unlink()
         case "no json":
             description.unlink()
         case "torn json":
@@ -73,21 +77,82 @@ def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, 
     refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("investigate", "--plan", "paper", "--origin-mm", "1,2"), "--origin-mm is '1,2'; allowed: none with"),
-        (("investigate", "--plan", "paper", "--geometry", "arm.toml"), "--geometry is 'arm.toml'; allowed: none with"),
-        (("investigate", "--plan", "paper", "--truth", "backlash:nan"), "'backlash:nan'; allowed: backlash:"),
-        (("study", "--model", "naive", "--learn-sensor"), "learn_sensor is True; allowed: False with"),
-        (("study", "--model", "naive", "--width", "1.3"), "width is 1.3; allowed: 1.0 with"),
-        (("study", "--concealed", "--beside-paper"), "--beside-paper is 'given'; allowed: none with --concealed"),
-        (("study", "--concealed", "--seed", "-1"), "'-1' is not a whole number of 0 or more"),
-        (("study", "--batch", "3", "--utility", "entropy"), "batch is 3; allowed: 1, or more with"),
-    ],
-)
-def test_options_that_contradict_each_other_are_refused_before_any_work(words, says, tmp_path, capsys):
-    assert says in refused(capsys, tmp_path / "out", *words, "--out", tmp_path / "out")
+EXPLORE = ("explore", "--sensor", "sensor.json")
+OWN = (*EXPLORE, "--arm", "own.py")
+INVESTIGATE = ("investigate", "--plan", "paper")
+TRUTHS = {
+    "500,250,-90": ("radius_mm", "-90.0", "20 to 150"),
+    "500,250,5000": ("radius_mm", "5000.0", "20 to 150"),
+    "500,nan,90": ("y_mm", "nan", "0 to 520"),
+    "inf,250,90": ("x_mm", "inf", "0 to 1048"),
+    "rectangle:500,250,100,60,2": ("angle_rad", "2.0", "0 to 1.5708"),
+    "ellipse:500,250,90,120,0.3": ("semi_minor_mm", "120.0", "20 to 90"),
+    "ellipse:500,250,inf,inf,0.3": ("semi_major_mm", "inf", "20 to 150"),
+}
+# Words of a command, and what its refusal says.
+CONTRADICTIONS = [
+    ((*INVESTIGATE, "--origin-mm", "1,2"), "--origin-mm is '1,2'; allowed: none with"),
+    ((*INVESTIGATE, "--geometry", "arm.toml"), "--geometry is 'arm.toml'; allowed: none with"),
+    ((*INVESTIGATE, "--truth", "backlash:nan"), "'backlash:nan'; allowed: backlash:"),
+    ((*INVESTIGATE, "--truth", "bcklash:1"), "did you mean backlash"),
+    ((*INVESTIGATE, "--minutes", "-1"), "greater than 0"),
+    (("investigate", "--plan", "nowhere.csv"), "nowhere.csv"),
+    ((*INVESTIGATE, "--arm", "own.py", "--no-hands"), "a plan over one pattern; paper has several"),
+    ((*INVESTIGATE, "--arm", "own.py", "--truth", "lag:1"), "--truth is 'lag:1'"),
+    (("study", "--model", "naive", "--learn-sensor"), "learn_sensor is True; allowed: False with"),
+    (("study", "--model", "naive", "--width", "1.3"), "width is 1.3; allowed: 1.0 with"),
+    (("study", "--concealed", "--beside-paper"), "--beside-paper is 'given'; allowed: none with --concealed"),
+    (("study", "--concealed", "--seed", "-1"), "'-1' is not a whole number of 0 or more"),
+    (("study", "--batch", "3", "--utility", "entropy"), "batch is 3; allowed: 1, or more with"),
+    (("calibrate", "small.csv", "--live", "51"), "52 or more"),
+    (("calibrate", "small.csv", "--orders", "1", "99"), "--orders is 99; allowed: up to 24 with --live 300"),
+    ((*EXPLORE, "--truth", "1,2"), "3 numbers, x_mm,y_mm,radius_mm"),
+    ((*EXPLORE, "--truth", "cirle:600,260,90"), "did you mean circle?"),
+    *(
+        ((*EXPLORE, "--truth", truth), f"{name} of --truth {truth} is {value}; allowed: {allowed},")
+        for truth, (name, value, allowed) in TRUTHS.items()
+    ),
+    ((*EXPLORE, "--field", "10"), "--field is '10'; allowed: WIDTH,HEIGHT in mm"),
+    ((*EXPLORE, "--field=-5,20"), "-5"),
+    ((*EXPLORE, "--seed", "x"), "'x' is not a whole number of 0 or more"),
+    ((*EXPLORE, "--model", "perfect"), "'perfect' is not one of ssf, naive"),
+    ((*EXPLORE, "--arm", "emulatr"), "did you mean emulator?"),
+    ((*EXPLORE, "--arm", "ntx:/dev/rfcomm0"), "did you mean nxt?"),
+    ((*EXPLORE, "--utility", "entorpy"), "did you mean entropy?"),
+    ((*EXPLORE, "--batch", "2", "--utility", "entropy"), "batch is 2"),
+    ((*EXPLORE, "--resume"), "no such file; allowed: a journal to resume"),
+    ((*EXPLORE, "--orientations", "0,45", "--arm", "nxt:/dev/null"), "no joint of which turns its sensor"),
+    ((*EXPLORE, "--heights", "10,14", "--arm", "nxt:/dev/null"), "none with the LEGO arm but 14: it reads that many"),
+    ((*EXPLORE, "--heights", "10", "--model", "naive"), "which knows no height"),
+    ((*EXPLORE, "--heights", "10", "--both-models"), "the naive model has no height"),
+    ((*EXPLORE, "--heights", "10"), "does not say at which height_mm it was calibrated"),
+    ((*EXPLORE, "--orientations", "0,north"), "not a list of numbers"),
+    ((*EXPLORE, "--repeats", "1,0"), "not a whole number from 1 to 1,000"),
+    ((*EXPLORE, "--reference", "a,100,80,60,1"), "--reference is 'a,100,80,60,1'"),
+    ((*EXPLORE, "--reference", "120,100,80,60,1.5"), "albedo"),
+    ((*EXPLORE, "--reference", "5,5,80,60,1"), "a card on the field of 1048 x 520 mm"),
+    ((*EXPLORE, "--model", "naive", "--reference", "120,100,80,60,1"), "none with --both-models, --model naive"),
+    ((*EXPLORE, "--method", "paper", "--trust", "0.9"), "trust is 0.9; allowed: 1"),
+    ((*EXPLORE, "--method", "paper", "--utility", "finishing"), "utility is 'finishing'; allowed: entropy"),
+    ((*EXPLORE, "--method", "paper", "--learn-sensor"), "learn_sensor is True; allowed: False"),
+    ((*EXPLORE, "--method", "paper", "--batch", "2"), "batch is 2; allowed: 1"),
+    ((*EXPLORE, "--nested-stop", "change"), "--nested-stop is 'change'; allowed: only with --method paper"),
+    ((*EXPLORE, "--method", "paper", "--levels", "x.csv"), "--levels is 'x.csv'; allowed: only with --method"),
+    ((*EXPLORE, "--method", "paper", "--model", "naive", "--arm", "nxt:x"), "--levels is 'none'; allowed: a recording"),
+    ((*EXPLORE, "--arm", "nowhere.py"), "nowhere.py: there is no such file"),
+    ((*EXPLORE, "--arm", "printer"), "--arm is 'printer'; allowed: simulated; emulator, "),
+    ((*OWN, "--geometry", "a.toml"), "--geometry is 'a.toml'; allowed: none with FILE.py"),
+    ((*OWN, "--truth", "600,260,90"), "--truth is '600,260,90'; allowed: none with a real arm"),
+]
+
+
+@pytest.mark.parametrize(("words", "says"), CONTRADICTIONS, ids=[" ".join(words) for words, _ in CONTRADICTIONS])
+def test_options_that_contradict_each_other_are_refused_before_any_work(
+    words, says, sensor_file, recording_file, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text("class Arm:\n    def measure(self, pose): 1 / 0\ndef connect(): return Arm()\n")
+    assert says in refused(capsys, tmp_path / "out", *words, "--out", "out")
 
 
 @pytest.mark.parametrize("value", ["9" * 30, "1" * 5000, "1e400", "nan", "-1", "0"], ids=lambda value: value[:6])
@@ -116,24 +181,6 @@ def test_no_warning_of_arithmetic_stands_beside_an_error(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("probewise arm: reach is 'nowhere on the field'")
 
 
-@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
-def test_a_recording_that_is_not_there_is_refused(verb, tmp_path, capsys):
-    said = refused(capsys, tmp_path / "out", verb, tmp_path / "nowhere.csv", "--out", tmp_path / "out")
-    assert "nowhere.csv" in said
-
-
-def test_too_few_live_points_are_refused_before_any_work(recording_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert "52 or more" in refused(capsys, out, "calibrate", recording_file, "--out", out, "--live", 51)
-
-
-def test_too_many_gaussians_are_blamed_on_the_option_that_asked_for_them(recording_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    said = refused(capsys, out, "calibrate", recording_file, "--out", out, "--orders", 1, 99)
-    assert "--orders is 99; allowed: up to 24 with --live 300" in said
-    assert "596 parameters, which take --live 1192" in said
-
-
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no /proc")
 @pytest.mark.parametrize("verb", ["calibrate", "diagnose", "audit"])
 def test_a_directory_that_nobody_can_write_to_is_refused_before_any_work(verb, recording_file, tmp_path, capsys):
@@ -157,80 +204,6 @@ def test_a_recording_without_contrast_cannot_be_calibrated(recording_file, tmp_p
     rows = [",".join([*line.split(",")[:at], "30", *line.split(",")[at + 1 :]]) for line in lines[1:]]
     recording_file.write_text("\n".join([lines[0], *rows]) + "\n")
     refused(capsys, tmp_path / "out", "calibrate", recording_file, "--out", tmp_path / "out")
-
-
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"format": "sensor/2"}', '{"format": "sensor/1"}', "\0\1"])
-@pytest.mark.parametrize("verb", ["predict", "explore", "diagnose"])
-def test_a_damaged_sensor_model_is_refused(verb, content, recording_file, tmp_path, capsys):
-    sensor, out = tmp_path / "damaged.json", tmp_path / "out"
-    sensor.write_text(content)
-    arguments = {
-        "predict": ["predict", sensor, recording_file, "--out", out],
-        "explore": ["explore", "--sensor", sensor, "--out", out],
-        "diagnose": ["diagnose", recording_file, "--sensor", sensor, "--out", out],
-    }[verb]
-    assert "damaged.json" in refused(capsys, out, *arguments)
-
-
-def test_a_sensor_model_with_a_field_missing_says_which(sensor_file, recording_file, tmp_path, capsys):
-    content = json.loads(sensor_file.read_text())
-    del content["noise"]
-    sensor_file.write_text(json.dumps(content))
-    said = refused(capsys, tmp_path / "o.csv", "predict", sensor_file, recording_file, "--out", tmp_path / "o.csv")
-    assert "noise" in said
-
-
-@pytest.mark.parametrize(
-    "option",
-    [
-        ("--truth", "1,2"),
-        ("--truth", "a,b,c"),
-        ("--truth", "spiral:1,2,3"),
-        ("--field", "10"),
-        ("--field", "-5,20"),
-        ("--shape", "spiral"),
-        ("--max-readings", "0"),
-        ("--seed", "-1"),
-        ("--seed", "x"),
-        ("--model", "perfect"),
-        ("--arm", "third"),
-        ("--utility", "spiral"),
-        ("--batch", "0"),
-        ("--batch", "2", "--utility", "entropy"),
-        ("--learn-sensor", "--model", "naive"),
-        ("--resume",),
-        ("--unheard-of",),
-    ],
-)
-def test_an_option_out_of_range_is_refused(option, sensor_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, *option)
-
-
-@pytest.mark.parametrize(
-    ("truth", "parameter", "value", "allowed"),
-    [
-        ("500,250,0", "radius_mm", "0.0", "20 to 150"),
-        ("500,250,-90", "radius_mm", "-90.0", "20 to 150"),
-        ("500,250,5000", "radius_mm", "5000.0", "20 to 150"),
-        ("500,nan,90", "y_mm", "nan", "0 to 520"),
-        ("inf,250,90", "x_mm", "inf", "0 to 1048"),
-        ("500,250,-inf", "radius_mm", "-inf", "20 to 150"),
-        ("1049,250,90", "x_mm", "1049.0", "0 to 1048"),
-        ("500,-1,90", "y_mm", "-1.0", "0 to 520"),
-        ("rectangle:500,250,100,0,0.3", "height_mm", "0.0", "40 to 300"),
-        ("rectangle:500,250,100,60,2", "angle_rad", "2.0", "0 to 1.5708"),
-        ("ellipse:500,250,90,120,0.3", "semi_minor_mm", "120.0", "20 to 90"),
-        ("ellipse:500,250,inf,inf,0.3", "semi_major_mm", "inf", "20 to 150"),
-    ],
-)
-def test_a_truth_that_cannot_lie_there_is_named_with_its_bounds_and_the_way_out(
-    truth, parameter, value, allowed, sensor_file, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    said = refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, "--truth", truth)
-    assert f"{parameter} of --truth {truth} is {value}; allowed: {allowed}," in said
-    assert "without --truth the seed draws one" in said
 
 
 @pytest.mark.parametrize("truth", ["0,0,20", "1048,520,150", "ellipse:500,250,90,90,0", "hexagon:500,250,30,0"])
@@ -270,18 +243,6 @@ def test_a_prediction_does_not_overwrite_its_plan(sensor_file, recording_file, t
         assert its.read_bytes() == before
 
 
-def test_a_run_that_stands_there_is_not_overwritten_by_a_new_one(sensor_file, tmp_path, capsys):
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / "journal.jsonl").write_text('{"format": "journal/1"}\n')
-    assert "--resume" in refused(capsys, out / "x", "explore", "--sensor", sensor_file, "--out", out)
-
-
-@pytest.mark.parametrize("arguments", [[], ["unheard-of"], ["calibrate"], ["predict", "only-one"]])
-def test_a_wrong_command_line_is_refused_in_one_line(arguments, tmp_path, capsys):
-    refused(capsys, tmp_path / "out", *arguments)
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -293,26 +254,14 @@ def test_a_wrong_command_line_is_refused_in_one_line(arguments, tmp_path, capsys
         (["calibrate", "a.csv", "b.csv", "--out", "o"], "arguments: b.csv (see probewise calibrate --help)"),
         (["arm", "jog", "base", "-5", "--dryrun"], "did you mean --dry-run?"),
         (["arm", "read", "--zzz"], "no option --zzz (see"),
+        ([], "required"),
+        (["unheard-of"], "is not one of"),
+        (["predict", "only-one"], "required"),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
 )
 def test_what_was_perhaps_meant_is_said(arguments, says, tmp_path, capsys):
     assert says in refused(capsys, tmp_path / "out", *arguments)
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "meant"),
-    [
-        ("--arm", "emulatr", "emulator"),
-        ("--arm", "ntx:/dev/rfcomm0", "nxt"),
-        ("--utility", "entorpy", "entropy"),
-        ("--truth", "cirle:600,260,90", "circle"),
-    ],
-)
-def test_a_misspelt_value_is_told_with_what_was_perhaps_meant(option, value, meant, sensor_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    said = refused(capsys, out, "explore", "--sensor", sensor_file, "--out", out, option, value, "--quiet")
-    assert f"did you mean {meant}?" in said
 
 
 def test_a_package_that_is_missing_is_named_and_not_the_address(tmp_path, monkeypatch, capsys):

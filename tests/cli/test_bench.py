@@ -85,14 +85,6 @@ def test_what_the_simulated_arm_records_is_what_its_sensor_predicts(sensor_file,
     assert chi_square == pytest.approx(1.0, abs=5 * np.sqrt(2 / len(plan)))
 
 
-@pytest.mark.parametrize("shipped", ["paper", "two_way"])
-def test_a_plan_that_ships_is_recorded_by_its_name(shipped, tmp_path, capsys):
-    out = tmp_path / "r.csv"
-    out.write_text("mine")
-    assert run("arm", "record", shipped, "--arm", "simulated", "--out", out) == 2
-    assert "the file exists already" in capsys.readouterr().err, "all that is found wrong"
-
-
 def test_the_emulated_arm_has_its_sensor_turned_and_patterns_laid(tmp_path):
     patterns = {"white": Uniform(1.0), "black": Uniform(0.0)}
     plan = Plan.from_arrays(

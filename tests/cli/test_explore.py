@@ -125,32 +125,6 @@ def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept
     assert "options.batch" not in said
 
 
-REFUSED = {
-    "no wrist": (("--orientations", "0,45", "--arm", "nxt:/dev/null"), "no joint of which turns its sensor"),
-    "one height": (
-        ("--heights", "10,14", "--arm", "nxt:/dev/null"),
-        "none with the LEGO arm but 14: it reads that many mm above",
-    ),
-    "a point sees no height": (("--heights", "10", "--model", "naive"), "which knows no height"),
-    "nor beside": (("--heights", "10", "--both-models"), "the naive model has no height"),
-    "into the table": (("--heights", "0,10"), "finite, greater than 0"),
-    "no angle": (("--orientations", "0,north"), "not a list of numbers"),
-    "no end": (("--orientations", "inf"), "not a list of numbers"),
-    "never": (("--repeats", "1,0"), "not a whole number from 1 to 1,000"),
-}
-
-
-@pytest.mark.usefixtures("at_14_mm")
-@pytest.mark.parametrize(("options", "why"), REFUSED.values(), ids=REFUSED)
-def test_what_an_arm_cannot_choose_is_refused_in_one_line(options, why, sensor_file, tmp_path, capsys):
-    out = tmp_path / "found"
-    assert main([str(word) for word in ("explore", "--sensor", sensor_file, "--out", out, *options)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert why in said
-    assert not out.exists()
-
-
 @pytest.mark.usefixtures("at_14_mm")
 def test_the_lego_arms_own_height_may_be_named(sensor_file, tmp_path):
     words = ("explore", "--sensor", sensor_file, "--out", tmp_path, "--heights", "14", "--arm", "nxt:/dev/null")
@@ -235,23 +209,6 @@ def test_a_known_card_lies_on_the_field_of_the_robot_and_of_the_world(explore, t
     assert len(lines) == 2
 
 
-@pytest.mark.parametrize(
-    "text", ["120,100,80,60", "a,100,80,60,1", "120,100,80,60,1.5", "5,5,80,60,1", "120,100,0,60,1"]
-)
-def test_a_card_that_cannot_lie_there_is_refused(text, sensor_file, tmp_path, capsys):
-    status = main(["explore", "--sensor", str(sensor_file), "--out", str(tmp_path / "o"), "--reference", text])
-    assert status == 2
-    assert "card" in (said := capsys.readouterr().err) or "--reference" in said
-    assert said.count("\n") == 1
-    assert not (tmp_path / "o").exists()
-
-
-def test_the_naive_model_knows_no_card(sensor_file, tmp_path, capsys):
-    options = ["--model", "naive", "--reference", "120,100,80,60,1"]
-    assert main(["explore", "--sensor", str(sensor_file), "--out", str(tmp_path / "o"), *options]) == 2
-    assert "--reference" in capsys.readouterr().err
-
-
 PAPER = ("--method", "paper", "--nested-stop", "remaining")
 
 
@@ -280,28 +237,6 @@ def test_the_papers_robot_goes_on_bit_for_bit_from_its_journal(explore, tmp_path
     assert status == 0
     assert resumed == whole
     assert whole[0]["likelihood"].startswith("Naive(mu_black=")
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (("--method", "paper", "--trust", "0.9"), "trust is 0.9; allowed: 1"),
-        (("--method", "paper", "--utility", "finishing"), "utility is 'finishing'; allowed: entropy"),
-        (("--method", "paper", "--learn-sensor"), "learn_sensor is True; allowed: False"),
-        (("--method", "paper", "--batch", "2"), "batch is 2; allowed: 1"),
-        (("--nested-stop", "change"), "--nested-stop is 'change'; allowed: only with --method paper"),
-        (("--levels", "x.csv"), "--levels is 'x.csv'; allowed: only with --method paper and --model naive"),
-        (("--method", "paper", "--levels", "x.csv"), "--levels is 'x.csv'; allowed: only with"),
-        (("--method", "paper", "--model", "naive", "--arm", "nxt:x"), "--levels is 'none'; allowed: a recording"),
-    ],
-)
-def test_what_does_not_go_with_a_method_is_refused_before_anything_is_written(
-    sensor_file, tmp_path, capsys, options, named
-):
-    out = tmp_path / "found"
-    assert main(["explore", "--sensor", str(sensor_file), "--out", str(out), *options]) == 2
-    assert named in capsys.readouterr().err
-    assert not out.exists()
 
 
 def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, capsys):

@@ -19,7 +19,6 @@ from probewise.cli import VERBS, main
 from probewise.diagnosis import audit_plan
 from probewise.effects import VOCABULARY
 from probewise.errors import ParameterError
-from probewise.scene import Circle, Field
 
 FEW = dict(list(VOCABULARY.items())[:3])
 
@@ -180,22 +179,6 @@ def test_an_arm_of_ones_own_is_entered_measured_with_and_left(sensor):
 
 
 @pytest.mark.parametrize(
-    ("shape", "truth", "name", "theta"),
-    [
-        ("circle", (500, 250, 90), "circle", [500, 250, 90]),
-        (["circle", "rectangle"], {"rectangle": [500, 250, 90, 60, 0.3]}, "rectangle", [500, 250, 90, 60, 0.3]),
-        (Circle(radius_mm=(50.0, 60.0)), (500, 250, 55), "circle", [500, 250, 55]),
-    ],
-)
-def test_what_is_hidden_is_the_truth_that_was_given(shape, truth, name, theta):
-    from probewise.experiment import HiddenShape, as_shape
-
-    field = Field()
-    hidden = HiddenShape.given_or_drawn(truth, as_shape(shape, field), field, rng=np.random.default_rng(0))
-    assert (hidden.name, hidden.theta.tolist()) == (name, theta)
-
-
-@pytest.mark.parametrize(
     ("truth", "message"),
     [
         ((500, 250), "truth is .*; allowed: 3 numbers, x_mm, y_mm, radius_mm"),
@@ -207,17 +190,6 @@ def test_what_is_hidden_is_the_truth_that_was_given(shape, truth, name, theta):
 def test_a_truth_that_cannot_be_is_named(sensor, truth, message):
     with pytest.raises(ParameterError, match=message):
         probewise.explore(sensor, truth=truth, rng=np.random.default_rng(0))
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
-def test_results_of_audit_and_predict_show_themselves(sensor, recording):
-    prediction = probewise.predict(sensor, recording)
-    assert "chi-square per reading" in prediction.summary()
-    for value in (prediction, probewise.predict(sensor, recording.plan)):
-        assert "data:image/png;base64" in value._repr_html_()
-    audit = audit_plan(recording.take(np.arange(10)), effects=FEW)
-    assert "data:image/png;base64" in audit._repr_html_()
 
 
 def test_an_audit_takes_the_noise_of_the_sensor_that_it_is_given(sensor, recording):
@@ -233,14 +205,6 @@ def test_the_reports_package_shows_what_people_use_and_loads_it_when_asked():
     assert said.split() == ["png", "False"]
     with pytest.raises(AttributeError, match="has no attribute 'heart'"):
         _ = probewise.report.heart
-
-
-@pytest.mark.slow
-def test_a_result_printed_is_its_summary(sensor, recording):
-    audit = probewise.audit(recording)
-    for result in (sensor, recording, audit, probewise.predict(sensor, recording)):
-        assert str(result) == result.summary()
-    assert str(recording).startswith("102 readings in LEGO, 102 usable")
 
 
 def test_the_verbs_take_a_table_and_a_simulator_too(tmp_path, sensor):

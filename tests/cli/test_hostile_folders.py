@@ -28,16 +28,6 @@ def contents(folder):
     return found
 
 
-def commit_list(text):
-    """Build what versions before the complete folder left behind."""
-
-    def build(out):
-        (out / ".writing").mkdir()
-        (out / ".writing" / "commit.json").write_bytes(text if isinstance(text, bytes) else text.encode())
-
-    return build
-
-
 def nested(out):
     """Folders in folders, 1,100 deep: too deep for a program that descends by calling itself."""
     at = out / ".complete"
@@ -74,15 +64,6 @@ def through_link(out):
 
 
 FOLDERS = {
-    "removes beside it": commit_list('{"names": [], "aside": {}, "remove": ["../outside/victim.txt"]}'),
-    "moves out of it": commit_list('{"names": ["../outside/victim.txt"], "aside": {}, "remove": []}'),
-    "renames out of it": commit_list('{"names": ["a"], "aside": {"a": "../outside/victim.txt"}, "remove": []}'),
-    "an absolute path": commit_list('{"names": [], "aside": {}, "remove": ["/etc/none"]}'),
-    "cut short": commit_list('{"names": 3'),
-    "a list": commit_list("[]"),
-    "not UTF-8": commit_list(b"\xff\xfe"),
-    "deep": commit_list("[" * 100_000),
-    "a NUL": commit_list('{"names": ["a\\u0000b"], "aside": {}, "remove": []}'),
     "staged in a link": linked(".writing"),
     "complete in a link": linked(".complete"),
     "a link among the complete": linked(".complete/d"),

@@ -70,28 +70,6 @@ def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
     assert (out / "rounds" / "1.csv").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("options", "way_out"),
-    [
-        (("--truth", "bcklash:1"), "did you mean backlash"),
-        (("--minutes", "-1"), "greater than 0"),
-        (("--readings", "0"), "from 1 to 100,000"),
-        (("--plan", "nowhere.csv"), "nowhere.csv"),
-    ],
-)
-def test_bad_input_is_told_in_one_line_and_nothing_is_written(few, tmp_path, capsys, options, way_out):
-    out = tmp_path / "out"
-    try:
-        status = run("investigate", "--plan", few, "--out", out, *options)
-    except SystemExit as ended:
-        status = ended.code
-    assert status == 2
-    said = capsys.readouterr().err
-    assert way_out in said
-    assert len(said.strip().splitlines()) == 1
-    assert not out.exists()
-
-
 @pytest.mark.slow
 def test_an_aliased_effect_is_settled_by_the_readings_that_are_asked_for(tmp_path):
     out = tmp_path / "out"
@@ -135,16 +113,6 @@ def test_an_instrument_of_ones_own_is_investigated_and_closed(few, tmp_path):
     assert closed.read_text() == "closed"
     assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
     assert "the world concealed" not in (out / "report.html").read_text()
-
-
-def test_what_hands_would_have_to_do_is_refused_before_anything_moves(tmp_path, capsys):
-    file, out = tmp_path / "edge.py", tmp_path / "out"
-    file.write_text("def connect():\n    raise RuntimeError('it moved')\n")
-    assert run("investigate", "--arm", file, "--plan", "paper", "--no-hands", "--out", out) == 2
-    assert "a plan over one pattern; paper has several" in capsys.readouterr().err
-    assert run("investigate", "--arm", file, "--plan", "paper", "--truth", "lag:1", "--out", out) == 2
-    assert "--truth" in capsys.readouterr().err
-    assert not out.exists()
 
 
 @pytest.mark.slow

@@ -120,39 +120,10 @@ def test_ctrl_c_closes_the_instrument_and_keeps_the_journal(arm_file, ten_bits, 
     assert closed() == 1
 
 
-REFUSED = {
-    "a file that is not there": (["--arm", "nowhere.py"], "nowhere.py: there is no such file"),
-    "another word": (
-        ["--arm", "printer"],
-        "--arm is 'printer'; allowed: simulated; emulator, .*; nxt:PORT .*; or FILE",
-    ),
-    "a geometry": (["--geometry", "a.toml"], "--geometry is 'a.toml'; allowed: none with FILE.py"),
-    "a truth": (["--truth", "600,260,90"], "--truth is '600,260,90'; allowed: none with a real arm"),
-    "the brick with ten bits": (["--arm", "emulator"], "--sensor is .*ten_bits.json'; allowed: one that reads in LEGO"),
-    "a turn": (
-        ["--orientations", "0,45"],
-        r"orientations_rad \(--orientations\) is .*; allowed: none with .*turns = True",
-    ),
-}
-
-
-@pytest.mark.parametrize(("more", "message"), REFUSED.values(), ids=REFUSED.keys())
-def test_what_does_not_go_with_an_instrument_of_ones_own_is_refused_and_nothing_written(
-    more, message, arm_file, ten_bits, tmp_path, capsys
-):
-    out = tmp_path / "out"
-    words = ["explore", "--sensor", ten_bits, "--out", out, "--quiet", "--arm", arm_file(), *more]
-    assert run(*words) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert re.search(message, error), error
-    assert not (out / "journal.jsonl").exists()
-
-
 def test_a_plan_is_recorded_in_the_instruments_own_unit_and_goes_on_when_it_was_cut(
     arm_file, tmp_path, capsys, monkeypatch, closed
 ):
-    monkeypatch.setattr("probewise.cli._record.prompter_for_answer", lambda arm: lambda text: "")
+    monkeypatch.setattr("probewise.cli._bench.prompter_for_answer", lambda arm: lambda text: "")
     plan = tmp_path / "plan.csv"
     write_plan(
         Plan.from_arrays(
@@ -202,16 +173,6 @@ def test_tasks_of_the_bench_that_need_the_lego_arm_say_so(words, message, arm_fi
     monkeypatch.chdir(tmp_path)
     assert run("arm", *words, "--arm", arm_file()) == 2
     assert re.search(message, capsys.readouterr().err)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("quick_frames")
-def test_the_emulator_is_an_arm_like_the_others(sensor_file, tmp_path):
-    out = tmp_path / "out"
-    words = ("explore", "--sensor", sensor_file, "--out", out, "--max-readings", 1, "--quiet", "--arm", "emulator")
-    assert run(*words) == 0
-    (reading,) = read_journal(out / "journal.jsonl").readings
-    assert reading.covariates["battery_mv"] > 6000
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 
 import probewise
 from probewise import _progress
-from probewise._progress import progress_or_bar, progress_shown
+from probewise._progress import progress_shown
 from probewise.cli._bench import prompter_for_answer
 from probewise.progress import silent
 from probewise.recordings import read_recording
@@ -108,15 +108,6 @@ def test_a_terminal_shows_the_stage_its_share_and_the_clock(hurried, monkeypatch
     assert "drawing the figures [00:00], slowly" in shown
 
 
-def test_what_ends_soon_shows_no_bar(monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(_progress.sys, "stderr", terminal)
-    with progress_shown(quiet=False) as progress:
-        for k in range(100):
-            progress("counting", k, 100)
-    assert not terminal.getvalue().strip()
-
-
 def test_a_quiet_command_says_nothing(hurried, capsys):
     with progress_shown(quiet=True) as progress:
         assert progress is silent
@@ -137,20 +128,6 @@ def test_nothing_beats_where_a_person_is_asked(hurried, capsys):
         assert capsys.readouterr().err == ""
         progress("readings", 1, 3)
     assert capsys.readouterr().err == "readings, 1 of 3 (0 s)\n"
-
-
-def test_from_python_nothing_is_written_where_nobody_looks(hurried, capsys):
-    with progress_or_bar(True) as progress:
-        assert progress is silent
-        time.sleep(0.05)
-    assert capsys.readouterr().err == ""
-
-
-def test_a_caller_may_be_told_instead():
-    told = []
-    with progress_or_bar(lambda *words, **more: told.append(words)) as progress:
-        progress("refitting effects", 3, 12)
-    assert told == [("refitting effects", 3, 12)]
 
 
 def test_reading_a_file_tells_of_its_rows(recording_file):

@@ -37,7 +37,7 @@ def plan(**changes):
 @pytest.fixture
 def record(tmp_path, monkeypatch):
     """Record a plan with an instrument of one's own, whose `measure` ends with `more`; return the exit status."""
-    monkeypatch.setattr("probewise.cli._record.prompter_for_answer", lambda arm: lambda text: "")
+    monkeypatch.setattr("probewise.cli._bench.prompter_for_answer", lambda arm: lambda text: "")
 
     def of(plan, *words, more="return 2.5"):
         (tmp_path / "plans").mkdir(exist_ok=True)  # an image is kept beside the plan and beside the recording

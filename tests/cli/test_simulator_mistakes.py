@@ -119,50 +119,49 @@ def test_a_mistake_in_the_table_is_one_line(capsys, tmp_path, table, said):
     assert said in refused(capsys, tmp_path, FILE, table=table)
 
 
-@pytest.mark.parametrize("start", ["None", "float('nan')", "[20.0, 21.0]"])
-def test_a_state_that_starts_at_no_number_is_refused_by_name(capsys, tmp_path, start):
-    law = FILE.partition("def simulate")[0] + (
-        f'states = {{"temp_c": {start}}}\n\ndef rates(s, p, u):\n    return {{"temp_c": -s["temp_c"]}}\n'
-    )
-    assert "states['temp_c'] is " in refused(capsys, tmp_path, law)
+HEADER = FILE.partition("def simulate")[0]
+LAWS = {
+    **{
+        f"a state that starts at {start}": (
+            f'{HEADER}states = {{"temp_c": {start}}}\n\ndef rates(s, p, u):\n    return {{"temp_c": -s["temp_c"]}}\n',
+            "states['temp_c'] is ",
+        )
+        for start in ("None", "float('nan')", "[20.0, 21.0]")
+    },
+    "another state": (
+        law_whose_rates('return {"temp_c": p["gain"] * s["heat"]}'), "line 12: rates raises KeyError: 'heat'",
+    ),
+    "a rate by another name": (
+        law_whose_rates('return {"temp": -s["temp_c"]}'), "a rate for each state, under its name: temp_c",
+    ),
+    "a list of rates": (law_whose_rates('return [-s["temp_c"]]'), "rates returns a list or a tuple; allowed: a dict"),
+    "an error": (law_whose_rates('raise ValueError("too hot")'), "line 12: rates raises ValueError: too hot"),
+    "a sine of one number": (
+        "import math\n" + law_whose_rates('return {"temp_c": -math.sin(s["temp_c"])}'),
+        "allowed: np.sin(x) in place of math.sin(x)",
+    ),
+    "an if": (
+        law_whose_rates('return {"temp_c": -1.0 if s["temp_c"] > 0 else 1.0}'),
+        "allowed: np.where(condition, a, b) in place of if",
+    ),
+    "another reading": (
+        f'{HEADER}states = {{"warm": 0.0}}\ndef rates(s, p, u):\n    return {{"warm": -s["warm"] / p["tau_s"]}}\n'
+        'def observe(s, p, u):\n    return s["hot"]\n',
+        "line 13: observe raises KeyError: 'hot'; allowed: columns",
+    ),
+    "readings of another shape": (
+        law_whose_rates('return {"temp_c": -s["temp_c"]}') + "\n\ndef observe(s, p, u):\n    return np.ones(3)\n",
+        "observe returns an array of shape (3,); allowed: (",
+    ),
+}  # fmt: skip
 
 
-def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path):
-    said = refused(capsys, tmp_path, law_whose_rates('return {"temp_c": p["gain"] * s["heat"]}'))
-    assert "heater.py, line 12: rates raises KeyError: 'heat'" in said
-    assert "states temp_c" in said
-
-
-def test_a_rate_under_another_name_than_its_state_is_told(capsys, tmp_path):
-    said = refused(capsys, tmp_path, law_whose_rates('return {"temp": -s["temp_c"]}'))
-    assert "rates returns no 'temp_c'; allowed: a dict with a rate for each state, under its name: temp_c" in said
-
-
-@pytest.mark.parametrize(
-    ("body", "said"),
-    [
-        ('return [-s["temp_c"]]', "rates returns a list or a tuple; allowed: a dict with a rate for each state"),
-        ('return {"temp_c": -math.sin(s["temp_c"])}', "line 13: rates raises TypeError"),
-        ('return {"temp_c": -math.sin(s["temp_c"])}', "allowed: np.sin(x) in place of math.sin(x)"),
-        ('return {"temp_c": -1.0 if s["temp_c"] > 0 else 1.0}', "allowed: np.where(condition, a, b) in place of if"),
-    ],
-)
-def test_a_law_written_for_one_number_is_told_how_arrays_are_written(capsys, tmp_path, body, said):
-    """Also where a column of the table is text, such as the names of the runs: they are not to blame."""
-    table = "\n".join(
-        ",".join(["note" if k == 0 else "a", *line.split(",")])
-        for k, line in enumerate(run_table_csv(runs()).splitlines())
-    )
-    assert said in refused(capsys, tmp_path, "import math\n" + law_whose_rates(body), table=table + "\n")
-
-
-def test_a_mistake_in_observe_is_told_of_observe(capsys, tmp_path):
-    law = FILE.partition("def simulate")[0] + (
-        'states = {"warm": 0.0}\ndef rates(s, p, u):\n    return {"warm": -s["warm"] / p["tau_s"]}\n'
-        'def observe(s, p, u):\n    return s["hot"]\n'
-    )
-    said = refused(capsys, tmp_path, law)
-    assert "line 13: observe raises KeyError: 'hot'; allowed: columns" in said
+@pytest.mark.parametrize(("law", "said"), LAWS.values(), ids=LAWS)
+def test_a_mistake_in_a_law_is_one_line(capsys, tmp_path, law, said):
+    """Also where a column of the table is text, such as a note."""
+    header, *rows = run_table_csv(runs()).splitlines()
+    table = "\n".join([f"note,{header}", *(f"a,{row}" for row in rows)]) + "\n"
+    assert said in refused(capsys, tmp_path, law, table=table)
 
 
 def test_a_sensor_beside_a_simulator_is_refused(capsys, tmp_path):
@@ -185,16 +184,6 @@ def test_a_table_given_twice_is_refused(capsys, tmp_path):
 def test_a_mistake_in_a_further_table_is_told_with_its_file_and_row(capsys, tmp_path, text, said):
     (tmp_path / "more.csv").write_text(text)
     assert said in refused(capsys, tmp_path, FILE, more=(str(tmp_path / "more.csv"),))
-
-
-def test_an_error_of_a_rate_is_answered_by_what_a_rate_is(capsys, tmp_path):
-    said = refused(capsys, tmp_path, law_whose_rates('raise ValueError("too hot")'))
-    assert "rates raises ValueError: too hot; allowed: a function that returns a rate for each state" in said
-
-
-def test_readings_of_a_law_that_have_another_shape_are_told_of_observe(capsys, tmp_path):
-    law = law_whose_rates('return {"temp_c": -s["temp_c"]}') + "\n\ndef observe(s, p, u):\n    return np.ones(3)\n"
-    assert "observe returns an array of shape (3,); allowed: (" in refused(capsys, tmp_path, law)
 
 
 def test_a_journal_is_refused(capsys, tmp_path):

@@ -66,14 +66,6 @@ def test_signals_within_a_second_are_one_request_and_a_later_one_forces(monkeypa
             signal.raise_signal(signal.SIGINT)
 
 
-def test_a_signal_whose_exception_is_swallowed_is_raised_again():
-    with stoppable():
-        with pytest.raises(Stopped):
-            signal.raise_signal(signal.SIGTERM)
-        with pytest.raises(Stopped):
-            raise_if_stopped()
-
-
 @pytest.mark.parametrize("echo", [ValueError("Invalid affine transformation matrix"), OSError(5, "closed"), KeyError()])
 def test_whatever_a_signal_is_turned_into_is_the_stop(echo):
     def turned():
@@ -216,18 +208,6 @@ def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
     assert main(command(sensor_file, out)) == 128 + signal.SIGTERM
     assert "keeps 1 reading; go on with" in capsys.readouterr().err
     assert sorted(p.name for p in out.iterdir()) == [".journal.jsonl.lock", "journal.jsonl"]
-
-
-@pytest.mark.slow
-def test_what_the_journal_holds_is_counted_not_what_this_command_took(
-    sensor_file, tmp_path, quick_frames, monkeypatch, capsys
-):
-    """Stopped while it replays the first of two readings, it keeps both."""
-    out = tmp_path / "out"
-    assert main(command(sensor_file, out, "--max-readings", 2)) == 0
-    monkeypatch.setattr(exploration, "robot_view_png", lambda *_, **__: signal.raise_signal(signal.SIGINT))
-    assert main(command(sensor_file, out, "--max-readings", 2, "--resume")) == 130
-    assert "keeps 2 readings" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -47,21 +47,6 @@ def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, 
 
 
 @pytest.mark.slow
-def test_a_run_that_was_cut_goes_on_to_the_same_readings(sensor_file, tmp_path, quick_frames):
-    options = ("--sensor", sensor_file, "--truth", "500,250,90", "--quiet", "--seed", 3)
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert run("explore", *options, "--out", whole, "--max-readings", 3) == 0
-    assert run("explore", *options, "--out", cut, "--max-readings", 2) == 0
-    assert run("explore", *options, "--out", cut, "--max-readings", 3, "--resume") == 0
-    lines = [(folder / "journal.jsonl").read_text().splitlines() for folder in (whole, cut)]
-    assert [json.loads(line)["reading"] for line in lines[0][1:]] == [
-        json.loads(line)["reading"] for line in lines[1][1:]
-    ]
-    assert (cut / "report.html").read_text().startswith("<!doctype html>")
-    assert (cut / "run.gif").read_bytes().startswith(b"GIF")
-
-
-@pytest.mark.slow
 def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quick_frames):
     """The page loads itself anew until the run is over; it is opened once."""
     pages, opened = [], []
@@ -100,7 +85,7 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
 @pytest.mark.parametrize(
     ("option", "quick"), [((), True), (("--method", "full"), False), (("--method", "quick"), True)]
 )
-def test_a_calibration_is_quick_unless_asked_otherwise(option, quick, recording_file, tmp_path, monkeypatch):
+def test_a_calibration_is_quick_unless_asked_otherwise(option, quick, recording_file, tmp_path, monkeypatch, capsys):
     asked = []
 
     def stop(*_, **options):
@@ -110,14 +95,6 @@ def test_a_calibration_is_quick_unless_asked_otherwise(option, quick, recording_
     monkeypatch.setattr("probewise.calibration.calibrate", stop)
     assert run("calibrate", recording_file, "--out", tmp_path / "out", *option) == 130
     assert asked == [quick]
-
-
-def test_a_calibration_that_is_stopped_writes_nothing(recording_file, tmp_path, monkeypatch, capsys):
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("probewise.calibration.calibrate", stop)
-    assert run("calibrate", recording_file, "--out", tmp_path / "out") == 130
     assert "nothing was written" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

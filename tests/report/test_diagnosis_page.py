@@ -16,10 +16,9 @@ from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan
 from probewise.report import covariates
 from probewise.report import diagnosis as page
 from probewise.report.covariates import axis_label, category_name_by_value, covariate_values, is_scan_along_line
-from probewise.report.diagnosis_figures import noun_of_held_out_part, rows_of_scan_changed_most
+from probewise.report.diagnosis_figures import rows_of_scan_changed_most
 from probewise.report.plots import heldout_gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
-from probewise.report.words import typeset_numbers
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 
@@ -37,14 +36,18 @@ def saturated():
     return diagnose(Recording(plan, readings), rng=np.random.default_rng(1))
 
 
-def drawn_figures(diagnosis):
-    return {name: draw() for name, draw in page.figure_drawers(diagnosis).items()}
+@pytest.fixture(scope="module")
+def drawn(saturated):
+    return {name: draw() for name, draw in page.figure_drawers(saturated).items()}
 
 
 @pytest.mark.slow
-def test_the_page_says_what_is_missing_and_what_to_do(saturated):
-    drawn = drawn_figures(saturated)
+def test_the_page_says_what_is_missing_and_what_to_do(saturated, drawn):
     assert {place.figure_name for place in saturated.where} <= set(drawn)
+    for name, image in drawn.items():
+        assert name.endswith(".svg")
+        assert ElementTree.fromstring(image).tag.endswith("svg")
+        assert b"nan" not in image
     audit = audit_plan_of_diagnosis(saturated)
     html = page.page_html(saturated, drawn, source="some.csv", seed=1, audit=audit)
     screen, rest = html.split("<h2>", 1)
@@ -69,44 +72,33 @@ def test_every_place_has_its_covariate_row_by_row(saturated):
 
 
 @pytest.mark.slow
-def test_every_figure_is_svg_that_a_browser_can_read(saturated):
-    for name, image in drawn_figures(saturated).items():
-        assert name.endswith(".svg")
-        root = ElementTree.fromstring(image)
-        assert root.tag.endswith("svg")
-        assert b"nan" not in image
-
-
-@pytest.mark.slow
 def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     """Its mean says nothing where the residual changes its sign within the scan."""
     plan, usable = saturated.recording.plan, saturated.recording.usable
     scan, by_row = plan.scan_names[0], plan.scan[usable].astype(float)
     changed = {"covariate": "scan", "scan": scan, "start": None, "end": None, "values": by_row}
     place = dataclasses.replace(saturated.where[0], **changed, without_effect=False)
-    drawn = drawn_figures(dataclasses.replace(saturated, where=(place,)))
-    shown = drawn[place.figure_name].decode()
+    shown = page.figure_drawers(dataclasses.replace(saturated, where=(place,)))[place.figure_name]().decode()
     assert shown.count("<!-- one reading -->") == 2
     assert f"(mm), scan {scan}" in shown
 
 
 @pytest.mark.slow
-def test_scans_that_an_effect_is_bound_to_are_named(saturated):
+def test_scans_that_an_effect_is_bound_to_are_named(saturated, drawn):
     bound = ParameterFound("scans", "scan", 5.5, 1.1, (4.0, 7.0))
     effect = dataclasses.replace(
         saturated.effects[0], probability=0.9, parameters=(bound,), scans=("edge_90_out", "edge_90_back")
     )
     report = dataclasses.replace(saturated.report, effects=(effect,))
     found = dataclasses.replace(saturated, report=report)
-    html = page.page_html(found, drawn_figures(found), source="some.csv", seed=1)
+    html = page.page_html(found, drawn, source="some.csv", seed=1)
     assert "edge_90_out, edge_90_back" in html
     assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]
 
 
-def test_numbers_are_written_as_people_write_them():
-    assert (
-        typeset_numbers("(p = 2.2e-07) -0.3 mm in edge-90") == "(p\u00a0=\u00a02.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
-    )
+def test_a_repair_that_does_not_predict_is_said_not_to():
+    assert page._heldout_gain_in_words(-1.0, 0.1).startswith("Worse than before")
+    assert page._heldout_gain_in_words(0.1, 0.1).startswith("No better than before")
 
 
 def test_labels_carry_units():
@@ -136,14 +128,6 @@ def test_a_window_is_a_step_of_its_own():
     assert np.all(np.delete(means.before, own) == 0.0)
 
 
-def test_readings_that_share_a_few_values_still_make_steps():
-    """Sixty readings at one level and nine above it would be two steps of one width."""
-    x = np.concatenate([np.linspace(10.0, 10.1, 60), np.linspace(20.0, 60.0, 9)])
-    means = mean_residuals(x, 0 * x, None, sd=1.0)
-    assert len(means.at) > 6
-    assert means.size.sum() == 69
-
-
 @pytest.mark.slow
 def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
     """A straight line fitted to noise: what it absorbs, by its posterior samples, makes the band narrower."""
@@ -170,27 +154,11 @@ def test_noise_that_remembers_widens_the_band():
     np.testing.assert_allclose(lasting.chance / plain.chance, np.sqrt(1.6 / 0.4), rtol=0.02)
 
 
-def test_values_without_a_scale_are_a_step_each():
-    way = np.repeat([-1.0, 1.0], 30)
-    means = mean_residuals(way, way, 0 * way, sd=1.0, names={-1.0: "back", 1.0: "forth"})
-    np.testing.assert_allclose(means.at, [0.0, 1.0])
-    np.testing.assert_allclose(means.before, [-1.0, 1.0])
-    np.testing.assert_allclose(means.after, [0.0, 0.0])
-
-
 def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
     ax = heldout_gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
     lengths = [bar.get_width() for bar in ax.containers[0]]
     np.testing.assert_allclose(lengths, [*range(39, 33, -1), *range(5, -1, -1)])
     assert ax.get_yticklabels()[0].get_text() == "scan 39"
-
-
-@pytest.mark.slow
-def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
-    worse = dataclasses.replace(saturated.improvement, heldout_log_density_per_reading=-1.0, heldout_sd=0.1)
-    found = dataclasses.replace(saturated, repair=dataclasses.replace(saturated.repair, improvement=worse))
-    drawn = {**drawn_figures(saturated), "gain.svg": b"<svg"}
-    assert "Worse than before" in page.page_html(found, drawn, source="some.csv", seed=1)
 
 
 def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
@@ -262,26 +230,6 @@ def test_the_page_of_a_long_recording_counts_the_readings_that_were_diagnosed():
     readings = np.append(np.full(4999, 7.0), np.nan)
     recording = Recording.from_arrays(x_mm=np.arange(5000), y_mm=0, readings=readings, patterns=Uniform(0.5), unit="V")
     assert page._n_readings_used(SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())) < 2600
-
-
-def test_a_held_out_part_is_called_a_run_only_if_it_is_one():
-    def called(*held):
-        gain = SimpleNamespace(heldout_by_scan=[(name, 0.1) for name in held])
-        plan, words = SimpleNamespace(scan_names=("all", "b")), SimpleNamespace(run="run")
-        recording, apparatus = SimpleNamespace(plan=plan), SimpleNamespace(words=words)
-        return noun_of_held_out_part(SimpleNamespace(improvement=gain, recording=recording, apparatus=apparatus))
-
-    assert called("all", "b") == "run"
-    assert called("part 1 of 5", "part 2 of 5") == "part"
-
-
-@pytest.mark.parametrize(
-    ("settled", "said"),
-    [(True, "Nothing more is needed."), (False, "No readings that can be taken here would settle what is open.")],
-)
-def test_where_no_readings_are_advised_the_page_says_why(settled, said):
-    report, judged = SimpleNamespace(is_settled=settled), SimpleNamespace(too_little=False)
-    assert page._next_readings_in_words(SimpleNamespace(next_measurement=None, report=report, judged=judged)) == said
 
 
 def test_explanations_that_the_next_readings_leave_together_are_told_as_one():

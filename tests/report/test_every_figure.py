@@ -139,7 +139,6 @@ FIGURES = {
 def test_every_plot_function_is_here():
     others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "draw_field_legend", "grid_of_axes", "png", "stack_of_axes", "svg"}
     of_a_diagnosis = {  # laid out by `svg`, and drawn by the tests of its pages
-        "readings_before_and_after_repair",
         "residual_autocorrelation",
         "heldout_gain_by_scan",
         "readings_modulo_step",

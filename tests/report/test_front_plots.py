@@ -5,7 +5,7 @@ import pytest
 from matplotlib.patches import Circle, Rectangle
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.errors import ParameterError, ReachError
+from probewise.errors import ParameterError
 from probewise.recordings import Recording, read_recording, shipped, two_way_plan
 from probewise.report import plots
 from probewise.report.plots.apparatus import draw_sensor_face
@@ -27,11 +27,6 @@ def test_the_arm_is_drawn_with_its_sensor_at_the_height_at_which_it_reads(geomet
     assert lowest == pytest.approx(geometry.read_height_mm)
     ends = np.array([line.get_xydata()[-1] for line in above.lines])
     assert (ends == [380.0, 170.0]).all(axis=1).any()
-
-
-def test_a_place_out_of_reach_is_refused(geometry):
-    with pytest.raises(ReachError, match="place_mm"):
-        plots.arm_and_sensor(geometry, (5000.0, 0.0))
 
 
 @pytest.mark.parametrize(("turned_deg", "photodiode"), [(0, (0, 1)), (90, (-1, 0)), (180, (0, -1)), (270, (1, 0))])
@@ -82,23 +77,6 @@ def test_scans_that_the_repair_changes_are_drawn_on_the_same_axes():
     shown = [ax for ax in axes.flat if ax.get_visible()]
     assert [ax.get_title(loc="left")[:4] for ax in shown] == ["edge"] * 8
     assert len({ax.get_ylim() for ax in shown}) == 1
-
-
-def test_one_scan_is_drawn_about_where_the_two_models_differ():
-    recording, before, after = two_models()
-    rows = np.flatnonzero(recording.plan.scan == 0)
-    above, below = plots.readings_before_and_after_repair(recording, rows, before, after)[:, 0]
-    low, high = below.get_xlim()
-    assert -50 < low < -6 < 6 < high < 50
-    assert sum(len(line.get_xdata()) for line in above.lines if line.get_label() == "recorded") == len(rows)
-    means = [line for line in below.lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 2]
-    assert min(means[0].get_ydata()) < -1.5
-    assert not means[1].get_ydata().any()
-
-
-def test_readings_that_lie_on_no_line_have_no_curve(recording):
-    with pytest.raises(ParameterError, match="three places"):
-        plots.readings_before_and_after_repair(recording, np.arange(404, 408), recording.readings, recording.readings)
 
 
 @pytest.mark.parametrize("lego_scale", [False, True])

@@ -18,21 +18,9 @@ PLAN = SimpleNamespace(instrumentation=Instrumentation())
 
 
 def found(
-    verdict,
-    combination=(),
-    *,
-    p_value=1e-9,
-    after=0.5,
-    rivals=(),
-    shares=None,
-    n=408,
-    few=False,
-    beside=(),
-    withdrawn=False,
-    shared=(),
-    leader=(),
-    open_beside=(),
-):
+    verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares=None, n=408, few=False, beside=(),
+    withdrawn=False, shared=(), leader=(), open_beside=(),
+):  # fmt: skip
     named = [EffectFound(name, 0.9, 20.0 - k, "", ()) for k, name in enumerate((*combination, *beside))]
     stated = [Hypothesis(tuple(names), 0.9 / max(len(rivals), 1)) for names in rivals]
     return SimpleNamespace(
@@ -91,75 +79,58 @@ def test_every_effect_has_words_of_its_own():
     assert len(set(EFFECTS_IN_WORDS.values())) == len(EFFECTS_IN_WORDS)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_one_effect_alone_is_said_in_full(name):
-    assert headline(found("named", (name,))) == f"The model leaves out {effect_in_words(name)}."
+SLOW = "a sensor that follows slowly"
+MISSING = "Something is missing"
+SAID = [
+    (found("named", ("upper_tank_overflow",)), "The model leaves out upper tank overflow."),
+    (found("named", ("flicker", "backlash")), "The model leaves out a flickering lamp and backlash (play) of the arm."),
+    (
+        found("cannot_tell", ("lag",), rivals=(("lag", "outliers"), ("backlash", "outliers"))),
+        f"{MISSING}: {SLOW} or backlash (play) of the arm; these readings cannot tell which.",
+    ),
+    (
+        found("named", ("lag",), shared=("lag",), leader=("lag", "outliers"),
+              open_beside=[(("outliers",), 0.5), (("glint",), 0.5)]),
+        f"The model leaves out {SLOW}; besides, outlying readings or a glint at one place.",
+    ),
+    (
+        found("cannot_tell", ("lag", "outliers"), rivals=[("lag", "outliers"), ("backlash", "outliers")],
+              shared=("outliers",)),
+        f"Beside outlying readings, something is missing: {SLOW} or backlash (play) of the arm.",
+    ),
+    (
+        found("cannot_tell", rivals=((), ("lag",))),
+        f"These readings cannot tell whether anything is missing; if so, most likely {SLOW}.",
+    ),
+    (
+        found("cannot_tell", rivals=(("lag",),), withdrawn=True),
+        f"{MISSING}; {SLOW} fits best, but predicts new readings worse.",
+    ),
+    (found("cannot_tell", rivals=(("lag",),)), f"{MISSING}, but these readings cannot tell what."),
+    (
+        found("unknown", ("unknown",), shares={"formula:reading:y:x^2, x beyond 3": 1.0}),
+        f"{MISSING} that no known effect explains; it looks most like a term x^2, x beyond 3 in y.",
+    ),
+    (
+        found("cannot_tell", ("hysteresis",), rivals=[("hysteresis",), ("lag",)]),
+        f"{MISSING}, most likely an offset that depends on the direction; these readings cannot tell.",
+    ),
+    (
+        found("cannot_tell", rivals=[(name,) for name in NAMES[:12]]),
+        f"{MISSING}, but these readings cannot tell what.",
+    ),
+    (found("named", ("lag",), after=1e-5), f"The model leaves out {SLOW}. Something more is missing."),
+    (
+        found("named", ("cubic:velocity:angle", "lag", "outliers"), after=1e-5),
+        "The model leaves out 3 effects, the largest of them a cubic term of angle in the rate of velocity.",
+    ),
+    *((found("named", (name,)), f"The model leaves out {effect_in_words(name)}.") for name in NAMES),
+]  # fmt: skip
 
 
-def test_an_effect_of_a_users_own_goes_by_its_name():
-    assert headline(found("named", ("upper_tank_overflow",))) == "The model leaves out upper tank overflow."
-
-
-def test_the_largest_effect_comes_first():
-    said = headline(found("named", ("flicker", "backlash")))
-    assert said == "The model leaves out a flickering lamp and backlash (play) of the arm."
-
-
-def test_rivals_are_told_by_what_they_do_not_share():
-    said = headline(found("cannot_tell", ("lag",), rivals=(("lag", "outliers"), ("backlash", "outliers"))))
-    assert "outlying" not in said
-    assert "a sensor that follows slowly or backlash" in said
-
-
-def test_what_all_rivals_share_is_named_and_what_is_open_beside_it_is_said():
-    open_beside = [(("outliers",), 0.5), (("glint",), 0.5)]
-    said = headline(found("named", ("lag",), shared=("lag",), leader=("lag", "outliers"), open_beside=open_beside))
-    assert (
-        said == "The model leaves out a sensor that follows slowly; besides, outlying readings or a glint at one place."
-    )
-    rivals = [("lag", "outliers"), ("backlash", "outliers")]
-    said = headline(found("cannot_tell", rivals[0], rivals=rivals, shared=("outliers",)))
-    assert said.startswith("Beside outlying readings, something is missing: a sensor that follows slowly or")
-
-
-def test_nothing_is_no_rival_of_something_missing():
-    said = headline(found("cannot_tell", rivals=((), ("lag",))))
-    assert (
-        said
-        == "These readings cannot tell whether anything is missing; if so, most likely a sensor that follows slowly."
-    )
-
-
-def test_only_of_an_effect_that_was_withdrawn_it_is_said_that_it_predicts_worse():
-    said = headline(found("cannot_tell", rivals=(("lag",),), withdrawn=True))
-    assert said.endswith("a sensor that follows slowly fits best, but predicts new readings worse.")
-    said = headline(found("cannot_tell", rivals=(("lag",),)))
-    assert said == "Something is missing, but these readings cannot tell what."
-
-
-def test_a_formula_is_no_covariate():
-    said = headline(found("unknown", ("unknown",), shares={"formula:reading:y:x^2, x beyond 3": 1.0}))
-    assert said == "Something is missing that no known effect explains; it looks most like a term x^2, x beyond 3 in y."
-
-
-def test_the_likeliest_of_rivals_too_long_to_be_listed_is_named():
-    rivals = [("hysteresis",), ("lag",)]
-    said = headline(found("cannot_tell", rivals[0], rivals=rivals))
-    assert said.startswith("Something is missing, most likely an offset that depends on the direction;")
-
-
-def test_many_rivals_of_which_none_is_probable_are_not_named():
-    said = headline(found("cannot_tell", rivals=[(name,) for name in NAMES[:12]]))
-    assert said == "Something is missing, but these readings cannot tell what."
-
-
-def test_what_is_missing_after_the_repair_is_said():
-    assert headline(found("named", ("lag",), after=1e-5)).endswith("Something more is missing.")
-
-
-def test_the_largest_effect_is_named_rather_than_that_more_is_missing():
-    said = headline(found("named", ("cubic:velocity:angle", "lag", "outliers"), after=1e-5))
-    assert said == "The model leaves out 3 effects, the largest of them a cubic term of angle in the rate of velocity."
+@pytest.mark.parametrize(("diagnosis", "said"), SAID, ids=[f"{k}-{d.verdict}" for k, (d, _) in enumerate(SAID)])
+def test_the_verdict_is_said_in_words(diagnosis, said):
+    assert headline(diagnosis) == said
 
 
 def test_equal_readings_are_no_signal():

@@ -70,12 +70,6 @@ def test_a_page_needs_nothing_from_outside():
     assert 'name="viewport"' in made
 
 
-def test_the_answer_and_its_picture_come_before_everything_else():
-    made = page("t", answer="the answer", key_figure=figure(PNG, "key"), sections=[Section("later", ())])
-    body = made[made.index("<body>") :]
-    assert body.index("the answer") < body.index("<img") < body.index("later")
-
-
 def test_markup_is_not_escaped_twice():
     assert fragment(Markup("<b>x</b>"), "<") == "<b>x</b>&lt;"
     assert element("td", "a", class_="number") == '<td class="number">a</td>'

@@ -9,10 +9,10 @@ from scipy.integrate import trapezoid
 from scipy.stats import binom
 
 from probewise.errors import ParameterError
-from probewise.nested import NestedResult, merge, run
+from probewise.nested import NestedResult, run
 from probewise.priors import Empty, Product, Uniform
 from probewise.report import plots
-from probewise.report.plots.nested import _centres_and_smoothed_density, _new_points_per_bar, _parameter_label
+from probewise.report.plots.nested import _centres_and_smoothed_density, _new_points_per_bar
 
 
 class Bell:
@@ -86,12 +86,6 @@ def test_a_trace_shows_every_dead_point_against_the_volume_left(result):
     assert plots.png(axes, dpi=30).startswith(b"\x89PNG")
 
 
-def test_a_long_trace_is_thinned():
-    axes = plots.trace_plot(synthetic(1, n=9000))
-    (dots,) = (c for c in axes[1, 0].collections if isinstance(c, PathCollection))
-    assert len(dots.get_offsets()) <= 4000
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("n_params", [1, 2, 10])
 def test_a_corner_has_each_parameter_and_each_pair(n_params):
@@ -136,15 +130,6 @@ def test_a_parameter_that_does_not_vary_is_drawn_too(result):
     assert plots.png(plots.trace_plot(still), dpi=30).startswith(b"\x89PNG")
 
 
-def test_names_become_labels_with_units():
-    assert _parameter_label("x_mm") == "x (mm)"
-    assert _parameter_label("semi_major_mm") == "semi major (mm)"
-    assert _parameter_label("gain_drift.tau_s") == "gain drift tau (s)"
-    assert _parameter_label("a_1") == "$a_{1}$"
-    assert _parameter_label("I_max") == r"$I_\mathrm{max}$"
-    assert _parameter_label("saturation.level") == "saturation level"
-
-
 def test_a_flat_posterior_stays_flat_up_to_the_priors_edge():
     values = (np.arange(8000) + 0.5) / 8000
     _, density = _centres_and_smoothed_density(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
@@ -174,34 +159,9 @@ def test_ranks_are_spread_over_their_share_of_the_axis():
     assert _new_points_per_bar(np.array([1]), np.array([2]), edges) == pytest.approx([0.5, 0.5])
 
 
-def test_ranks_outside_the_band_are_marked_and_none_are_said(result):
-    lowest_missing = dataclasses.replace(result, insertion_rank=np.maximum(result.insertion_rank, 15))
-    bars = [p for p in plots.insertion_plot(lowest_missing).patches if p.get_width() < 0.5]
-    colours = [p.get_facecolor() for p in bars]
-    assert len(set(colours)) == 2
-    assert colours[0] != colours[-1]
-    empty = np.empty(0, dtype=np.int64)
-    none = dataclasses.replace(result, insertion_rank=empty, insertion_n_ranked=empty)
-    assert plots.insertion_plot(none).texts[0].get_text() == "no point was inserted"
-
-
 def test_the_course_of_a_run_ends_at_its_evidence(result):
     axes = plots.run_plot(result)
     assert [ax.get_ylabel() for ax in axes[:, 0]] == ["ln likelihood", "posterior per nat", "live points", "ln Z"]
     assert axes[3, 0].lines[0].get_ydata()[-1] == pytest.approx(result.log_z)
     assert axes[2, 0].lines[0].get_ydata().max() == 100
     assert any(isinstance(c, PolyCollection) for c in axes[1, 0].collections)
-
-
-def test_merged_runs_are_drawn_as_one():
-    rngs = np.random.default_rng(5).spawn(3)
-    merged = merge([run(Bell("x_mm"), rng=rng, n_live=40) for rng in rngs[1:]], rng=rngs[0])
-    assert plots.run_plot(merged)[2, 0].lines[0].get_ydata().max() == 80
-    assert plots.insertion_plot(merged).get_title(loc="left").startswith(f"{merged.insertion_rank.size} new points")
-
-
-@pytest.mark.slow
-def test_a_notebook_shows_no_more_than_six_parameters():
-    shown = synthetic(9)._repr_html_()
-    assert "of the first 6 of 9 parameters" in shown
-    assert "effective sample size 600" in shown

@@ -1,16 +1,13 @@
 """Results show themselves in a notebook, with a picture."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from probewise import _display
 from probewise._display import ShowsItself, render_html
-from probewise.calibration import calibrate
 from probewise.nested import run
 from probewise.priors import Product, Uniform
-from probewise.recordings import Recording, paper_plan, read_recording, shipped
+from probewise.recordings import Recording, paper_plan
 from probewise.sensor import SSFField
 
 
@@ -19,21 +16,6 @@ class Bell:
 
     def log_likelihood(self, theta):
         return -0.5 * (theta**2).sum(axis=1)
-
-
-def small_calibration():
-    recording = read_recording(shipped("paper"))
-    few = recording.take(np.arange(0, len(recording), 4))
-    return calibrate(few, orders=(1,), n_live=16, rng=np.random.default_rng(0))
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
-def test_a_calibration_its_sensor_and_its_nested_run_show_themselves():
-    calibration = small_calibration()
-    for value in (calibration, calibration.sensor, calibration.sensor.field):
-        shown = value._repr_html_()
-        assert "data:image/png;base64" in shown
 
 
 @pytest.mark.parametrize(
@@ -47,13 +29,6 @@ def test_a_calibration_its_sensor_and_its_nested_run_show_themselves():
 )
 def test_a_value_shows_a_picture(make):
     assert "data:image/png;base64" in make()._repr_html_()
-
-
-def test_in_a_terminal_a_result_shows_its_summary():
-    written = []
-    result = run(Bell(), rng=np.random.default_rng(0), n_live=50)
-    result._repr_pretty_(SimpleNamespace(text=written.append), False)
-    assert written == [result.summary()]
 
 
 def test_a_value_without_a_renderer_shows_its_escaped_summary():

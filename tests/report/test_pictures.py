@@ -3,10 +3,8 @@
 import io
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from probewise.errors import ParameterError
 from probewise.report.pictures import animated_gif, join_side_by_side
 
 
@@ -30,19 +28,8 @@ def test_frames_follow_each_other_and_smaller_ones_are_set_on_white():
     assert tuple(second[3, 6]) == (255, 255, 255)
 
 
-def test_no_frames_make_no_picture():
-    with pytest.raises(ParameterError, match="one picture or more"):
-        animated_gif([])
-
-
-def picture(width, shade):
-    out = io.BytesIO()
-    Image.new("RGB", (width, 10), (shade,) * 3).save(out, "PNG")
-    return out.getvalue()
-
-
 def test_the_run_that_ended_first_stays_at_its_last_picture():
-    slides = join_side_by_side([picture(20, 0), picture(20, 100)], [picture(30, 200)])
+    slides = join_side_by_side([png((s, s, s), (20, 10)) for s in (0, 100)], [png((200, 200, 200), (30, 10))])
     opened = [Image.open(io.BytesIO(slide)).convert("RGB") for slide in slides]
     assert [image.size for image in opened] == [(50, 10)] * 2
     assert [(image.getpixel((0, 0))[0], image.getpixel((49, 9))[0]) for image in opened] == [(0, 200), (100, 200)]
@@ -54,6 +41,6 @@ def test_a_colour_that_few_pixels_have_survives_in_a_slide():
     tones[100:107, 50:57] = (0, 224, 138)
     out = io.BytesIO()
     Image.fromarray(tones).save(out, "PNG")
-    (slide,) = join_side_by_side([out.getvalue()], [picture(5, 0)])
+    (slide,) = join_side_by_side([out.getvalue()], [png("black", (5, 10))])
     shown = Image.open(io.BytesIO(slide)).convert("RGB").getpixel((53, 103))
     np.testing.assert_allclose(shown, (0, 224, 138), atol=16)

@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 
 from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
@@ -55,12 +54,9 @@ def test_every_usable_reading_on_a_line_is_drawn(recording):
 def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording):
     axes = plots.predicted_and_recorded_by_scan(recording, recording.readings, np.ones(len(recording)))
     assert sum(ax.get_visible() for ax in axes.flat) == 5
-
-
-def test_many_scans_are_thinned_to_eight_panels():
     plan = read_recording(shipped("concealed")).plan
-    flat = Recording(plan, np.full(len(plan), 30.0))
-    axes = plots.predicted_and_recorded_by_scan(flat, flat.readings, np.ones(len(flat)))
+    many = Recording(plan, np.full(len(plan), 30.0))
+    axes = plots.predicted_and_recorded_by_scan(many, many.readings, np.ones(len(many)))
     assert sum(ax.get_visible() for ax in axes.flat) <= 8
 
 
@@ -82,13 +78,6 @@ def test_the_field_shows_readings_by_brightness_and_the_next_place():
     np.testing.assert_allclose(squares.get_facecolors()[:, :3], [[0, 0, 0], [1, 1, 1]])
     np.testing.assert_allclose(green.get_offsets(), [[300.0, 100.0]])
     assert "mm" in ax.get_xlabel()
-
-
-def test_an_ssf_is_drawn_about_its_place_in_the_sensor_frame():
-    ax = plots.spatial_sensitivity(blob())
-    left, right = ax.get_xlim()
-    assert left == -right
-    assert plots.ssf_by_n_gaussians({1: blob(), 2: blob()}, {1: -5.0, 2: -7.0}, {1: 0.1, 2: 0.1}).shape == (1, 2)
 
 
 def test_the_label_of_an_axis_whose_ticks_become_finer_in_the_layout_is_within_the_drawing():
@@ -121,25 +110,6 @@ def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     widths = [bar.get_width() for bar in ax.patches]
     assert len(widths) == 9
     assert sum(widths) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    "draw",
-    [
-        lambda: plots.posterior_widths({"a": np.array([50.0, 8.0, 3.0])}),
-        lambda: plots.information_gained({"a": np.array([1.0, 2.5])}),
-    ],
-    ids=["widths", "information"],
-)
-def test_a_figure_returns_its_axes_and_renders(draw):
-    ax = draw()
-    assert isinstance(ax, Axes)
-    assert plots.png(ax).startswith(b"\x89PNG")
-
-
-def test_drawing_on_given_axes_makes_no_figure_of_its_own(recording):
-    given = plots.grid_of_axes(1, 1, size_in=(4, 3))[0, 0]
-    assert plots.readings_by_orientation(recording, ax=given) is given
 
 
 @pytest.mark.parametrize("repeats", [1, 2, 5])

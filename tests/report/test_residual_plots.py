@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -45,12 +44,6 @@ def images(figures):
     return {name: plots.svg(drawing) for name, drawing in figures.items()}
 
 
-@pytest.mark.slow
-def test_every_figure_is_svg_that_a_browser_can_read(images):
-    for image in images.values():
-        assert ElementTree.fromstring(image).tag.endswith("svg")
-
-
 def test_every_axis_says_what_it_carries(figures):
     for name, drawing in figures.items():
         for ax in np.atleast_1d(drawing):
@@ -79,29 +72,11 @@ def test_the_same_drawing_gives_the_same_bytes():
     assert first == second
 
 
-def test_small_residuals_are_labelled_in_full():
-    tiny = mean_residuals(X, 1e-4 * np.sin(X), None, sd=1e-4)
-    ax = plots.mean_residuals_along(tiny, label="X (mm)", unit="mW")
-    plots.svg(ax)
-    labels = [label.get_text() for label in ax.get_yticklabels()]
-    assert ax.yaxis.get_offset_text().get_text() == ""
-    assert all("0.000" in label or label == "0" or "10⁻" in label for label in labels)
-
-
 @pytest.mark.parametrize(("window", "shaded"), [((2.0, 3.0), True), ((0.5, 9.5), False)])
 def test_only_a_part_of_the_axis_stands_out(window, shaded):
     x = np.linspace(0.0, 10.0, 200)
     ax = plots.mean_residuals_along(mean_residuals(x, np.sin(x), None, sd=1.0), label="X", unit="V", window=window)
     assert ("stands out here" in ax.get_legend_handles_labels()[1]) is shaded
-
-
-def test_a_hundred_thousand_dots_stay_a_small_file():
-    rng = np.random.default_rng(0)
-    cloud = [("as calibrated", rng.standard_normal(100_000))]
-    assert (
-        len(plots.svg(plots.residuals_against_covariates([("time (s)", rng.random(100_000))], cloud, unit="V")))
-        < 1_000_000
-    )
 
 
 def test_rounded_readings_lie_on_their_lattice(figures):

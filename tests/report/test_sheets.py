@@ -116,27 +116,6 @@ def test_the_fields_pages_join_without_gap_or_step():
     assert {tile.beyond_mm[0] for tile in tiles} == {0.0, OVERLAP_MM}
 
 
-def test_each_strip_is_labelled_within_it_where_no_cut_takes_the_label_away():
-    sheet = field_sheet((400.0, 200.0))
-    tiles = tiles_of(sheet, "letter")
-    labels = 0
-    for tile, page in zip(tiles, pages_of(sheets_pdf([sheet], paper="letter", title="t"))[1:], strict=True):
-        cut = np.array([LEFT_MM, BOTTOM_MM]) + np.subtract(tile.high_mm, tile.low_mm)
-        boxes = filled(page)[1:]  # after the field's black, what lies white behind the labels
-        assert len(boxes) == np.count_nonzero(tile.beyond_mm)
-        for axis in np.flatnonzero(tile.beyond_mm):
-            inside = [(box[:, axis] > cut[axis]) & (box[:, axis] < cut[axis] + OVERLAP_MM) for box in boxes]
-            assert any(rows.all() for rows in inside)
-        labels += len(boxes)
-    # Of a row of columns, all but the last have a right strip; the same upwards.
-    n_columns, n_rows = tiles[-1].column + 1, tiles[-1].row + 1
-    assert labels == (n_columns - 1) * n_rows + n_columns * (n_rows - 1) > 0
-
-
-def test_the_papers_field_takes_twelve_pages():
-    assert len(tiles_of(field_sheet((1048.0, 520.0)), "a4")) == 12
-
-
 def test_every_cut_has_its_marks_in_the_margin():
     sheet = field_sheet((400.0, 200.0))
     for tile, page in zip(
@@ -159,14 +138,6 @@ def test_a_sheet_is_as_large_as_its_readings_need():
     again = pattern_sheets(plan.patterns, turned)
     assert [sheet.orientations_rad for sheet in again] == [sheet.orientations_rad for sheet in sheets.values()]
     assert set(sheets) == set(plan.pattern_names)
-
-
-def test_a_pattern_that_the_plan_does_not_have_needs_no_sheet():
-    plan = paper_plan()
-    described = {**plan.patterns, "another": Uniform(0.5)}
-    assert [sheet.name for sheet in pattern_sheets(described, plan)] == [
-        sheet.name for sheet in pattern_sheets(plan.patterns, plan)
-    ]
 
 
 def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():

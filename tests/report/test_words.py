@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 from probewise._words import unit_of_name
 from probewise.report.words import (
     digits_of_range,
-    duration_text,
     interval_text,
     range_text,
-    rounded_count_text,
     value_and_interval_texts,
     value_with_error,
     words_without_unit,
@@ -32,10 +30,6 @@ from probewise.report.words import (
 )
 def test_a_value_is_written_to_the_second_figure_of_its_error(value, error, written):
     assert value_with_error(value, error) == written
-
-
-def test_a_unit_follows_the_error():
-    assert value_with_error(90.94, 3.82, "mm") == "90.9 ± 3.8 mm"
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-8, 1e6))
@@ -63,23 +57,3 @@ def test_a_parameters_unit_is_told_once():
     assert (words_without_unit("rectangle.width_mm"), unit_of_name("rectangle.width_mm")) == ("rectangle width", "mm")
     assert (words_without_unit("angle_rad"), unit_of_name("angle_rad")) == ("angle", "rad")
     assert (words_without_unit("A_1"), unit_of_name("A_1")) == ("A 1", "")
-
-
-@pytest.mark.parametrize(
-    ("minutes", "written"),
-    [
-        (0.2, "1 minute"),
-        (61.0, "61 minutes"),
-        (179.0, "179 minutes"),
-        (300.0, "5 hours"),
-        (3 * 1440.0, "3 days"),
-        (10_104_062.0, "19 years"),
-    ],
-)
-def test_a_duration_is_written_in_a_unit_that_a_person_would_use(minutes, written):
-    assert duration_text(minutes) == written
-
-
-def test_a_count_that_is_an_estimate_has_two_figures():
-    assert rounded_count_text(642_858.0) == "640,000"
-    assert rounded_count_text(20.0) == "20"

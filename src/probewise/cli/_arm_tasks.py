@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -24,17 +25,8 @@ from probewise.arm.carry_out import reachable_places_of
 from probewise.arm.fitting import spread_mark_places
 from probewise.arm.geometry import JOINTS
 from probewise.arm.height_check import HeightReading, check_heights
+from probewise.cli import _bench
 from probewise.cli._arm import SCENE, parse_arm, parse_place
-from probewise.cli._bench import (
-    SimulatedBench,
-    enable_confirmed_lowering,
-    open_arm_and_bench,
-    open_brick,
-    open_nxt_arm,
-    prompter,
-    warn_and_confirm_lowering,
-    warn_if_clearance_doubtful,
-)
 from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_result, print_warning
 from probewise.errors import LinkError, ParameterError
 from probewise.recordings import write_bytes_atomically
@@ -57,12 +49,12 @@ def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s:
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
         )
-    return open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
+    return _bench.open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
 
 
 def open_instrument(
     arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0, n_taken: int = 0, scene: str = SCENE
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
+) -> tuple[LegoArm | OwnInstrument | SimulatedArm, _bench.SimulatedBench | None]:
     """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":
@@ -72,26 +64,18 @@ def open_instrument(
         raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
     if chosen.kind == "file":
         refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
-    given = {name: getattr(arguments, name, None) for name in ("sensor", "scene", "seed")}
-    seed = DEFAULT_SEED if given["seed"] is None else given["seed"]
-    opened = open_arm_and_bench(
-        chosen,
-        geometry,
-        arguments.geometry,
-        sensor=given["sensor"],
-        scene=scene if given["scene"] is None else given["scene"],
-        seed=seed,
-        start_s=start_s,
-        n_taken=n_taken,
-    )
-    print_result(f"seed {seed}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
+    default = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
+    given = {name: getattr(arguments, name, None) for name in default}
+    given = {name: default[name] if value is None else value for name, value in given.items()}
+    opened = _bench.open_arm_and_bench(chosen, geometry, arguments.geometry, **given, start_s=start_s, n_taken=n_taken)
+    print_result(f"seed {given['seed']}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
     return opened
 
 
 def confirm_lowering(arguments: argparse.Namespace, instrument: Instrument, geometry: Geometry) -> None:
     """Warn if the sensor may hit the table and let a person confirm its first lowering, unless nothing moves."""
     if arguments.arm is not None and not arguments.dry_run:
-        warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
+        _bench.warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
 
 
 def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
@@ -113,7 +97,7 @@ def nxt_port(name: str) -> str:
 
 def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
     """Return a function that prompts the person; in a dry run, it only prints the request."""
-    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
+    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else _bench.prompter(arm)
 
 
 # The tasks
@@ -124,9 +108,7 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
     from probewise.report.plots.apparatus import draw_arm_lengths, reach_map
     from probewise.report.plots.canvas import png
 
-    def say(text: str) -> None:
-        print_result(text, quiet=arguments.quiet)
-
+    say = partial(print_result, quiet=arguments.quiet)
     out, drawing, own = arguments.out, arguments.drawing, arguments.geometry
     out = out and checked_output_file(out, own)
     drawing = drawing and checked_output_file(drawing, own, option="--drawing")
@@ -142,14 +124,11 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
     for name, joint in zip(JOINTS, geometry.joints, strict=True):
         count_mm = farthest_mm / abs(joint.counts_per_rad)
         low, high = math.degrees(joint.low_rad), math.degrees(joint.high_rad)
-        say(
-            f"{name:<12} motor {'ABC'[joint.port]}, {low:g} to {high:g} degrees; "
-            f"at {farthest_mm:.0f} mm one count is {count_mm:.2f} mm, "
-            f"its play {joint.play_rad * farthest_mm:.1f} mm"
-        )
-    if geometry.accuracy is None:
-        known = "not fitted to marks: with home 2 degrees off on both links the sensor hangs up to"
-    else:
+        of_motor = f"motor {'ABC'[joint.port]}, {low:g} to {high:g} degrees"
+        play = f"its play {joint.play_rad * farthest_mm:.1f} mm"
+        say(f"{name:<12} {of_motor}; at {farthest_mm:.0f} mm one count is {count_mm:.2f} mm, {play}")
+    known = "not fitted to marks: with home 2 degrees off on both links the sensor hangs up to"
+    if geometry.accuracy is not None:
         known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
     say(f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.max_height_error_mm:.1f} mm lower")
     if out is not None:
@@ -161,10 +140,9 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
         say(f"drawn        {drawing}")
     if port is None:
         return
-    with open_brick(port) as brick:  # nothing moves
-        version = brick.version()
+    with _bench.open_brick(port) as brick:  # nothing moves
+        version, battery_v = brick.version(), brick.battery_mv() / 1000
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
-        battery_v = brick.battery_mv() / 1000
         say(f"brick        {brick.name()}, firmware {firmware}, battery {battery_v:.2f} V")
         light = brick.light_sensor(geometry.sensor_port).read()
         value = percent_to_lego_units(light.fine_percent, geometry)
@@ -182,10 +160,10 @@ def jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> No
             if arguments.steps and not arguments.down:
                 raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
             if arguments.down and not arguments.dry_run and not arguments.steps:
-                warn_if_clearance_doubtful(geometry)
+                _bench.warn_if_clearance_doubtful(geometry)
             with open_lego_arm(arguments, geometry) as arm:
                 if arguments.steps and not arguments.dry_run:
-                    enable_confirmed_lowering(arm)
+                    _bench.enable_confirmed_lowering(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _print_position(arm, quiet=arguments.quiet)
                 if arguments.down:
@@ -237,16 +215,16 @@ def scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     places = np.linspace(start, end, arguments.readings)
     if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before connecting to the brick
         require_within_reach(geometry, places, "reading of the scan")
-    names: list[str] = ["battery_mv"]
     instrument, _ = open_instrument(arguments, geometry)
     confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
         require_within_reach(reachable_places_of(arm), places, "reading of the scan")
-        if isinstance(arm, LegoArm):
+        names = ["battery_mv"] if isinstance(arm, LegoArm) else None  # an own instrument's are those of its readings
+        if names is not None:
             print_result(",".join((_COLUMNS, *names)))
-        for k, ((x_mm, y_mm), standing) in enumerate(zip(places, arm.orientation_rad(places), strict=True)):
+        for (x_mm, y_mm), standing in zip(places, arm.orientation_rad(places), strict=True):
             reading = arm.measure(Pose(float(x_mm), float(y_mm), float(standing)))
-            if k == 0 and not isinstance(arm, LegoArm):
+            if names is None:
                 names = list(reading.covariates)
                 print_result(",".join((_COLUMNS, *names)))
             at, more = reading.pose, (f",{reading.covariates.get(name, math.nan):.9g}" for name in names)
@@ -260,6 +238,7 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
     """Compare by the light over white the sensor's height at each place with that at the first; print differences."""
     if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
         raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
+    say = partial(print_result, quiet=arguments.quiet)
     width, height = geometry.field_mm
     places = [parse_place("X,Y", text) for text in arguments.places]
     places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]
@@ -271,9 +250,8 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
     confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
         if bench is None:
-            prompter_unless_dry_run(arguments, arm)(
-                "lay white matt paper, the same everywhere, over the field, or under each place"
-            )
+            paper = "lay white matt paper, the same everywhere, over the field, or under each place"
+            prompter_unless_dry_run(arguments, arm)(paper)
 
         def height_reading_at(place: tuple[float, float], height_mm: float) -> HeightReading:
             arm.go_down(*place, height_mm)
@@ -289,25 +267,24 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
             lights.append(height_reading_at(place, lowest_mm))
             if not arguments.dry_run:
                 check = check_heights(curve, lights)
-                print_result(_height_error_in_words(place, check.off_mm[-1], check.sd_mm[-1]), quiet=arguments.quiet)
+                say(_height_error_in_words(place, check.off_mm[-1], check.sd_mm[-1]))
     if arguments.dry_run:
         return
-    print_result(
+    say(
         f"light        falls by {check.per_mm:.1%} with each mm at {lowest_mm:g} mm (in [sensor] of the geometry: "
         f"light_per_mm = {check.per_mm:.3f}); heights are relative to the first place, "
-        f"({places[0][0]:g}, {places[0][1]:g}) mm",
-        quiet=arguments.quiet,
+        f"({places[0][0]:g}, {places[0][1]:g}) mm"
     )
     if check.agrees:
-        print_result(f"heights      agree with the counters (p = {check.p_value:.2g})", quiet=arguments.quiet)
-    else:
-        worst = int(np.argmax(np.abs(check.off_mm / check.sd_mm)))
-        print_warning(
-            f"the light contradicts the heights (p = {check.p_value:.1g}), most at "
-            f"{_height_error_in_words(places[1 + worst], check.off_mm[worst], check.sd_mm[worst])}; is the paper the "
-            "same everywhere? Then bring the sensor to marks there and fit the geometry again "
-            "(probewise arm fit-geometry)"
-        )
+        say(f"heights      agree with the counters (p = {check.p_value:.2g})")
+        return
+    worst = int(np.argmax(np.abs(check.off_mm / check.sd_mm)))
+    print_warning(
+        f"the light contradicts the heights (p = {check.p_value:.1g}), most at "
+        f"{_height_error_in_words(places[1 + worst], check.off_mm[worst], check.sd_mm[worst])}; is the paper the "
+        "same everywhere? Then bring the sensor to marks there and fit the geometry again "
+        "(probewise arm fit-geometry)"
+    )
 
 
 def _height_error_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:

@@ -164,21 +164,6 @@ class InstrumentWithCallbacks:
         return reading
 
 
-class MarkQuestion(str):
-    """A question to the person who watches the sensor: the sentence, with the mark's place and its block's height."""
-
-    __slots__ = ("block_mm", "mark_mm")
-
-    mark_mm: tuple[float, float]
-    block_mm: float
-
-    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> MarkQuestion:
-        """Build a question from its sentence."""
-        question = super().__new__(cls, text)
-        question.mark_mm, question.block_mm = mark_mm, block_mm
-        return question
-
-
 class SimulatedBench:
     """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
@@ -213,7 +198,7 @@ class SimulatedBench:
         self._table, self._stand = bench.table, bench.arm.sensor_pose
         return arm
 
-    def answer_at_mark(self, question: MarkQuestion) -> str:
+    def answer_at_mark(self, mark_mm: tuple[float, float], block_mm: float) -> str:
         """Answer like a person who watches the emulated arm's sensor over a mark: "ok", or moves such as "x 5 down 2".
 
         Raises ParameterError if the arm is not an emulated one.
@@ -221,8 +206,8 @@ class SimulatedBench:
         if self._stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
         stand = self._stand()
-        across = (question.mark_mm[0] - stand.x_mm, question.mark_mm[1] - stand.y_mm)
-        gap_mm = stand.height_mm - question.block_mm
+        across = (mark_mm[0] - stand.x_mm, mark_mm[1] - stand.y_mm)
+        gap_mm = stand.height_mm - block_mm
         words = [
             f"{axis} {round(2 * off) / 2:g}" for axis, off in zip("xy", across, strict=True) if abs(off) > _SEEN_MM
         ]

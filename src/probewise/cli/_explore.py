@@ -22,16 +22,8 @@ from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
+from probewise.cli import _common as common
 from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
-from probewise.cli._common import (
-    DEFAULT_SEED,
-    finish,
-    message_to_resume,
-    parse_numbers,
-    print_result,
-    refuse_nested_stop,
-    tables_and_descriptions,
-)
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean
 from probewise.experiment import Exploration, HiddenShape, read_journal
@@ -130,8 +122,8 @@ def _shipped_sensor(arguments: argparse.Namespace, chosen: ArmName) -> FittedSen
         raise ParameterError("--sensor", "none", "the sensor model of this arm, as `probewise calibrate` writes it")
     if arguments.resume and (arguments.out / _SHIPPED).exists():
         return read_sensor(arguments.out / _SHIPPED)
-    print_result("no --sensor: that of the recording that ships is calibrated", quiet=arguments.quiet)
-    rng = np.random.default_rng(DEFAULT_SEED)
+    common.print_result("no --sensor: that of the recording that ships is calibrated", quiet=arguments.quiet)
+    rng = np.random.default_rng(common.DEFAULT_SEED)
     return calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
 
 
@@ -159,7 +151,7 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
     of_arm = None if geometry is None else Field(*geometry.field_mm)
     if text is None:
         return of_arm or Field()
-    numbers = parse_numbers(text)
+    numbers = common.parse_numbers(text)
     if len(numbers) != 2:
         raise ParameterError("--field", text, "WIDTH,HEIGHT in mm, such as 1048,520")
     field = Field(*numbers)
@@ -175,7 +167,7 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
     """
     cards = []
     for text in texts:
-        numbers = parse_numbers(text)
+        numbers = common.parse_numbers(text)
         if len(numbers) != 5:
             allowed = "X,Y,WIDTH,HEIGHT,ALBEDO: centre and size in mm, albedo from 0 to 1, such as 100,80,60,40,1"
             raise ParameterError("--reference", text, allowed)
@@ -201,7 +193,7 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
     if name not in SHAPES:
         allowed = f"a shape of {', '.join(SHAPES)} before the colon{did_you_mean(name, SHAPES)}"
         raise ParameterError("--truth", text, allowed)
-    shape, theta = SHAPES[name](field), np.array(parse_numbers(listed))
+    shape, theta = SHAPES[name](field), np.array(common.parse_numbers(listed))
     wanted = shape.prior.names
     if len(theta) != len(wanted):
         raise ParameterError("--truth", text, f"{len(wanted)} numbers, {','.join(wanted)}")
@@ -215,7 +207,7 @@ def _naive_levels(
 
     Raises ParameterError if an option does not apply, or a real arm has no recording.
     """
-    refuse_nested_stop(arguments)
+    common.refuse_nested_stop(arguments)
     wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
     if arguments.levels is not None and not wanted:
         raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
@@ -372,7 +364,7 @@ def explore(arguments: argparse.Namespace) -> int:
     journal = out / "journal.jsonl"
     before = _journal_to_resume(journal, resume=arguments.resume)
     site = _open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
-    print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
+    common.print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     if arguments.sensor is None:
         arguments.sensor = out / _SHIPPED
         out.mkdir(parents=True, exist_ok=True)
@@ -380,7 +372,7 @@ def explore(arguments: argparse.Namespace) -> int:
     _bench.warn_and_confirm_lowering(inputs.arm, site.arm, inputs.geometry)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
         _bench.warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)
-    read = [arguments.sensor, *([] if arguments.levels is None else tables_and_descriptions([arguments.levels]))]
+    read = [arguments.sensor, *([] if arguments.levels is None else common.tables_and_descriptions([arguments.levels]))]
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm, read)
     steps, n_before = pictures.steps, 0 if before is None else len(before.entries)
 
@@ -388,7 +380,7 @@ def explore(arguments: argparse.Namespace) -> int:
         if not journal.exists():
             return "nothing was read"
         n_read = len(read_journal(journal).entries)
-        return message_to_resume(journal, n_read, "reading", arguments, "--resume")
+        return common.message_to_resume(journal, n_read, "reading", arguments, "--resume")
 
     def report_activity(doing: str) -> None:
         believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
@@ -434,7 +426,7 @@ def explore(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept_message, results=True), progress_shown(quiet=arguments.quiet) as progress:
         renamed = pictures.write_results(result, seed=arguments.seed, known=site.known, progress=progress)
     lines = _closing_lines(result, inputs, site, journal)
-    return finish(pictures.drawings, *lines, *renamed, f"written to {out}", quiet=arguments.quiet)
+    return common.finish(pictures.drawings, *lines, *renamed, f"written to {out}", quiet=arguments.quiet)
 
 
 def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journal: Path) -> Iterator[str]:

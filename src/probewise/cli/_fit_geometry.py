@@ -17,7 +17,7 @@ from probewise.arm.fitting import TouchedMark, fit_geometry, read_turns_and_plac
 from probewise.arm.geometry_file import text_with_fitted_values
 from probewise.cli._arm import parse_arm
 from probewise.cli._arm_tasks import open_instrument
-from probewise.cli._bench import MarkQuestion, prompter, prompter_for_answer
+from probewise.cli._bench import prompter, prompter_for_answer
 from probewise.cli._common import CommandError, message_to_resume, print_result
 from probewise.errors import FileError, ParameterError, ReachError
 from probewise.recordings import write_text_atomically
@@ -77,9 +77,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         )
 
     with reporting_what_is_kept(kept_message), instrument as arm:
-        answer = prompter_for_answer(arm)
-        ask = answer if bench is None else bench.answer_at_mark
-        tell = partial(print_result, quiet=bench is not None)
+        answer, tell = prompter_for_answer(arm), partial(print_result, quiet=bench is not None)
         if bench is None:
             prompter(arm)(
                 "lay the sheet of marks (probewise sheets marks) on the field, and on each cross in its turn a "
@@ -88,7 +86,10 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         for number, mark in enumerate(marks, 1):
             if mark in done:
                 continue
-            met = bring_to_mark(arm, mark, arguments.block_mm, ask, tell, named=f"mark {number} of {len(marks)}")
+            ask = partial(answer, f"mark {number} of {len(marks)} ({mark[0]:g}, {mark[1]:g}): ")
+            if bench is not None:
+                ask = partial(bench.answer_at_mark, mark, arguments.block_mm)
+            met = bring_to_mark(arm, mark, arguments.block_mm, ask, tell)
             if met is not None:
                 taken.append(met)
                 write_marks(taken, kept)
@@ -99,10 +100,8 @@ def bring_to_mark(
     arm: LegoArm,
     mark_mm: tuple[float, float],
     block_mm: float,
-    ask: Callable[[MarkQuestion], str],
+    ask: Callable[[], str],
     tell: Callable[[str], None],
-    *,
-    named: str,
 ) -> TouchedMark | None:
     """Bring the sensor over a mark and down to the block on it, as a person directs; return the mark as touched.
 
@@ -114,7 +113,7 @@ def bring_to_mark(
     arm.go_down(*at)
     tell(_HELP)
     while True:
-        answer = ask(MarkQuestion(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
+        answer = ask().lower()
         if answer == "skip":
             return None
         if answer in ("ok", "seen"):

@@ -31,6 +31,7 @@ from probewise.arm import (
 )
 from probewise.arm.carry_out import BY_HAND_S, duration_s, reachable_places_of
 from probewise.arm.geometry import wrapped_to_pi
+from probewise.cli import _bench
 from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
 from probewise.cli._arm_tasks import (
     confirm_lowering,
@@ -38,13 +39,6 @@ from probewise.cli._arm_tasks import (
     open_instrument,
     prompter_unless_dry_run,
     refuse_options,
-)
-from probewise.cli._bench import (
-    plan_for_lego_arm,
-    plan_for_own_instrument,
-    prompter_for_answer,
-    shifted_pattern,
-    without_measured_covariates,
 )
 from probewise.cli._common import message_to_resume, print_result, print_warning
 from probewise.emulator.bench import scene_text
@@ -137,13 +131,13 @@ def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: 
     """Read the plan and adapt it to the arm, or to the sensor of --sensor."""
     plan = read_or_shipped_plan(arguments.plan)
     if is_own:
-        return plan_for_own_instrument(plan, unit=arguments.unit, range_=arguments.range, step=arguments.step)
+        return _bench.plan_for_own_instrument(plan, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     if arguments.sensor is not None:
         from probewise.calibration import read_sensor
 
-        return without_measured_covariates(plan, read_sensor(arguments.sensor).instrumentation)
+        return _bench.without_measured_covariates(plan, read_sensor(arguments.sensor).instrumentation)
     refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
-    return plan_for_lego_arm(plan, geometry)
+    return _bench.plan_for_lego_arm(plan, geometry)
 
 
 # Readings of an earlier session
@@ -228,7 +222,7 @@ class PersonAtBench:
     ) -> None:
         self._arm, self._plan, self._origin, self._sheet_check = arm, plan, origin_mm, sheet_check
         self._emulated, self._check_sheets = emulated, check_sheets
-        self._answer = prompter_for_answer(arm)
+        self._answer = _bench.prompter_for_answer(arm)
 
     def __call__(self, request: RequestToPerson) -> None:
         """Prompt, and check the sheet until it is right or the person overrides the check."""
@@ -253,7 +247,7 @@ class PersonAtBench:
         if request.pattern is None:
             return ""
         try:
-            scene = scene_text(shifted_pattern(self._plan.patterns[request.pattern], self._origin))
+            scene = scene_text(_bench.shifted_pattern(self._plan.patterns[request.pattern], self._origin))
         except ParameterError:
             return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
         return f" (in the emulator's terminal: {scene})"

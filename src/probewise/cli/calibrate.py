@@ -6,17 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import (
-    add,
-    add_nested_stop,
-    add_out,
-    add_seed_and_quiet,
-    finish,
-    parse_count,
-    parse_recording,
-    refuse_nested_stop,
-    tables_and_descriptions,
-)
+from probewise.cli import _common as common
 from probewise.cli._journal import refuse_journal
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
@@ -25,13 +15,13 @@ from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise calibrate`."""
     about = "recording, its JSON beside it; or paper or concealed, which ship"
-    add(parser, "recording REC.csv", about, type=parse_recording)
-    add_out(parser)
+    common.add(parser, "recording REC.csv", about, type=common.parse_recording)
+    common.add_out(parser)
     about = f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})"
-    add(parser, "--orders N", about, type=parse_count, nargs="+", default=list(ORDERS))
+    common.add(parser, "--orders N", about, type=common.parse_count, nargs="+", default=list(ORDERS))
     about = f"live points where a number of Gaussians is searched in full (default {N_LIVE})"
-    add(parser, "--live N", about, type=parse_count, default=N_LIVE)
-    add(
+    common.add(parser, "--live N", about, type=common.parse_count, default=N_LIVE)
+    common.add(
         parser,
         "--method",
         "quick (default): samples from the peaks of the likelihood, until the evidence has clearly fallen, one "
@@ -41,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("quick", "full", "paper"),
         default=CALIBRATION,
     )
-    add_nested_stop(parser)
-    add_seed_and_quiet(parser)
+    common.add_nested_stop(parser)
+    common.add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -55,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.recordings import read_recording
     from probewise.report import calibration as report
 
-    refuse_nested_stop(arguments)
+    common.refuse_nested_stop(arguments)
     refuse_journal(arguments.recording)
     drawings = Drawings(checked_output_directory(arguments.out))
     orders = tuple(sorted(set(arguments.orders)))
@@ -76,10 +66,10 @@ def run(arguments: argparse.Namespace) -> int:
             lambda stage: write_sensor(result.sensor, stage / "sensor.json"),
             report.figure_drawers(result, recording, prediction),
             lambda drawn: report.page_html(result, recording, prediction, drawn, seed=arguments.seed),
-            inputs=tables_and_descriptions([arguments.recording]),
+            inputs=common.tables_and_descriptions([arguments.recording]),
             progress=progress,
         )
-    return finish(
+    return common.finish(
         drawings,
         *(f"note: {note}" for note in recording.notes),
         *notes,

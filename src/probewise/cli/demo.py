@@ -10,7 +10,7 @@ from probewise.cli._common import add, add_out, add_seed_and_quiet, print_result
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from concurrent.futures import Executor, Future
+    from concurrent.futures import Executor
 
     from probewise.arm import Pose
     from probewise.calibration import Calibration, FittedSensor
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from probewise.scene import Circle
 
 _DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
-MODELS: tuple[Model, ...] = ("naive", "ssf")
-MODEL_NAMES: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
+MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
 TRUSTS = {"trusting": 1.0, "doubting": 0.9}
 N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
 N_LIVE_ROBOT = 100
@@ -72,39 +71,30 @@ def _run_demo(
     from probewise.report.searches import search_comparison_lines
     from probewise.world.shipped import true_world as world_behind
 
-    started = time.monotonic()
-    seed = arguments.seed
-    out = drawings.out
-    truth = random_hidden_circle_mm(seed)
+    started, seed, out = time.monotonic(), arguments.seed, drawings.out
+    truth, doing = random_hidden_circle_mm(seed), "calibrating, searching and diagnosing"
     with worker_pool(2) as pool:
-        doing = "calibrating, searching and diagnosing"
         progress(doing, 0, 8)
         diagnosing = pool.submit(_diagnose_shipped_recording, seed)
         calibration = _calibrate_shipped_recording(seed, arguments.full, pool)
         sensor = calibration.sensor
-        seek, paper_rule = partial(search, sensor, truth, seed), ReadingEntropy()
-        doubting = [
-            pool.submit(seek, 7, trust=trust, saturating=True, max_readings=MAX_READINGS_DOUBT)
-            for trust in TRUSTS.values()
-        ]
-        starting = [
-            pool.submit(seek, 6, model=model, utility=paper_rule, max_readings=MAX_READINGS) for model in MODELS
-        ]
-        searching = [pool.submit(seek, 2, model=model, on_circle=False, max_readings=MAX_READINGS) for model in MODELS]
-        parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
+        seek, longest = partial(pool.submit, search, sensor, truth, seed), {"max_readings": MAX_READINGS}
+        doubting = {
+            name: seek(7, trust=trust, saturating=True, max_readings=MAX_READINGS_DOUBT)
+            for name, trust in TRUSTS.items()
+        }
+        starting = {name: seek(6, model=model, utility=ReadingEntropy(), **longest) for model, name in MODELS.items()}
+        searching = {name: seek(2, model=model, on_circle=False, **longest) for model, name in MODELS.items()}
+        parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
         progress(doing, 1, 8)
         for done, future in enumerate(as_completed(parts), start=2):
             future.result()
             progress(doing, done, 8)
-    diagnosis, alike = diagnosing.result(), [future.result() for future in starting]
-    runs = [future.result() for future in searching]
-    recording = read_recording(shipped("paper"))
+    diagnosis, recording = diagnosing.result(), read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
-    names = MODEL_NAMES.values()
-    searches = searches_with_true_circle(sensor, zip(names, runs, strict=True), truth)
-    started_alike = searches_with_true_circle(sensor, zip(names, alike, strict=True), truth)
-    doubted = searches_with_true_circle(
-        sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth
+    searches, started_alike, doubted = (
+        searches_with_true_circle(sensor, ((name, run.result()) for name, run in runs.items()), truth)
+        for runs in (searching, starting, doubting)
     )
     figures = report.figure_drawers(
         calibration,
@@ -195,7 +185,7 @@ def random_hidden_circle_mm(seed: int) -> tuple[float, ...]:
     import numpy as np
 
     drawn = hypothesised_circle().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
-    return tuple(float(v) for v in drawn)
+    return tuple(drawn.tolist())
 
 
 def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calibration:
@@ -204,13 +194,8 @@ def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calib
     from probewise.calibration import calibrate
     from probewise.recordings import read_recording, shipped
 
-    return calibrate(
-        read_recording(shipped("paper")),
-        orders=(1, 2, 3, 4) if full else (1, 2),
-        n_live=300 if full else N_LIVE,
-        rng=np.random.default_rng([seed, 1]),
-        executor=pool,
-    )
+    orders, n_live, rng = (1, 2, 3, 4) if full else (1, 2), 300 if full else N_LIVE, np.random.default_rng([seed, 1])
+    return calibrate(read_recording(shipped("paper")), orders=orders, n_live=n_live, rng=rng, executor=pool)
 
 
 def _frame_png(search: RobotSearch, step: Step) -> bytes:
@@ -260,14 +245,12 @@ def search(
     from probewise.world import Saturation
     from probewise.world.shipped import true_world as world_behind
 
-    field, world = Field(), world_behind("paper")
+    field, world, circle = Field(), world_behind("paper"), hypothesised_circle()
     if saturating:
         world = replace(world, concealed=(Saturation(SATURATION),))
-    options = {"trust": 1.0, **options}
-    experiment = experiment_for(sensor, hypothesised_circle(), field, n_live=N_LIVE_ROBOT, **options)
+    experiment = experiment_for(sensor, circle, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
-    surface = HiddenShape("circle", hypothesised_circle(), np.array(truth)).surface
-    with arm_over(world, surface, field, seed=seed) as arm:
+    with arm_over(world, HiddenShape("circle", circle, np.array(truth)).surface, field, seed=seed) as arm:
         if not on_circle:
             return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=max_readings)))
         first = random_pose_within_circle(truth, seed)

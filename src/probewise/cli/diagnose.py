@@ -8,16 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, cast
 
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
-from probewise.cli._common import (
-    CommandError,
-    add,
-    add_out,
-    add_seed_and_quiet,
-    finish,
-    inputs_and_filled_in_plan,
-    parse_path,
-    parse_recording,
-)
+from probewise.cli import _common as common
 from probewise.cli._executor import add_executor
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
 from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
@@ -43,26 +34,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "recording, its JSON beside it, or paper or concealed, which ship, or the journal.jsonl of an explore "
         "run; with --simulator any table; several are diagnosed together"
     )
-    add(parser, "recordings REC.csv", about, type=parse_recording, nargs="+")
+    common.add(parser, "recordings REC.csv", about, type=common.parse_recording, nargs="+")
     about = "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)"
-    add(parser, "--sensor S.json", about, type=parse_path)
+    common.add(parser, "--sensor S.json", about, type=common.parse_path)
     add_simulator(parser)
-    add(
+    common.add(
         parser,
         "--thorough",
         "compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
         "approximation where they differ by more than one nat plus its standard error and no run gives a warning "
         "(first says how long it may take)",
     )
-    add(
+    common.add(
         parser,
         "--each",
         "diagnose each recording by itself, into a folder of its name; table.csv and report.html sort them by "
         "what ails them; the same command resumes",
     )
     add_executor(parser)
-    add_out(parser)
-    add_seed_and_quiet(parser)
+    common.add_out(parser)
+    common.add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -74,7 +65,9 @@ def run(arguments: argparse.Namespace) -> int:
 
         return diagnose_each(arguments, run)
     if arguments.workers > 1 or arguments.scheduler is not None:
-        raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
+        raise common.CommandError(
+            "--workers and --scheduler are for --each, which diagnoses several recordings one by one"
+        )
     if arguments.simulator is not None:
         return _diagnose_simulator(arguments)
     from probewise.diagnosis import NEXT_PLAN, SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
@@ -111,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
             partial(write_files, diagnosis, rng=files_rng),
             report.figure_drawers(diagnosis),
             page,
-            inputs=inputs_and_filled_in_plan(read, drawings.out / NEXT_PLAN),
+            inputs=common.inputs_and_filled_in_plan(read, drawings.out / NEXT_PLAN),
             outdated=OF_ONE_RUN,
             progress=progress,
         )
@@ -148,7 +141,7 @@ def _diagnose_simulator(arguments: argparse.Namespace) -> int:
             partial(_write_files_of_simulator, diagnosis),
             report.figure_drawers(diagnosis),
             lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed),
-            inputs=inputs_and_filled_in_plan(read, drawings.out / "next.csv", simulator.reading),
+            inputs=common.inputs_and_filled_in_plan(read, drawings.out / "next.csv", simulator.reading),
             outdated=_OF_ONE_RUN_OF_SIMULATOR,
             progress=progress,
         )
@@ -158,7 +151,7 @@ def _diagnose_simulator(arguments: argparse.Namespace) -> int:
 
 def _finish(arguments: argparse.Namespace, drawings: Drawings, diagnosis: Diagnosis, notes: Sequence[str]) -> int:
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return finish(drawings, *notes, summary, quiet=arguments.quiet)
+    return common.finish(drawings, *notes, summary, quiet=arguments.quiet)
 
 
 def _read_inputs(

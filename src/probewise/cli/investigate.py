@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, checked_output_directory
+from probewise.cli import _common as common
 from probewise.cli._arm import (
     SHIPPED,
     ArmName,
@@ -21,19 +22,6 @@ from probewise.cli._arm import (
     parse_place,
     read_or_shipped_geometry,
     read_or_shipped_plan,
-)
-from probewise.cli._common import (
-    CommandError,
-    add,
-    add_out,
-    add_seed_and_quiet,
-    finish,
-    inputs_and_filled_in_plan,
-    message_to_resume,
-    parse_count,
-    parse_path,
-    positive_number_parser,
-    print_result,
 )
 from probewise.errors import ParameterError
 
@@ -51,28 +39,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise investigate`."""
     add_arm(parser)
     about = f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship"
-    add(parser, "--plan PLAN.csv", about, required=True)
+    common.add(parser, "--plan PLAN.csv", about, required=True)
     about = (
         "where on the field the plan's origin lies (default: the field's middle; with FILE.py 0,0; none with simulated)"
     )
-    add(parser, "--origin-mm X,Y", about)
+    common.add(parser, "--origin-mm X,Y", about)
     add_geometry(parser)
-    add_out(parser)
-    add(parser, "--sensor S.json", "an earlier calibration, whose posterior becomes the prior", type=parse_path)
+    common.add_out(parser)
+    common.add(
+        parser, "--sensor S.json", "an earlier calibration, whose posterior becomes the prior", type=common.parse_path
+    )
     about = (
         "effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
         "one effect drawn from the seed, named at the end)"
     )
-    add(parser, "--truth NAME:V,V", about)
+    common.add(parser, "--truth NAME:V,V", about)
     about = "largest number of readings beyond the first plan (default 400)"
-    add(parser, "--readings N", about, type=parse_count, default=400)
+    common.add(parser, "--readings N", about, type=common.parse_count, default=400)
     about = "largest number of minutes beyond the first plan (default: no limit)"
-    add(parser, "--minutes M", about, type=positive_number_parser("minutes"), default=math.inf)
+    common.add(parser, "--minutes M", about, type=common.positive_number_parser("minutes"), default=math.inf)
     about = "largest number of rounds, including the first (default 6)"
-    add(parser, "--rounds N", about, type=parse_count, default=6)
-    add(parser, "--no-hands", "no person turns or exchanges sheets: take only readings over the sheet in place")
-    add(parser, "--resume", "resume from the rounds in DIR")
-    add_seed_and_quiet(parser)
+    common.add(parser, "--rounds N", about, type=common.parse_count, default=6)
+    common.add(parser, "--no-hands", "no person turns or exchanges sheets: take only readings over the sheet in place")
+    common.add(parser, "--resume", "resume from the rounds in DIR")
+    common.add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -119,9 +109,9 @@ def run(arguments: argparse.Namespace) -> int:
     folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
 
     def kept_message() -> str:
-        return message_to_resume(folder.path, folder.n_readings, "reading", arguments, "--resume")
+        return common.message_to_resume(folder.path, folder.n_readings, "reading", arguments, "--resume")
 
-    print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
+    common.print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     rounds = []
     with contextlib.ExitStack() as stack:
         stack.enter_context(reporting_what_is_kept(kept_message))
@@ -160,12 +150,12 @@ def run(arguments: argparse.Namespace) -> int:
             lambda drawn: report.page_html(
                 found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed
             ),
-            inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN),
+            inputs=common.inputs_and_filled_in_plan(read, out / NEXT_PLAN),
             outdated=OF_ONE_RUN,
             progress=progress,
         )
     known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]
-    return finish(drawings, found.summary(), *known, *renamed, f"written to {out}", quiet=arguments.quiet)
+    return common.finish(drawings, found.summary(), *known, *renamed, f"written to {out}", quiet=arguments.quiet)
 
 
 def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
@@ -213,7 +203,9 @@ def _opened_plan_runner(
                 elif not arguments.no_hands:
                     by_hand(request)
                 elif request.pattern is None or laid:
-                    raise CommandError(f"with --no-hands nobody can {request}; leave it out, or take another plan")
+                    raise common.CommandError(
+                        f"with --no-hands nobody can {request}; leave it out, or take another plan"
+                    )
                 laid.extend([] if request.pattern is None else [request.pattern])
 
             return carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))

@@ -5,14 +5,7 @@ from __future__ import annotations
 import argparse
 
 from probewise._writing import checked_output_file
-from probewise.cli._common import (
-    add,
-    add_seed_and_quiet,
-    parse_path,
-    parse_recording,
-    print_result,
-    tables_and_descriptions,
-)
+from probewise.cli import _common as common
 from probewise.cli._journal import refuse_journal
 from probewise.cli._simulator import add_simulator
 
@@ -20,12 +13,12 @@ from probewise.cli._simulator import add_simulator
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise predict`."""
     about = "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json, calibrated.json or "
-    add(parser, "sensor S.json", f"{about}fitted.json", type=parse_path)
+    common.add(parser, "sensor S.json", f"{about}fitted.json", type=common.parse_path)
     about = "plan or recording, its JSON beside it; or paper or concealed, which ship; with --simulator any table"
-    add(parser, "plan PLAN.csv", about, type=parse_recording)
-    add(parser, "--out P.csv", "where the prediction goes", type=parse_path, required=True)
+    common.add(parser, "plan PLAN.csv", about, type=common.parse_recording)
+    common.add(parser, "--out P.csv", "where the prediction goes", type=common.parse_path, required=True)
     add_simulator(parser)
-    add_seed_and_quiet(parser)
+    common.add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -36,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise._progress import progress_shown
 
     refuse_journal(arguments.plan)
-    read = tables_and_descriptions([arguments.plan]) if arguments.simulator is None else [arguments.plan]
+    read = common.tables_and_descriptions([arguments.plan]) if arguments.simulator is None else [arguments.plan]
     read += [] if arguments.simulator is None else [arguments.simulator]
     out = checked_output_file(arguments.out, arguments.sensor, *read)
     notes: tuple[str, ...] = ()
@@ -58,6 +51,6 @@ def run(arguments: argparse.Namespace) -> int:
             recordings.write_prediction(prediction, out)
             summary = prediction.summary()
     for note in notes:
-        print_result(f"note: {note}", quiet=arguments.quiet)
-    print_result(f"{summary}\nwritten to {out}", quiet=arguments.quiet)
+        common.print_result(f"note: {note}", quiet=arguments.quiet)
+    common.print_result(f"{summary}\nwritten to {out}", quiet=arguments.quiet)
     return 0

@@ -97,8 +97,14 @@ def sections(
         "(near 1 where the model and its noise are right; they were fitted, so a little below)."
     )
     residuals = "Standardised residuals in the order of the readings; 95 % should lie between the dashed lines."
+    own = {"reading": sensor.instrumentation.unit}  # a prior's unit is that of the table of parameters
     priors = (
-        (p.parameter, _printed_unit(p.unit), typeset_numbers(p.distribution), typeset_numbers(p.reason))
+        (
+            p.parameter,
+            _printed_unit(own.get(p.unit, p.unit)),
+            typeset_numbers(p.distribution),
+            typeset_numbers(p.reason),
+        )
         for p in sensor.priors
     )
     run = {

@@ -195,18 +195,18 @@ def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -
         for place in diagnosis.where
     }
     shown: list[Place] = []
-    for place in sorted(
+    order = sorted(
         diagnosis.where, key=lambda p: (-_probability_unknown_depends_on(diagnosis, p), not seen[p.figure_name])
-    ):  # with one scan, a place in all scans and one in that scan are the same
-        if not any(_is_same_interval(diagnosis, place, other) for other in shown):
+    )
+    for place in order:  # with one scan, a place in all scans and one in that scan are the same
+        values = covariate_values(diagnosis, place)
+        if place.start is None or not any(
+            (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
+            and np.array_equal(values, covariate_values(diagnosis, other), equal_nan=True)
+            for other in shown
+        ):
             shown.append(place)
     return [(place, seen[place.figure_name]) for place in shown]
-
-
-def _is_same_interval(diagnosis: Diagnosis, place: Place, other: Place) -> bool:
-    ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
-    at, other_at = (covariate_values(diagnosis, each) for each in (place, other))
-    return ends and place.start is not None and np.array_equal(at, other_at, equal_nan=True)
 
 
 def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:

@@ -24,23 +24,9 @@ from probewise.report.covariates import (
     view_along_scan,
     views_of_place,
 )
+from probewise.report.plots import residuals as plots
 from probewise.report.plots.canvas import BLUE, AxesGrid, stack_of_axes, svg
-from probewise.report.plots.noise import (
-    lost_readings_against_predicted,
-    readings_modulo_step,
-    residual_autocorrelation,
-    residual_histogram,
-    spread_by_level,
-)
 from probewise.report.plots.probabilities import hypothesis_probabilities, n_further_lines
-from probewise.report.plots.residuals import (
-    BEFORE,
-    heldout_gain_by_scan,
-    mean_residuals_along,
-    readings_in_order,
-    residuals_against_covariates,
-    scan_with_residuals,
-)
 from probewise.systems import RunTable
 from probewise.systems.forms import Form
 
@@ -64,14 +50,8 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
-        drawers["gain.svg"] = lambda: svg(
-            heldout_gain_by_scan(
-                gain.heldout_by_scan,
-                gain.heldout_log_density_per_reading,
-                gain.heldout_sd,
-                part=noun_of_held_out_part(diagnosis),
-            )
-        )
+        mean_and_sd, part = (gain.heldout_log_density_per_reading, gain.heldout_sd), noun_of_held_out_part(diagnosis)
+        drawers["gain.svg"] = lambda: svg(plots.heldout_gain_by_scan(gain.heldout_by_scan, *mean_and_sd, part=part))
     for effect in cast(Sequence[Form], diagnosis.repaired.chain.effects):
         if effect.name.startswith("curve:"):
             drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
@@ -106,7 +86,7 @@ def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     above, below = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3) + 0.16 * lines], width_in=_FIGURE_IN)
     shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
-        readings_in_order(diagnosis.recording, ax=above)
+        plots.readings_in_order(diagnosis.recording, ax=above)
     elif isinstance(shown, str):
         _noise_panel_drawer(diagnosis, chance, shown)(above)
     else:
@@ -152,7 +132,7 @@ def _draw_means_along(
 ) -> Axes:
     names = view.category_names_on_axis
     at = view.at if names is None else _spread_within_categories(view.at)
-    return mean_residuals_along(
+    return plots.mean_residuals_along(
         chance.mean_residuals(diagnosis, view, after=after),
         label=view.label,
         unit=diagnosis.recording.plan.instrumentation.unit_after_number,
@@ -184,12 +164,12 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     walking = ", with the walk" if after.has_walk else ""
-    named = ((BEFORE, before), (diagnosis.repair.after_in_words, after))
+    named = ((plots.BEFORE, before), (diagnosis.repair.after_in_words, after))
     models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in named]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
     models = models if diagnosis.repair.changes_predictions else models[:1]
-    return scan_with_residuals(
+    return plots.scan_with_residuals(
         shown.at[rows], readings, models, joined=is_scan_along_line(plan, rows), label=shown.label, unit=unit
     )
 
@@ -206,19 +186,13 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
 
 def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
-    plan = diagnosis.recording.plan
-    unit = plan.instrumentation.unit
-    models = [
-        (BEFORE, diagnosis.repair.before.residuals),
-        (diagnosis.repair.after_in_words, diagnosis.repair.after.residuals),
-    ]
+    plan, repair = diagnosis.recording.plan, diagnosis.repair
+    models = [(plots.BEFORE, repair.before.residuals), (repair.after_in_words, repair.after.residuals)]
+    models = models if repair.changes_predictions else models[:1]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
-    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.repair.before.readings))
-    return svg(
-        residuals_against_covariates(
-            covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_after_number(unit)
-        )
-    )
+    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), repair.before.readings))
+    unit = unit_after_number(plan.instrumentation.unit)
+    return svg(plots.residuals_against_covariates(covariates, models, unit=unit))
 
 
 def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
@@ -240,15 +214,17 @@ def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) 
         residuals[lost] = np.nan
         lost[list(recording.left_out)] = True
         if name == "dropouts":
-            return lambda ax: lost_readings_against_predicted(
+            return lambda ax: plots.lost_readings_against_predicted(
                 diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax
             )
     if name == "quantisation" and "step" in found:
-        return lambda ax: readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
+        return lambda ax: plots.readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
     if name in ("correlated_noise", "random_walk"):
         walking = residuals + diagnosis.repair.after.walk
-        return lambda ax: residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
+        return lambda ax: plots.residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
-        return lambda ax: residual_histogram(residuals / chance.sd, 1.0, ax=ax)
+        return lambda ax: plots.residual_histogram(residuals / chance.sd, 1.0, ax=ax)
     model_sd = chance.sd if np.ptp(chance.sd) > 0 else None
-    return lambda ax: spread_by_level(diagnosis.repair.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax)
+    return lambda ax: plots.spread_by_level(
+        diagnosis.repair.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax
+    )

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
 from probewise.experiment import Exploration, left_out_after_step
 from probewise.inquiry import Grid, UtilityMap, entropy_map
@@ -69,13 +70,11 @@ class RobotSearch:
         """Return the number of the step after `n` readings, or of the last step if the run ended earlier."""
         return min(n, len(self.run.steps))
 
-    def draw_view(self, number: int, *, title: str, ax: Axes) -> Axes:
+    def draw_view(self, number: int, *, title: str, ax: Axes, **options: Any) -> Axes:
         """Draw the robot's view after reading `number`, from 1, with the true shape; return the axes."""
         seen = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in self.run.readings[:number]]
-        step, levels = self.run.steps[number - 1], self.levels
-        return draw_robot_view(
-            step, self.run.experiment, seen, levels=levels, truth_mm=self.truth_mm, title=title, ax=ax
-        )
+        options |= {"levels": self.levels, "truth_mm": self.truth_mm, "title": title, "ax": ax}
+        return draw_robot_view(self.run.steps[number - 1], self.run.experiment, seen, **options)
 
 
 def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
@@ -95,18 +94,16 @@ def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, .
     ]
 
 
-def search_comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Markup:
+_CAPTION = (
+    "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
+    "the whole search, whatever the run. Errors: estimate minus truth, ± posterior sd (mm). One run each: the "
+    "number of readings varies from circle to circle, most of all until the first white reading."
+)
+
+
+def search_comparison_table(searches: Sequence[RobotSearch], caption: str = _CAPTION) -> Markup:
     """Build the table that compares the robots' searches, a row each; the default caption explains bits and errors."""
-    return table(
-        HEADER,
-        search_comparison_rows(searches),
-        caption=caption
-        or (
-            "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
-            "the whole search, whatever the run. Errors: estimate minus truth, ± posterior sd (mm). One run each: the "
-            "number of readings varies from circle to circle, most of all until the first white reading."
-        ),
-    )
+    return table(HEADER, search_comparison_rows(searches), caption=caption)
 
 
 def search_comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
@@ -154,19 +151,9 @@ def paper_view(search: RobotSearch, number: int, *, window_mm: tuple[float, floa
 
     `number` is that of the reading, from 1; `window_mm` are the limits shown: left, right, lower, upper.
     """
-    run, step = search.run, search.run.steps[number - 1]
-    known = f"sd up to {number_text(step.largest_sd_mm, 1)} mm"
-    ax = draw_robot_view(
-        step,
-        run.experiment,
-        [(r.pose.x_mm, r.pose.y_mm, r.value) for r in run.readings[:number]],
-        drawn=fine_entropy_map(run, number),
-        levels=search.levels,
-        truth_mm=search.truth_mm,
-        title=f"{search.model} model, {count_with_noun(number, 'reading')}: {known}",
-        lego_scale=True,
-        ax=ax,
-    )
+    known = f"sd up to {number_text(search.run.steps[number - 1].largest_sd_mm, 1)} mm"
+    title = f"{search.model} model, {count_with_noun(number, 'reading')}: {known}"
+    search.draw_view(number, title=title, ax=ax, drawn=fine_entropy_map(search.run, number), lego_scale=True)
     ax.collections[0].set_linewidth(_OUTLINE)
     left, right, low, high = window_mm
     ax.set(xlim=(left, right), ylim=(low, high))
@@ -180,15 +167,11 @@ def fine_entropy_map(run: Exploration, number: int) -> UtilityMap:
     """
     step, coarse = run.steps[number - 1], run.experiment.grid
     grid = Grid(coarse.width_mm, coarse.height_mm, _FINER * coarse.n_x - 1, _FINER * coarse.n_y - 1)
-    within = _reachable_on_fine_grid(coarse, grid, step.map.reachable[: coarse.n_places])
-    return entropy_map(run.experiment.model, step.samples, grid, grid.plan("field"), reachable=within)
-
-
-def _reachable_on_fine_grid(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:
-    """Return the mask of the fine grid's reachable places, (n_places,): each as the nearest place of the coarse one."""
-    rows = np.rint(np.linspace(0, coarse.n_y - 1, fine.n_y)).astype(np.int64)
-    columns = np.rint(np.linspace(0, coarse.n_x - 1, fine.n_x)).astype(np.int64)
-    return np.asarray(reachable.reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel())
+    # A fine place is within reach as the nearest place of the coarse grid is.
+    rows = np.rint(np.linspace(0, coarse.n_y - 1, grid.n_y)).astype(np.int64)
+    columns = np.rint(np.linspace(0, coarse.n_x - 1, grid.n_x)).astype(np.int64)
+    reachable = step.map.reachable[: coarse.n_places].reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel()
+    return entropy_map(run.experiment.model, step.samples, grid, grid.plan("field"), reachable=reachable)
 
 
 def window_around_runs_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:

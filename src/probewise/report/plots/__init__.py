@@ -16,13 +16,12 @@ _FILES = {
     "apparatus": "arm_and_sensor reach_map",
     "canvas": "AxesGrid PAGE_IN SMALL_PT grid_of_axes png stack_of_axes svg",
     "nested": "corner_plot insertion_plot run_plot trace_plot",
-    "noise": "lost_readings_against_predicted readings_modulo_step residual_autocorrelation residual_histogram "
-    "spread_by_level",
     "probabilities": "audit_matrix effect_probabilities_by_reading hypothesis_probabilities probabilities_by_round",
     "readings": "predicted_and_recorded_by_scan quadrant_patterns readings_by_orientation residuals_by_scan "
     "sensor_orientations standardised_residuals",
-    "residuals": "heldout_gain_by_scan mean_residuals_along readings_in_order recorded_against_predicted "
-    "residuals_against_covariates scan_with_residuals",
+    "residuals": "heldout_gain_by_scan lost_readings_against_predicted mean_residuals_along readings_in_order "
+    "readings_modulo_step recorded_against_predicted residual_autocorrelation residual_histogram "
+    "residuals_against_covariates scan_with_residuals spread_by_level",
     "search": "draw_field_legend information_gained playing_field posterior_widths",
     "ssf": "spatial_sensitivity ssf_by_n_gaussians",
 }

@@ -132,6 +132,12 @@ def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> Axes
     return np.asarray(axes[:, 0], dtype=np.object_)
 
 
+def axes_or_panel(ax: Axes | None, *, height_in: float = 2.7) -> Axes:
+    """Return the axes given, or those of a new figure of one panel, for `svg`."""
+    panel: Axes = ax if ax is not None else stack_of_axes([height_in])[0]
+    return panel
+
+
 def svg(drawing: Axes | AxesGrid) -> bytes:
     """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
     sheet = figure_of(drawing)

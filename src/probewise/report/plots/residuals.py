@@ -1,4 +1,8 @@
-"""Residuals of the calibrated and of the repaired model: along covariates, in one scan, by held-out part."""
+"""Residuals of the calibrated and of the repaired model: along covariates, in one scan, by held-out part.
+
+And tests of the noise against white noise: autocorrelation, spread by predicted reading, tails, lost and rounded ones.
+Residuals and predictions have the shape (n_points,), NaN where there is no usable reading; `unit` is the readings'.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots import canvas
@@ -26,6 +30,11 @@ _LEAST_SHADE = 0.008  # least width of a shaded interval, as a share of the axes
 _MOST_SHADE = 0.5  # the largest, from which on the rest of the axis is what stands out
 _MOST_SCANS = 12
 _RUNNING_MEANS = 20
+_MOST_LAGS = 12
+_STEPS = 12
+_BINS = 41  # of the part of a rounding step: odd, so that rounded readings share the middle one
+_SD_95 = 1.96
+_WHITE = "95 % of white noise"
 
 
 def running_mean_curve(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -55,7 +64,7 @@ def mean_residuals_along(
     significant interval, shaded unless it takes up most of the axis; `names` are those of the values 0, 1, 2 ... of a
     categorical covariate; `after` is the name of the later of the two models.
     """
-    ax = ax if ax is not None else canvas.stack_of_axes([2.7])[0]
+    ax = canvas.axes_or_panel(ax)
     if each is not None:
         _draw_dots(ax, *each, canvas.GREY, "one reading")
     ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
@@ -120,7 +129,7 @@ def scan_with_residuals(
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     """Draw usable readings by reading number, for recordings too short for any other figure."""
     require_recording(recording)
-    ax = ax if ax is not None else canvas.stack_of_axes([2.7])[0]
+    ax = canvas.axes_or_panel(ax)
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=canvas.BLUE, markersize=5)
     canvas.label_axes(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
@@ -158,7 +167,7 @@ def heldout_gain_by_scan(
     ranked = sorted(scans, key=lambda pair: -pair[1])
     if len(ranked) > _MOST_SCANS:
         ranked = [*ranked[: _MOST_SCANS // 2], *ranked[-_MOST_SCANS // 2 :]]
-    ax = ax if ax is not None else canvas.stack_of_axes([1.0 + 0.28 * max(len(ranked), 3)])[0]
+    ax = canvas.axes_or_panel(ax, height_in=1.0 + 0.28 * max(len(ranked), 3))
     gains = np.array([gain for _, gain in ranked])
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[canvas.BLUE if gain >= 0 else canvas.VERMILLION for gain in gains])
@@ -178,7 +187,7 @@ def recorded_against_predicted(
 
     `label` and `unit` are those of the readings.
     """
-    ax = ax if ax is not None else canvas.stack_of_axes([4.2])[0]
+    ax = canvas.axes_or_panel(ax, height_in=4.2)
     there = np.isfinite(readings)
     x, y = predicted[there], readings[there]
     ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")
@@ -206,3 +215,96 @@ def _label_x_by_name(ax: Axes, names: Sequence[str]) -> None:
     at = np.arange(len(names))
     ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize=canvas.SMALL_PT, **slant)
     ax.set_xlim(-0.6, len(names) - 0.4)
+
+
+def residual_autocorrelation(
+    residuals: FloatArray, scan: IntArray, *, rho: float | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the autocorrelation of residuals within scans at lags up to 12, with the 95 % band of white noise.
+
+    `scan` holds scan numbers, (n_points,). Powers of `rho`, the estimated correlation of neighbours, are drawn too.
+    """
+    ax = canvas.axes_or_panel(ax)
+    lags = np.arange(1, min(_MOST_LAGS, max(len(residuals) // 4, 1)) + 1)
+    variance = float(np.nanmean(residuals**2)) or 1.0
+    correlation, chance = np.full(len(lags), np.nan), np.full(len(lags), np.nan)
+    for k, lag in enumerate(lags):
+        pairs = (residuals[lag:] * residuals[:-lag])[scan[lag:] == scan[:-lag]]
+        pairs = pairs[np.isfinite(pairs)]
+        if pairs.size:
+            correlation[k], chance[k] = pairs.mean() / variance, _SD_95 / np.sqrt(pairs.size)
+    ax.fill_between(lags, -chance, chance, color=canvas.GREY, alpha=0.3, linewidth=0, label=_WHITE)
+    ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
+    ax.vlines(lags, 0, correlation, color=canvas.VERMILLION, linewidth=1.4)
+    ax.plot(lags, correlation, "o", color=canvas.VERMILLION, markersize=5, label="residuals")
+    if rho is not None:
+        ax.plot(lags, rho**lags, "--", color=canvas.BLUE, linewidth=1.5, label=f"noise model found: {rho:.2f} per step")
+    ax.set_xticks(lags)
+    return canvas.finish(ax, x="how many readings apart (within a scan or run)", y="correlation (no unit)", plain="y")
+
+
+def spread_by_level(
+    predicted: FloatArray,
+    residuals: FloatArray,
+    *,
+    unit: str,
+    model_sd: FloatArray | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the rms of residuals by predicted reading, in bins of equal numbers, with the band expected of white noise.
+
+    `model_sd`, (n_points,), is the noise sd of each reading under the noise model, which is drawn too.
+    """
+    ax = canvas.axes_or_panel(ax)
+    ok = np.flatnonzero(np.isfinite(residuals) & np.isfinite(predicted))
+    parts = np.array_split(ok[np.argsort(predicted[ok], kind="stable")], max(1, min(_STEPS, len(ok) // 8)))
+    at = np.array([predicted[p].mean() for p in parts])
+    rms = np.array([np.sqrt(np.mean(residuals[p] ** 2)) for p in parts])
+    # The sd of an rms of n normal values is close to sd / sqrt(2 n).
+    root = np.sqrt(2 * np.array([p.size for p in parts]))
+    overall = float(np.sqrt(np.mean(residuals[ok] ** 2)))
+    half = _SD_95 * overall / root
+    ax.errorbar(at, rms, _SD_95 * rms / root, fmt="o", color=canvas.VERMILLION, capsize=3, label="residuals, 95 %")
+    ax.fill_between(at, overall - half, overall + half, color=canvas.GREY, alpha=0.3, linewidth=0, label=_WHITE)
+    if model_sd is not None:
+        by_model = np.array([np.sqrt(np.mean(model_sd[p] ** 2)) for p in parts])
+        ax.plot(at, by_model, "--", color=canvas.BLUE, linewidth=1.6, label="noise model found")
+    ax.set_ylim(bottom=0.0)
+    return canvas.finish(ax, x=f"predicted reading ({unit})", y=f"rms residual ({unit})")
+
+
+def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
+    """Draw a histogram of residuals in noise sds (`sd`, tails left out) on a log scale, with a normal distribution."""
+    ax = canvas.axes_or_panel(ax)
+    z = residuals[np.isfinite(residuals)] / sd
+    most = float(np.clip(np.abs(z).max(initial=4.0), 4.0, 30.0))
+    edges = np.arange(-np.ceil(most), np.ceil(most) + 0.25, 0.5)
+    counts = np.histogram(np.clip(z, edges[0], edges[-1]), edges)[0]
+    ax.bar(edges[:-1] + 0.25, counts, 0.45, color=canvas.VERMILLION, label="residuals")
+    at = np.linspace(-5, 5, 201)
+    normal = len(z) * 0.5 * np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
+    ax.plot(at, normal, "--", color=canvas.BLACK, linewidth=1.4, label="normal distribution")
+    ax.set_yscale("log")
+    ax.set_ylim(0.5, 2 * max(float(counts.max(initial=1)), 1.0))
+    return canvas.finish(ax, x="residual (sds of the noise)", y="readings per half sd", plain="x")
+
+
+def lost_readings_against_predicted(
+    predicted: FloatArray, readings: FloatArray, lost: BoolArray, *, unit: str, ax: Axes | None = None
+) -> Axes:
+    """Draw recorded against predicted readings, (n_points,) each; those where the mask `lost` is True are marked."""
+    ax = canvas.axes_or_panel(ax)
+    ax.plot(predicted[~lost], readings[~lost], "o", color=canvas.GREY, markersize=3, label="reading")
+    ax.plot(predicted[lost], readings[lost], "X", color=canvas.VERMILLION, markersize=7, label="lost reading")
+    ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, color=canvas.BLACK, linewidth=0.7)
+    return canvas.finish(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
+
+
+def readings_modulo_step(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw a histogram of readings' distances from the nearest multiple of `step`; rounded ones share one bin."""
+    ax = canvas.axes_or_panel(ax)
+    finite = readings[np.isfinite(readings)]
+    counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, _BINS, (-0.5, 0.5))
+    ax.bar((edges[:-1] + edges[1:]) / 2, counts, 0.9 / _BINS, color=canvas.VERMILLION, label="readings")
+    ax.axhline(len(finite) / _BINS, color=canvas.GREY, linestyle="--", label="without rounding")
+    return canvas.finish(ax, x=f"distance from a multiple of {step:.4g} {unit} (steps)", y="readings")

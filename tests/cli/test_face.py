@@ -15,7 +15,7 @@ import pytest
 import probewise
 from probewise import verbs
 from probewise.arm import SimulatedArm
-from probewise.cli import VERBS, main
+from probewise.cli import main
 from probewise.diagnosis import audit_plan
 from probewise.effects import VOCABULARY
 from probewise.errors import ParameterError

@@ -36,6 +36,8 @@ from probewise.world.concealed import Quantisation
 from probewise.world.stages import Disturbs
 from probewise.world.world import World
 
+__all__ = ["run_case", "run_challenge"]
+
 _RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 

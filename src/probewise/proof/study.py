@@ -23,6 +23,8 @@ from probewise.proof.estimates import Estimate, estimated_share, mean_with_error
 from probewise.proof.results import TRIAL, misfit
 from probewise.proof.trial import WRONG_MM, Trial, run_trial
 
+__all__ = ["Study", "Summary", "run_study", "summarise"]
+
 _CHANCE = 0.01
 
 

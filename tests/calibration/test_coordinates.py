@@ -9,7 +9,8 @@ import pytest
 
 from probewise.calibration import SSFPrior
 from probewise.calibration.about_peaks import LightContrasts
-from probewise.calibration.coordinates import MomentCoordinates, WholeFootprintCoordinates
+from probewise.calibration.coordinates import WholeFootprintCoordinates
+from probewise.calibration.priors import MomentCoordinates
 from probewise.priors import LogUniform, Uniform
 
 

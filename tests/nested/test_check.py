@@ -13,7 +13,7 @@ from nested_sampling import hard, problems
 from scipy.special import logsumexp
 
 from probewise.errors import DoubtfulResultWarning
-from probewise.nested import Check, NestedResult, SliceMove, merge, run
+from probewise.nested import NestedResult, SliceMove, run
 from probewise.nested.check import check_and_repeat
 from probewise.nested.sampler import run_once
 
@@ -39,23 +39,6 @@ def test_a_hard_evidence_agrees_with_a_fine_grid(name: str) -> None:
     height = known.log_likelihood(known.prior.from_unit_cube(u))
     # Two dimensions leave a kink where the slab lies across the square's corner; in eight the density is smooth.
     assert float(logsumexp(height)) - math.log(len(u)) == pytest.approx(known.log_z, abs=0.012)
-
-
-@pytest.mark.slow
-def test_the_hierarchical_evidence_is_that_of_draws_from_the_population() -> None:
-    """Averaging the likelihood of readings over group means drawn from their population, for fixed mu and tau."""
-    known = hard.hierarchical(3)
-    draw = np.random.default_rng(3)
-    n = 400_000
-    mu, log_tau = draw.uniform(-6, 6, n), draw.uniform(-5, 1.5, n)
-    z = mu[:, None] + np.exp(log_tau)[:, None] * draw.standard_normal((n, 3))
-    theta = np.column_stack([mu, log_tau, z])
-    off = (z - mu[:, None]) * np.exp(-log_tau)[:, None]
-    population = (-0.5 * off**2 - log_tau[:, None] - 0.5 * math.log(2 * math.pi)).sum(axis=1)
-    log_weight = known.log_likelihood(theta) - population
-    log_z = float(logsumexp(log_weight)) - math.log(n) - 3 * math.log(40.0)
-    n_eff = math.exp(2 * logsumexp(log_weight) - logsumexp(2 * log_weight))
-    assert log_z == pytest.approx(known.log_z, abs=3.9 / math.sqrt(n_eff) + 1e-3)
 
 
 @pytest.mark.slow
@@ -167,32 +150,3 @@ def test_a_checked_run_is_repeated_by_its_seed_and_saved_whole(tmp_path: Path) -
     assert first.check == again.check
     first.save(tmp_path / "result.npz")
     assert NestedResult.load(tmp_path / "result.npz").check == first.check
-
-
-@pytest.mark.slow
-def test_a_bias_that_all_runs_share_is_found_when_they_are_merged() -> None:
-    """Each of eight runs is off by 1.5 errors, which its own check lets pass; together they are off by four."""
-    known = problems.problem("Gaussian 4-D")
-    runs = []
-    for part in rng().spawn(8):
-        sound = run(known, rng=part, n_live=40, max_cost=1.0)
-        at = known.log_z + 1.5 * sound.log_z_error
-        check = Check("a second pass", known.log_z, sound.log_z_error / 2, 1.3, 100)
-        shift = at - sound.log_z  # every likelihood a little too great: so is the evidence
-        runs.append(
-            dataclasses.replace(
-                sound,
-                log_z=at,
-                log_likelihood=sound.log_likelihood + shift,
-                log_birth=sound.log_birth + shift,
-                check=check,
-            )
-        )
-    with pytest.warns(DoubtfulResultWarning, match="does not average out"):
-        merged = merge(runs, rng=rng())
-    assert merged.check is not None
-    assert merged.check.log_z == pytest.approx(known.log_z)
-    assert merged.check.distance > 2.5
-    without = merge([dataclasses.replace(r, check=None) for r in runs], rng=rng())
-    assert without.check is None
-    assert not without.warnings

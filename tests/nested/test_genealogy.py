@@ -10,7 +10,7 @@ import pytest
 from nested_sampling.problems import Known, box
 from scipy.stats import chi2
 
-from probewise.nested import Bound, Evaluator, NestedResult, Points, Tally, merge, run
+from probewise.nested import Bound, Evaluator, NestedResult, Points, Tally, run
 
 _STEEP = 2000.0
 
@@ -68,16 +68,3 @@ def test_chains_that_remember_have_an_error_that_knows_it() -> None:
 @pytest.mark.parametrize("options", [{}, {"n_replaced": 7}])
 def test_independent_points_have_no_memory(options: dict[str, int]) -> None:
     assert np.mean([r.memory for r in runs(0.0, 8, **options)]) < 1.1
-
-
-@pytest.mark.slow
-def test_a_merged_run_remembers_as_its_parts_do() -> None:
-    parts = runs(0.8, 4)
-    whole = merge(parts, rng=np.random.default_rng(0))
-    assert whole.memory == pytest.approx(np.mean([r.memory for r in parts]))
-    known = whole.parent >= 0
-    # Parents die after their children are born.
-    parents = whole.parent[known]
-    assert (whole.log_likelihood[parents] > whole.log_birth[known]).all()
-    kept = np.isclose(whole.theta[parents, 1], whole.theta[known, 1], rtol=1e-12)
-    assert 0.5 < kept.mean() < 0.8  # the first rounds draw from the prior, where nothing is kept

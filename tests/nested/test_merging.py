@@ -11,7 +11,7 @@ from nested_sampling import problems
 from scipy.stats import chi2, combine_pvalues
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested import NestedResult, merge, run
+from probewise.nested import Check, NestedResult, merge, run
 from probewise.nested.merge import agreement_of, n_alive_at_death
 from probewise.priors import Product, Uniform
 
@@ -133,6 +133,20 @@ def test_runs_that_disagree_say_so_and_widen_the_error(terraces: list[NestedResu
     assert merged.log_z_error == pytest.approx(np.std([r.log_z for r in far], ddof=1))
     assert "disagree" in merged.warnings[0]
     assert "doubtful: the 3 runs disagree" in merged.summary()
+
+
+def test_a_bias_that_all_runs_share_is_found_and_their_memory_averaged(
+    terraces: list[NestedResult], rng: np.random.Generator
+) -> None:
+    """Each run is off by 1.5 errors from its second estimate, which its own check lets pass; together by four."""
+    checks = [Check("a second pass", r.log_z - 1.5 * r.log_z_error, r.log_z_error / 9, 1.5, 100) for r in terraces]
+    runs = [dataclasses.replace(r, check=check) for r, check in zip(terraces, checks, strict=True)]
+    with pytest.warns(DoubtfulResultWarning, match="does not average out"):
+        merged = merge(runs, rng=rng)
+    assert merged.check is not None
+    assert merged.check.distance > 2.5
+    assert merged.memory == pytest.approx(np.mean([r.memory for r in runs]))
+    assert merge([*runs[:3], dataclasses.replace(runs[3], check=None)], rng=rng).check is None
 
 
 def test_agreement_by_hand(terraces: list[NestedResult]) -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from nested_sampling import problems, seeds, ssf
+from nested_sampling import problems, ssf
 from scipy.special import logsumexp
 
 
@@ -85,40 +85,3 @@ def test_evidence_and_moments_agree_with_importance_sampling(name: str, rng: np.
         mean = float(weight @ values)
         error = math.sqrt(float(weight**2 @ (values - mean) ** 2))
         assert mean == pytest.approx(check.mean, abs=5 * error + 1e-6), check.name
-
-
-def _lines(rng: np.random.Generator, n: int, bias: float = 0.0, factor: float = 1.0) -> list[dict[str, object]]:
-    return [
-        {
-            "problem": "plateau",
-            "seed": seed,
-            "n_live": 100,
-            "log_z": problems.plateau().log_z + 0.2 * (bias + factor * z),
-            "log_z_error": 0.2,
-            "n_evaluations": 1000,
-            "cpu_s": 0.1,
-            "n_eff": 100.0,
-            "insertion_p_value": p,
-            "doubts": ["a doubt"] if seed == 3 else [],
-            "checks": {"mean of p1": [0.5 + 0.03 * (z + bias), 0.3]},
-        }
-        for seed, (z, p) in enumerate(zip(rng.standard_normal(n), rng.random(n), strict=True))
-    ]
-
-
-def test_the_summary_of_seeds_passes_a_right_sampler_and_fails_a_wrong_one(rng: np.random.Generator) -> None:
-    known = problems.Known(
-        problems.plateau().prior,
-        problems.plateau().function,
-        problems.plateau().log_z,
-        checks=(problems.plateau().checks[2],),
-    )
-    right = seeds.summarise(_lines(rng, 400), known)
-    assert right["held"]
-    assert right["checks_held"]
-    assert right["doubtful"] == 1
-    assert right["checks"][0]["rms_z"] == pytest.approx(1.0, abs=0.15)
-    biased = seeds.summarise(_lines(rng, 400, bias=0.5), known)
-    assert not biased["held"]
-    assert not biased["checks_held"]
-    assert not seeds.summarise(_lines(rng, 400, factor=1.5), known)["held"]

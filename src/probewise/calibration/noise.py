@@ -29,25 +29,9 @@ def draw_sd(
     The posterior is sd^(-1 - n) exp(-Q / (2 sd^2)) on [floor, ceiling], so Q / (2 sd^2) follows a
     truncated gamma distribution of shape n / 2, which is drawn by its quantile function.
 
-    Parameters
-    ----------
-    sum_of_squares
-        Q, the sum of squared residuals of each hypothesis, shape (n_samples,).
-    n_readings
-        Number of residuals in each sum.
-    sd_floor, sd_ceiling
-        Bounds of the prior, in the reading's unit.
-    rng
-        Source of randomness.
-
-    Returns
-    -------
-    One sd for each hypothesis, shape (n_samples,).
-
-    Raises
-    ------
-    ParameterError
-        If `n_readings` is below 1 or the bounds are not 0 < floor < ceiling.
+    `sum_of_squares` is Q, of `n_readings` residuals, of each hypothesis, (n_samples,); the bounds of the prior are in
+    the reading's unit. Return one sd for each hypothesis, (n_samples,). ParameterError if `n_readings` is below 1 or
+    the bounds are not 0 < floor < ceiling.
     """
     if n_readings < 1:
         raise ParameterError("n_readings", n_readings, "1 or more")
@@ -72,14 +56,7 @@ def draw_pooled_sd(
 ) -> FloatArray:
     """Draw one noise sd per sample, (n_samples,), from the residuals of all scans: the noise of a new scan.
 
-    Parameters
-    ----------
-    residuals
-        Reading minus prediction of the usable rows, shape (n_samples, n_points).
-    sd_floor, sd_ceiling
-        Bounds of the prior, in the reading's unit.
-    rng
-        Source of randomness.
+    `residuals`: reading minus prediction of the usable rows, (n_samples, n_points); see `draw_sd`.
     """
     total = np.einsum("sp,sp->s", residuals, residuals)
     return draw_sd(total, residuals.shape[1], sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
@@ -96,18 +73,8 @@ def noise_by_scan(
 ) -> tuple[ScanNoise, ...]:
     """Summarise the posterior of every scan's noise sd, in the order of the scans; scans without rows are left out.
 
-    Parameters
-    ----------
-    residuals
-        Reading minus prediction of the usable rows, shape (n_samples, n_points).
-    scan
-        Data set of each row, an index into `scan_names`, shape (n_points,); ShapeError for another.
-    scan_names
-        Names of the data sets.
-    sd_floor, sd_ceiling
-        Bounds of the prior, in the reading's unit.
-    rng
-        Source of randomness.
+    `residuals`: reading minus prediction of the usable rows, (n_samples, n_points); `scan`: data set of each row, an
+    index into `scan_names`, (n_points,), else ShapeError.
     """
     if residuals.shape[1:] != scan.shape:
         raise ShapeError(

@@ -17,7 +17,6 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, rounding_error
-from probewise.calibration.coordinates import MomentCoordinates, view_by_kind_and_gaussian
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
@@ -212,6 +211,95 @@ class SSFPrior:
         if self.unit_mass_mm2 is None:
             return np.ones_like(determinant)
         return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, _TINY))
+
+
+@dataclass(frozen=True)
+class MomentCoordinates:
+    """Moments of a mixture as sampling coordinates, each determined by few readings (`probewise.priors.Coordinates`).
+
+    A scan across an edge determines the variance along its direction, which is a nonlinear combination of A, B and C.
+    Here the coordinates of each Gaussian are its centre, the log variances along x' and y', and the inverse hyperbolic
+    tangent of its correlation. The first Gaussian also has its log amplitude in the prior's unit and, instead of its
+    own centre, that of the whole footprint; the others have the log ratio of their mass to the first one's. I_min and
+    I_max follow.
+
+    The Gaussians are sorted by mass, greatest first, and the prior's density is multiplied by N!: the readings do not
+    depend on the labels, so N! equal modes become one and the evidence is unchanged.
+    """
+
+    prior: SSFPrior
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        """Map parameters to coordinates, both (n_samples, 6 N + 2)."""
+        n = self.prior.n_gaussians
+        g = theta[:, : 6 * n].reshape(len(theta), n, 6)
+        det = g[..., 3] * g[..., 4] - g[..., 5] ** 2
+        log_mass = np.log(g[..., 0]) - 0.5 * np.log(det)
+        order = np.argsort(-log_mass, axis=1)
+        g, det, log_mass = (
+            np.take_along_axis(g, order[..., None], axis=1),
+            np.take_along_axis(det, order, axis=1),
+            np.take_along_axis(log_mass, order, axis=1),
+        )
+        out = np.empty_like(g)
+        out[:, 0, 0] = np.log(g[:, 0, 0] / self.prior.amplitude_at_unit_mass(det[:, 0]))
+        out[:, 1:, 0] = log_mass[:, 1:] - log_mass[:, :1]
+        out[..., 1:3] = g[..., 1:3]
+        out[..., 3] = np.log(0.5 * g[..., 4] / det)
+        out[..., 4] = np.log(0.5 * g[..., 3] / det)
+        out[..., 5] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
+        out[:, 0, 1:3] = np.einsum("nk,nkj->nj", _mass_shares(out), g[..., 1:3])
+        return np.concatenate([out.reshape(len(theta), 6 * n), theta[:, 6 * n :]], axis=1)
+
+    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates to parameters, (n_samples, 6 N + 2); also return the log prior density, (n_samples,).
+
+        It is the density in the coordinates, -inf where the Gaussians are not sorted.
+        """
+        n = self.prior.n_gaussians
+        # One contiguous row per kind of coordinate, for speed.
+        g = np.ascontiguousarray(view_by_kind_and_gaussian(x))
+        # A sampler may try extreme values, which must not overflow.
+        log_variance = g[3:5].clip(-100.0, 100.0)
+        log_first, log_ratio = g[0, 0].clip(-100.0, 50.0), g[0, 1:].clip(-100.0, 0.0)
+        r = np.tanh(g[5])
+        rest = np.maximum(1.0 - r * r, 1e-12)
+        log_rest, both = np.log(rest), log_variance[0] + log_variance[1]
+        out = np.empty_like(g)
+        np.divide(0.5 * np.exp(-log_variance), rest, out=out[3:5])
+        product = out[3] * out[4]
+        np.multiply(-r, np.sqrt(product), out=out[5])
+        log_a = np.log(self.prior.amplitude_at_unit_mass(product[0] * rest[0])) + log_first
+        # The others' masses follow from the first one's: a = mass times the root of A B - C^2.
+        half_log_det = -0.5 * (both + log_rest)
+        log_a = np.concatenate([log_a[None], log_ratio + (log_a - half_log_det[0]) + half_log_det[1:]])
+        np.exp(log_a, out=out[0])
+        ratio = np.exp(log_ratio)
+        whole = 1.0 + ratio.sum(axis=0)
+        out[1:3] = g[1:3]
+        out[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
+        theta = x.copy()
+        view_by_kind_and_gaussian(theta)[...] = out
+        # d(A, B, C) / d(log variances, arctanh r), d a / d log a, and the first centre from that of the whole.
+        jacobian = log_a - 1.5 * both - 2.0 * log_rest
+        log_density = self.prior.log_prob_by_kind(out, theta[:, -2], theta[:, -1])
+        log_density += jacobian.sum(axis=0)
+        log_density += 2.0 * np.log(whole)
+        log_density += math.lgamma(n + 1) - 3.0 * n * math.log(2.0)
+        falling = (g[0, 1:2] <= 0.0).all(axis=0) & (g[0, 2:] <= g[0, 1:-1]).all(axis=0)
+        usable = falling & (np.abs(g[3:5]) < 100.0).all(axis=(0, 1)) & np.isfinite(log_density)
+        return theta, np.where(usable, log_density, -np.inf)
+
+
+def view_by_kind_and_gaussian(columns: FloatArray) -> FloatArray:
+    """View the Gaussians' columns, in (n_samples, 6 N + 2), as (6 kinds, N, n_samples), without a copy."""
+    return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
+
+
+def _mass_shares(g: FloatArray) -> FloatArray:
+    """Each Gaussian's share of the mass, from coordinates (n_samples, N, 6) -> (n_samples, N)."""
+    ratio = np.concatenate([np.ones((len(g), 1)), np.exp(np.clip(g[:, 1:, 0], -100.0, 0.0))], axis=1)
+    return np.asarray(ratio / ratio.sum(axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)

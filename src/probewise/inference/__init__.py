@@ -7,7 +7,6 @@ of known sd, and one of rounded readings; any sensor model works with any of the
 from probewise.inference.likelihoods import GaussianKnown, Naive, StudentT, log_sigma_integral
 from probewise.inference.problem import (
     Likelihood,
-    Problem,
     SensorProblem,
     reading_span,
     sd_ceiling,
@@ -20,7 +19,6 @@ __all__ = [
     "GaussianKnown",
     "Likelihood",
     "Naive",
-    "Problem",
     "Rounded",
     "SensorProblem",
     "StudentT",

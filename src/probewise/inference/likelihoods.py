@@ -22,6 +22,8 @@ from probewise._arrays import FloatArray, IntArray, floats, frozen_int, read_onl
 from probewise._kinds import checked_number
 from probewise.errors import ParameterError, ShapeError
 
+_LOG_2PI = math.log(2 * math.pi)
+
 
 def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return readings, (n_points,), minus predictions, (n_samples, n_points): (n_samples, n_points).
@@ -41,11 +43,7 @@ def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
 class Naive:
     """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd (paper, "The Naive Likelihood").
 
-    Parameters
-    ----------
-    mu_black, sd_black, mu_white, sd_white
-        Mean and sd of readings over black and over white, in units of the reading; the means differ, else
-        ParameterError.
+    Mean and sd of readings over black and over white, in units of the reading; the means differ, else ParameterError.
     """
 
     mu_black: float
@@ -93,17 +91,11 @@ class Naive:
         return np.asarray(over_white @ (white - black) + black.sum())
 
 
-_LOG_2PI = math.log(2 * math.pi)
-
-
 @dataclass(frozen=True, eq=False)
 class GaussianKnown:
     """Likelihood of independent Gaussian noise of known sd.
 
-    Parameters
-    ----------
-    sd
-        In units of the reading: a number, or one for each reading, (n_points,); ParameterError if not above 0.
+    `sd`: in units of the reading, a number, or one for each reading, (n_points,); ParameterError if not above 0.
     """
 
     sd: ArrayLike
@@ -132,7 +124,6 @@ class GaussianKnown:
         return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - constant)
 
 
-_LOG_2PI = math.log(2 * math.pi)
 _TINY = 1e-250
 _N_TERMS = 100
 _MANY_GROUPS = 16  # from here on, sums in place are cheaper than a product with a mostly zero matrix
@@ -145,18 +136,8 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
     gamma functions of order n/2. It is computed in log space from the tail in which both ends lie,
     so it is accurate from square = 0 to squares whose integral underflows.
 
-    Parameters
-    ----------
-    square
-        Sum of squared residuals, 0 or more.
-    n
-        Number of residuals, greater than 0; broadcasts with `square`.
-    low, high
-        Bounds of sigma, 0 < low < high.
-
-    Returns
-    -------
-    Natural log of the integral, of the arguments' broadcast shape.
+    `square`: sum of squared residuals, 0 or more; `n`: number of residuals, greater than 0, broadcasts with `square`.
+    The bounds of sigma are 0 < low < high.
     """
     s, a = np.asarray(square, dtype=np.float64), np.asarray(n, dtype=np.float64) / 2.0
     with np.errstate(over="ignore"):
@@ -236,12 +217,8 @@ class StudentT:
     For a data set of N readings with sum of squares S, and L = ln(sd_ceiling / sd_floor): (2 pi)^(-N/2) / L times the
     integral of sigma^(-N-1) exp(-S / 2 sigma^2) from floor to ceiling.
 
-    Parameters
-    ----------
-    groups
-        Label of the data set of each reading, (n_points,); any integers.
-    sd_floor, sd_ceiling
-        Bounds of every data set's sigma, in units of the reading: 0 < floor < ceiling, else ParameterError.
+    `groups`: label of the data set of each reading, (n_points,), any integers. `sd_floor`, `sd_ceiling`: bounds of
+    every data set's sigma, in units of the reading, 0 < floor < ceiling, else ParameterError.
     """
 
     groups: IntArray
@@ -252,7 +229,9 @@ class StudentT:
         groups = frozen_int(self.groups)
         if groups.ndim != 1:
             raise ShapeError(f"groups have shape {groups.shape}; allowed: (n_points,)")
-        _require_ordered_bounds(self.sd_floor, self.sd_ceiling)
+        if not 0 < self.sd_floor < self.sd_ceiling < math.inf:
+            bounds = self.sd_floor, self.sd_ceiling
+            raise ParameterError("(sd_floor, sd_ceiling)", bounds, "0 < floor < ceiling, finite")
         object.__setattr__(self, "groups", groups)
 
     @cached_property
@@ -305,8 +284,3 @@ class StudentT:
         variance = self.sums_by_group(np.square(residual)) / self.group_sizes
         per_set = 1.0 / variance.clip(self.sd_floor**2, self.sd_ceiling**2)
         return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
-
-
-def _require_ordered_bounds(sd_floor: float, sd_ceiling: float) -> None:
-    if not 0 < sd_floor < sd_ceiling < math.inf:
-        raise ParameterError("(sd_floor, sd_ceiling)", (sd_floor, sd_ceiling), "0 < floor < ceiling, finite")

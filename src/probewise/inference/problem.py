@@ -31,19 +31,6 @@ class Likelihood(Protocol):
         ...
 
 
-class Problem(Protocol):
-    """The interface of an inference problem: a prior, and the log likelihood of parameters."""
-
-    @property
-    def prior(self) -> Prior:
-        """The prior; its names are those of the parameters."""
-        ...
-
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Return the log likelihood of each hypothesis, (n_samples, n_params) -> (n_samples,)."""
-        ...
-
-
 def require_model(model: object) -> None:
     """Raise ParameterError unless `model` has `names` and `predict`, as a sensor model has."""
     allowed = "a sensor model such as Chain(ssf, levels, scene), with names and predict(theta, plan)"
@@ -142,12 +129,7 @@ def sd_ceiling(recording: Recording) -> float:
 def student_t_of(recording: Recording, groups: IntArray | None = None) -> StudentT:
     """Build the Student-t likelihood of a recording's usable readings, with its `sd_floor` and `sd_ceiling`.
 
-    Parameters
-    ----------
-    recording
-        The recording.
-    groups
-        Data set of each row of the plan, (n_points,), each with its own noise sd; by default its scan.
+    `groups`: data set of each row of the plan, (n_points,), each with its own noise sd; by default its scan.
     """
     rows = recording.plan.scan if groups is None else np.asarray(groups)
     return StudentT(rows[recording.usable], sd_floor(recording), sd_ceiling(recording))

@@ -79,19 +79,14 @@ class Rounded:
     Parameters
     ----------
     sd
-        Sd of the noise before rounding, in units of the reading.
+        Sd of the noise before rounding, in units of the reading; above 0, else ParameterError.
     step
-        Width of a reading's cell, in units of the reading; readings are whole multiples of it, or an end of the scale
-        that rounds to one beyond.
+        Width of a reading's cell, above 0; readings are whole multiples of it, or an end of the scale that rounds to
+        one beyond.
     low, high
-        Ends of the scale, in units of the reading. The outermost reading that each allows covers everything beyond.
+        Ends of the scale, low < high. The outermost reading that each allows covers everything beyond.
     whole_steps
         Whether readings lie on multiples of `step`; if not, the ends of the scale are not rounded to such multiples.
-
-    Raises
-    ------
-    ParameterError
-        If `sd` or `step` is not above 0, or `low` not below `high`.
     """
 
     sd: float

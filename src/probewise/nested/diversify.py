@@ -44,30 +44,16 @@ def diversify(
     The step size is drawn over orders of magnitude. The proposals depend only on the samples as given, not on the
     chains' states, so the posterior is left invariant.
 
-    Parameters
-    ----------
-    theta
-        Posterior samples, possibly repeated, (n_samples, n_params).
-    problem
-        Prior, with `log_prob`, and likelihood.
-    rng
-        Source of randomness.
-    n_steps
-        Metropolis-Hastings steps per sample; the paper takes about 1000.
-
-    Returns
-    -------
-    theta, tally
-        The samples after their steps, (n_samples, n_params), and statistics of the steps.
+    `theta` are posterior samples, possibly repeated, (n_samples, n_params); `problem` has a prior with `log_prob`.
+    Return the samples after `n_steps` each (the paper takes about 1000), and statistics of the steps.
 
     Raises
     ------
-    ParameterError
-        If a sample has zero posterior density, `n_steps` is negative, or the prior has no `log_prob`.
+    ParameterError, ShapeError
+        If a sample has zero posterior density, `n_steps` is negative, the prior has no `log_prob`, or `theta` has
+        another shape, or no rows.
     NotConvergedError
         If the likelihood fails.
-    ShapeError
-        If `theta` has another shape, or no rows.
     """
     require_rng(rng)
     start = np.array(floats(theta, "theta"))

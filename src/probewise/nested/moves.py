@@ -42,24 +42,10 @@ class Move(Protocol):
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Draw as many new points as `start` has, each distributed as the prior above `bound`.
+        """Draw as many new points as `start` has, each distributed as the prior above `bound`; also return the tally.
 
-        Parameters
-        ----------
-        start
-            Points above the bound, at which chains may begin.
-        bound
-            The level and label that new points must exceed.
-        live
-            All known points above the bound, in the evaluator's space, those of `start` included, (n, n_params).
-        evaluate
-            The problem.
-        rng
-            Source of randomness.
-
-        Returns
-        -------
-        The new points, and the move's tally.
+        Chains may begin at the points `start`, above the bound. `live` are all known points above it in the evaluator's
+        space, those of `start` included, (n, n_params).
         """
         ...
 
@@ -121,22 +107,10 @@ class SliceMove:
       counterpart in the other, accepted with the ratio of their volumes. Hops keep the share of live points in each
       mode from drifting.
 
-    Parameters
-    ----------
-    steps_per_param
-        Steps of a chain per parameter, not counting hops.
-    width
-        Bracket width in units of the live points' sd along the line.
-    axes
-        Share of the steps along axes.
-    differences
-        Share of the steps along differences of live points; the rest are along random directions.
-    hops
-        Number of hops per chain, where there are clusters.
-    target
-        Target number of candidates per step, on average; the width is tuned to it.
-    fewest_steps
-        Least number of steps of a chain.
+    A chain has `steps_per_param` steps per parameter, at least `fewest_steps`, and `hops` hops more where there are
+    clusters. Of the steps a share `axes` is along axes and a share `differences` along differences of live points; the
+    rest are along random directions. `width` is the bracket's, in units of the live points' sd along the line; it is
+    tuned so that a step takes `target` candidates on average.
     """
 
     steps_per_param: float = 1.0
@@ -293,17 +267,8 @@ class KernelMove:
     where many proposals lie above the bound. Where fewer than one in `patience` is accepted, the chains of `otherwise`
     go on from the ends.
 
-    Parameters
-    ----------
-    moves
-        Target number of accepted proposals per chain, on average. A chain with none stays at its start, which is valid;
-        about exp(-moves) of the chains do.
-    n_proposals
-        Number of proposals per chain, tuned to that target.
-    patience
-        Largest number of proposals per acceptance.
-    otherwise
-        The move used where kernels are inefficient.
+    `moves` is the target number of accepted proposals per chain, on average; a chain with none stays at its start,
+    which is valid, and about exp(-moves) of the chains do. `n_proposals`, of a chain, is tuned to that target.
     """
 
     moves: float = 10.0

@@ -109,10 +109,7 @@ class _NormalScores:
 def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
     """Return the sampling coordinates: the prior's, if it has any, else the unit cube.
 
-    Raises
-    ------
-    ParameterError
-        If `periodic` names parameters that the prior does not have, or the prior has coordinates.
+    ParameterError if `periodic` names parameters that the prior does not have, or the prior has coordinates.
     """
     if hasattr(prior, "coordinates"):
         if periodic:
@@ -415,10 +412,7 @@ def make_problem(
     periodic
         Names of parameters whose range is periodic.
 
-    Raises
-    ------
-    ParameterError
-        If an argument has the wrong type, or names and prior do not match.
+    ParameterError if an argument has the wrong type, or names and prior do not match.
     """
     require_callable("log_likelihood", log_likelihood, "a function of a point, such as lambda x: -0.5 * (x**2).sum()")
     named = _as_named_prior(prior, names, vectorized)
@@ -435,10 +429,7 @@ def as_problem(
     pass_dict: bool,
     periodic: Sequence[str],
 ) -> Samplable:
-    """Return a problem as it is, or make one of a log likelihood and its prior by `make_problem`.
-
-    ParameterError if a problem comes with one of the other arguments, or a likelihood without a prior.
-    """
+    """Return a problem as it is, or make one of a log likelihood and its prior by `make_problem`."""
     if hasattr(problem, "log_likelihood") or isinstance(problem, type):
         if prior is not None or names is not None or vectorized or pass_dict or periodic:
             raise ParameterError(
@@ -501,9 +492,9 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
     if isinstance(names, str):
         raise ParameterError("names", names, "a list of names: names=['x', 'y']")
     given = None if names is None else tuple(str(name) for name in names)
+    made: Prior
     if isinstance(prior, type):
         raise ParameterError("prior", prior, _ALLOWED_PRIOR)
-    made: Prior
     if isinstance(prior, Mapping):
         made = Product({str(name): _as_marginal(f"prior[{name!r}]", one) for name, one in prior.items()})
     elif hasattr(prior, "names") and hasattr(prior, "from_unit_cube"):
@@ -512,11 +503,11 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
         chosen = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
         if len(chosen) != len(prior):
             raise ParameterError("names", names, f"{len(prior)} names, one for each distribution")
+        if len(set(chosen)) != len(chosen):
+            raise ParameterError("names", names, "each name once")
         made = Product(
             {n: _as_marginal(f"prior[{i}]", one) for i, (n, one) in enumerate(zip(chosen, prior, strict=True))}
         )
-        if len(made.names) != len(prior):
-            raise ParameterError("names", names, "each name once")
     elif callable(prior) and not hasattr(prior, "logpdf"):
         if given is None:
             allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"

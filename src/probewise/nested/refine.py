@@ -31,6 +31,7 @@ _MOST_FITTED = 2000
 _SURPRISED = 0.01
 _HELD_OUT = 1 / 3
 _MOST_HELD = 1000
+_N_UPDATED = 1000  # samples of the old posterior whose likelihood is evaluated anew
 _APART = 4.0  # errors between the log Z of draws and of the refined run, above which they disagree
 _FIRST = 0.75  # share of the better form of density in the mixture
 
@@ -47,7 +48,7 @@ def refine(
     n_pilots: int = 2,
     look: bool = True,
 ) -> Weighted:
-    """Reduce the error of a run's evidence and posterior by importance sampling.
+    """Reduce the error of a run's evidence and posterior by importance sampling; see `Weighted.sound` before its use.
 
     Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot round a few
     draws of each are weighted; the form with the larger effective sample size gets the larger share of the mixture, and
@@ -65,10 +66,6 @@ def refine(
     ----------
     result
         A run of the same problem, or an earlier refinement.
-    problem
-        Prior and likelihood.
-    rng
-        Source of randomness.
     n_draws
         Number of final draws, 100 or more; every pilot round takes a quarter of that, at least 100, in addition.
     n_pilots
@@ -76,11 +73,6 @@ def refine(
     look
         Whether to look for parts of the posterior that the run has missed, if the run has no check (it was made with
         `max_cost=1`): for at most about a quarter of the run's evaluations. A part that matters is added to the doubts.
-
-    Returns
-    -------
-    Weighted
-        Check `sound` before using it instead of the run's evidence.
 
     Raises
     ------
@@ -93,14 +85,11 @@ def refine(
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)
     n_pilots = checked_whole("n_pilots", n_pilots)
-    evaluate = Evaluator(problem)
-    if result.names != evaluate.names:
-        raise ParameterError("result.names", result.names, f"the problem's names {evaluate.names}")
+    evaluate, space = _evaluator_and_space(problem, result, "result")
     if not result.names:
         raise ParameterError("result", "a run without parameters", "one with some; the evidence is exact without")
-    space = unbounded_space_of(problem.prior)
     n_lineages = effective_lineages(result)
-    fitted, held = split_off_held_out(result, n_lineages, space, rng)
+    fitted, held = _split_off_held_out(result, n_lineages, space, rng)
     known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
@@ -113,16 +102,14 @@ def refine(
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
         best = mixture_of_proposals(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
-            known.append(resampled_for_fit(better.theta, better.log_weight, space, rng))
-    found = with_error_of_lost_parts(
-        draw_and_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng
-    )
-    doubts = inherited_doubts(found, result)
+            known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
+    found = draw_and_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng)
+    found = with_error_of_lost_parts(found, n_lineages, space, rng)
+    doubts = _inherited_doubts(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
         # A generator of its own: the refined evidence is the same with and without the look.
         missed, n_calls = doubts_of_missed_parts(result, found, problem, run_once, rng=rng.spawn(1)[0])
-        found = replace(found, n_calls=found.n_calls + n_calls)
-        doubts = (*doubts, *missed)
+        found, doubts = replace(found, n_calls=found.n_calls + n_calls), (*doubts, *missed)
     return replace(found, inherited=doubts)
 
 
@@ -149,20 +136,14 @@ def update(
         Posterior of the same parameters given fewer readings.
     problem
         Prior, and likelihood of all readings.
-    rng
-        Source of randomness.
     fall_back
-        Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`.
+        Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`; then its samples are
+        returned, and its result as `run`.
     n_draws
         Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
     prior_share
         Share of the draws that come from the prior, 0 to below 1: they cover regions without samples of the old
         posterior, and bound the weights.
-
-    Returns
-    -------
-    Weighted
-        With the samples and `run` of the fallback where it was used.
 
     Raises
     ------
@@ -179,22 +160,17 @@ def update(
     n_draws = checked_whole("n_draws", n_draws)
     if not 0 <= checked_number("prior_share", prior_share) < 1:
         raise ParameterError("prior_share", prior_share, "0 or more, below 1")
-    evaluate = Evaluator(problem)
-    if previous.names != evaluate.names:
-        raise ParameterError("previous.names", previous.names, f"the problem's names {evaluate.names}")
-    space = unbounded_space_of(problem.prior)
-    rows = np.unique(previous.draw_rows(1000, rng=rng))
+    evaluate, space = _evaluator_and_space(problem, previous, "previous")
+    rows = np.unique(previous.draw_rows(_N_UPDATED, rng=rng))
     theta = previous.theta[rows]
-    log_likelihood = evaluate.log_likelihood(theta)
-    log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
+    log_weight = previous.log_weight[rows] + evaluate.log_likelihood(theta) - previous.log_likelihood[rows]
     # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
-    log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
+    log_weight = log_weight + np.maximum(-math.log(_N_UPDATED) - previous.log_weight[rows], 0.0)
     n_eff, k = n_effective(log_weight), math.inf
     # Without parameters there is no density to fit: the fallback evaluates the only hypothesis.
     if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
-        proposal = fit_wide_and_narrow_proposals(
-            resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
-        )[-1]
+        fitted = _resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng)
+        proposal = fit_wide_and_narrow_proposals(fitted, rng=rng)[-1]
         found = draw_and_weigh(proposal, prior_share, None, space, evaluate, n_draws=n_draws, rng=rng)
         found = with_error_of_lost_parts(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
@@ -206,7 +182,15 @@ def update(
     return Weighted(*samples, *evidence, evaluate.n_calls + fallen.n_calls, k, run=fallen)
 
 
-def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
+def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tuple[Evaluator, Space]:
+    """Return a problem's evaluator and unbounded coordinates; ParameterError if `found` has other parameters."""
+    evaluate = Evaluator(problem)
+    if found.names != evaluate.names:
+        raise ParameterError(f"{name}.names", found.names, f"the problem's names {evaluate.names}")
+    return evaluate, unbounded_space_of(problem.prior)
+
+
+def _inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
     """Return the doubts about `result`, which `found` refines, in words.
 
     For a run also where its log Z, or that of its check, is more than four errors from that of `found`.
@@ -236,23 +220,20 @@ def effective_lineages(found: Posterior) -> float:
     return found.n_live / max(found.information * found.memory, 1.0)
 
 
-def split_off_held_out(
+def _split_off_held_out(
     found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
 ) -> tuple[FloatArray, HeldOutSamples]:
-    """Split samples at random, two to one, into those for fitting a density and held-out ones.
-
-    The first are (n, n_params), in coordinates of `space`, resampled by weight. `n_lineages`: effective number of all.
-    """
+    """Split samples at random, two to one, into those for fitting a density, by weight, and held-out ones."""
     lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
     rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
     held = HeldOutSamples(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
-    return resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
+    return _resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 
-def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
+def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
     """Resample for fitting a density; return distinct samples in coordinates of `space`, (n, n_params).
 
     As many are drawn by weight as the effective sample size, at most 2000, and a third as many by the square root of

@@ -328,13 +328,10 @@ def run_once(
     if not checked_finite_number("checkpoint_every_s", checkpoint_every_s) >= 0:
         raise ParameterError("checkpoint_every_s", checkpoint_every_s, "0 or more")
     if executor is not None:
-        allowed = (
-            "an executor such as concurrent.futures.ProcessPoolExecutor(), or None; for a count pass n_workers too"
-        )
-        require_like("executor", executor, ("map", "submit"), allowed)
+        made = "an executor such as concurrent.futures.ProcessPoolExecutor(), or None; for a count pass n_workers too"
+        require_like("executor", executor, ("map", "submit"), made)
     require_flag("return_interrupted", return_interrupted)
-    if n_workers is not None:
-        n_workers = checked_whole("n_workers", n_workers)
+    n_workers = n_workers if n_workers is None else checked_whole("n_workers", n_workers)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers, most_calls=max_calls)
     n_params = len(evaluate.names)
     n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)

@@ -41,16 +41,8 @@ class _Candidates:
 class SliceChains:
     """Chains that start at points above a bound, one at each.
 
-    Parameters
-    ----------
-    start
-        The starts, n_chains of them.
-    live
-        All known points above the bound, those of `start` included, (n, n_params).
-    space
-        The space in which chains step.
-    width
-        Bracket width in units of the live points' sd along the line.
+    `live`: all known points above the bound, those of `start` included, (n, n_params). `width`: of a bracket, in units
+    of the live points' sd along the line.
     """
 
     def __init__(self, start: Points, live: FloatArray, space: Space, *, width: float) -> None:

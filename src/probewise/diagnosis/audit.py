@@ -687,9 +687,11 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in bind_forms(about).items() if name_of_first_copy(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
-    on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds if kind is not NoisePerRun}
+    on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds}
     if len(own.scan_names) > 1:
         on_noise[NoisePerRun.name] = NoisePerRun(own.scan_names)
+    else:
+        del on_noise[NoisePerRun.name]
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])

@@ -9,7 +9,7 @@ added greedily by information per minute, as long as there is information to gai
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,12 +38,10 @@ from probewise.recordings.plan import Plan, Recording
 def slopes_split_by_run(slopes: FloatArray, of_run: IntArray, plan: Plan) -> tuple[FloatArray, FloatArray]:
     """Split slopes of planned readings into those by values already fitted, and those by values of the new runs.
 
-    A planned run is predicted at the values of a recorded run, by whose coordinates the slopes are.
-
-    `slopes`: slopes by a model's coordinates, (n_points, n_params); `of_run`: indices of the coordinates of which each
-    run has a value of its own, with a standard normal prior; `plan`: the planned runs, (n_points,). Returns the slopes
-    with 0 in the columns `of_run`, (n_points, n_params); and, for each run and each of these columns that acts there, a
-    column that is 0 in all other runs, (n_points, n_columns).
+    A planned run is predicted at the values of a recorded run, by whose coordinates the slopes (n_points, n_params)
+    are; `of_run`: indices of those of which each run has a value of its own, with a standard normal prior. Returns the
+    slopes with 0 in the columns `of_run`; and, for each run and each of these columns that acts there, a column that is
+    0 in all other runs, (n_points, n_columns).
     """
     shared = slopes.copy()
     shared[:, of_run] = 0.0
@@ -165,12 +163,8 @@ def measurement_separating_rivals(
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
-                gains[k] = (
-                    mutual_information_lower_bound(
-                        [predictive.take_readings(together) for predictive in predictives], weights
-                    )
-                    - told
-                )
+                taken_together = [predictive.take_readings(together) for predictive in predictives]
+                gains[k] = mutual_information_lower_bound(taken_together, weights) - told
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
@@ -343,7 +337,14 @@ def choose_next_measurement(
     probabilities: dict[Names, float] = {(): by_mean.get((), 0.0) + unknown}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
-    found = _fits_of_open_hypotheses(searched, null, {names: probabilities[names] for names in ranked})
+    found, held = list[WeighedFit](), 0.0  # those of the fewest hypotheses that hold .95, at most five
+    for names in ranked:
+        candidate = searched.best_refit_of(names, searched.certain) if names else null
+        if candidate is not None:
+            found.append(candidate)
+        held += probabilities[names]
+        if found and (held >= SETTLED or len(found) == _MOST_RIVALS):
+            break
     sd = found[0].whitened_sd
     if is_unknown or (len(found) == 1 and found[0] is null and unknown > 1 - SETTLED):
         if unknown_shows_in is None:
@@ -352,7 +353,14 @@ def choose_next_measurement(
     if is_settled(searched) or len(found) == 1:
         return None
     as_calibrated = f"{apparatus.words.null} as calibrated"
-    rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated, apparatus) for candidate in found]
+    rivals = []
+    for fit in found:
+        label = hypothesis_in_words(fit.names, nothing=as_calibrated)
+        slopes, own_sd = fit.found.slopes, fit.whitened_sd
+        free = residual_degrees_of_freedom(slopes, own_sd, len(slopes))
+        root = covariance_root(slopes, own_sd**2 * len(slopes) / free)
+        of_run = apparatus.coordinates_of_new_run(fit.found.model)
+        rivals.append(Rival(label, fit.found.model, fit.found.z, root, probabilities[fit.names], of_run))
     asked = measurement_separating_rivals(rivals, sd, plan, apparatus)
     return asked if asked is not None and asked.expected_log_bayes_factor >= ENOUGH_NATS else None
 
@@ -361,25 +369,3 @@ def is_settled(searched: Searched) -> bool:
     """Return whether one hypothesis on the mean, other than an unknown effect, has .95, whatever the noise."""
     by_mean = searched.posterior.marginal_over_noise
     return any(p >= SETTLED and names != ("unknown",) for names, p in by_mean.items())
-
-
-def _fits_of_open_hypotheses(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
-    """Return the refits of the fewest hypotheses on the mean that hold .95, at most five, the most probable first."""
-    found: list[WeighedFit] = []
-    held = 0.0
-    for names, probability in ranked.items():
-        candidate = searched.best_refit_of(names, searched.certain) if names else null
-        if candidate is not None:
-            found.append(candidate)
-        held += probability
-        if found and (held >= SETTLED or len(found) == _MOST_RIVALS):
-            break
-    return found
-
-
-def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str, apparatus: Apparatus) -> Rival:
-    label, found = hypothesis_in_words(candidate.names, nothing=as_calibrated), candidate.found
-    of_run = apparatus.coordinates_of_new_run(found.model)
-    slopes, sd = found.slopes, candidate.whitened_sd
-    root = covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd, len(slopes)))
-    return Rival(label, found.model, found.z, root, probability, of_run)

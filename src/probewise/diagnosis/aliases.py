@@ -150,15 +150,12 @@ def _projected_basis(problem: Linearised, whitened: FloatArray) -> tuple[FloatAr
 def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
     """List the pairs of effects whose projected templates have a cosine of 0.9 or more, the most collinear first.
 
-    `problem`: the linearised null fit, whose parameters are projected out of the templates; `templates`: for each
-    effect, its best-fitting template columns (n_points, k); `otherwise`: the `settle_by` of each pair; its `readings`
-    are 0.
+    `templates`: for each effect, its best-fitting template columns (n_points, k); `otherwise`: the `settle_by` of each
+    pair; its `readings` are 0.
     """
-    out = []
-    for pair in itertools.combinations(sorted(templates), 2):
-        cosine = projected_cosine(problem, templates[pair[0]], templates[pair[1]])
-        if cosine >= ALIAS_COSINE:
-            out.append(Alias(pair, cosine, otherwise, 0))
+    pairs = list(itertools.combinations(sorted(templates), 2))
+    cosines = [projected_cosine(problem, templates[one], templates[other]) for one, other in pairs]
+    out = [Alias(pair, c, otherwise, 0) for pair, c in zip(pairs, cosines, strict=True) if c >= ALIAS_COSINE]
     return sorted(out, key=lambda alias: -alias.cosine)
 
 
@@ -168,14 +165,10 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
     An effect's template is the best-fitting entry of its bank (its changes of readings, at a grid of its parameters).
     """
     prepared, misfit_templates = searched.prepared, searched.misfit_templates
-    telling: dict[str, FloatArray] = {}
-    chosen: dict[str, EffectEntry] = {}
+    telling, chosen = dict[str, FloatArray](), dict[str, EffectEntry]()
     for name, effect in prepared.effects.items():
-        if (
-            name in prepared.noise_effect_names
-            or effects_out_of_vocabulary((name,))
-            or name_of_first_copy(name) is not None
-        ):
+        is_copy = name_of_first_copy(name) is not None
+        if name in prepared.noise_effect_names or effects_out_of_vocabulary((name,)) or is_copy:
             continue
         templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
         blocks = OrthonormalBlocks.of(problem, templates.columns)

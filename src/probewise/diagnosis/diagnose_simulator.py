@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.diagnosis import Diagnosis
-from probewise.diagnosis.engine import Thorough, diagnosis_of_search, search_prepared
+from probewise.diagnosis.engine import Thorough, diagnose_prepared, diagnosis_of_search
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.left_out import (
     NEAR_END,
@@ -144,11 +144,9 @@ def diagnose_system(
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
         if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
             prior = prepared.apparatus.prior_odds(prepared.effects)
-            found = search(replace(prepared, effects={}), prior=prior, progress=told)
-            searched = replace(found, prepared=prepared)
-        else:
-            searched = search_prepared(prepared, progress=told)
-        return diagnosis_of_search(searched, thorough=thorough, progress=told, rng=rng)
+            found = replace(search(replace(prepared, effects={}), prior=prior, progress=told), prepared=prepared)
+            return diagnosis_of_search(found, thorough=thorough, progress=told, rng=rng)
+        return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
 
     diagnosis = fit_and_diagnose(simulator)
     needed = finer_step_for_repair(diagnosis)

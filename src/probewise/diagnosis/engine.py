@@ -116,13 +116,8 @@ def diagnose_prepared(
     prepared: Prepared, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
 ) -> Diagnosis:
     """Run the pipeline of `diagnose` on the input of any apparatus, with the same returns and errors."""
-    searched = search_prepared(prepared, progress=progress)
+    searched = search_with_formulas(search(prepared, progress=progress), progress=progress)
     return diagnosis_of_search(searched, thorough=thorough, progress=progress, rng=rng)
-
-
-def search_prepared(prepared: Prepared, *, progress: Progress = silent) -> Searched:
-    """Run the pipeline's first part: search for the combinations of effects, then with formulas."""
-    return search_with_formulas(search(prepared, progress=progress), progress=progress)
 
 
 def diagnosis_of_search(

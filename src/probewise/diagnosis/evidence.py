@@ -122,13 +122,7 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
-    if any(law.walk.size or law.before.size for law in laws):
-        turned = np.stack([law(joined) for law in laws])
-    else:
-        turned = joined * np.stack([law.kept / law.sd for law in laws])[:, :, None]
-    if any(law.carry.any() for law in laws) and not any(law.walk.size or law.before.size for law in laws):
-        carry = np.stack([law.carry for law in laws])[:, 1:, None]
-        turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
+    turned = np.stack([law(joined) for law in laws])
     gram = turned.transpose(0, 2, 1) @ turned
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
     steps, least = np.zeros_like(jr), np.array([law.sigma_floor**2 for law in laws])
@@ -223,11 +217,6 @@ class Linearised:
         return cls(basis, residual, law, sd, n_points)
 
     @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        return len(self.basis)
-
-    @property
     def n_kept(self) -> int:
         """Number of readings that are not lost; rows of lost ones are 0 and carry no information."""
         return self.law.n_kept
@@ -249,21 +238,15 @@ class Linearised:
     def absorbing_shift(self, found: Fit, change: FloatArray) -> FloatArray:
         """Return the shift of coordinates, (n_params,), at which predictions plus `change` (n_points,) fit best."""
         slopes = self.whiten(found.slopes)
-        left = self.law(found.residuals - change)[:, None]
-        normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.fisher_information)]))[
-            :, 0
-        ]
+        sigma = np.array([self.sd * math.sqrt(self.law.fisher_information)])
+        normal = self.law.normal_pseudo_residuals(self.law(found.residuals - change)[:, None], sigma)[:, 0]
         shift = slopes.T @ (normal / self.sd) - found.z
         return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
 
     def draw_null_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw projected residuals under the null, in noise sds, (n_rows, n_draws)."""
-        eps = np.concatenate(
-            [
-                self.law.draw_pseudo_residuals(n_draws, rng=rng),
-                rng.standard_normal((self.n_rows - self.n_points, n_draws)),
-            ]
-        )
+        of_readings = self.law.draw_pseudo_residuals(n_draws, rng=rng)
+        eps = np.concatenate([of_readings, rng.standard_normal((len(self.basis) - self.n_points, n_draws))])
         return np.asarray(eps - self.basis @ (self.basis.T @ eps))
 
 
@@ -523,10 +506,7 @@ def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArr
 
 
 def linearised_sizes(found: Fit, law: NoiseLaw, usable: IntArray, names: Sequence[str]) -> Iterator[float]:
-    """Iterate over the lambdas of some effects of a fit: norm, in noise sds, of the change after a linearised refit.
-
-    Arguments as of `log_probability_effects_detectable`; `names` are those of the effects.
-    """
+    """Iterate over the lambdas of some effects of a fit: norm, in noise sds, of the change after a linearised refit."""
     sd = found.sd / np.sqrt(law.fisher_information)
     slopes = law(found.slopes) / sd
     for name in names:

@@ -296,11 +296,8 @@ def fit(
     """Find the maximum of the posterior, with the noise sd that is most likely at each point.
 
     Maximises the log likelihood under the noise model minus |z|^2 / 2, over the box |z| <= 6. Each step differentiates
-    in one vectorised prediction and tries five dampings in another.
-
-    `start`: coordinates to start from, shape (n_params,); `tolerance`: gain of a step, in nats, below which to stop;
-    `hopeless_above`: objective above which a fit is of no use: one that would stay above it if all steps left gained as
-    much as the last is given up.
+    in one vectorised prediction and tries five dampings in another. A step that gains less than `tolerance` nats is the
+    last; a fit that would stay above `hopeless_above` if all steps left gained as much as the last is given up.
     """
     (found,) = fit_each_start(
         model, recording, [start], law, max_steps=max_steps, tolerance=tolerance, hopeless_above=hopeless_above
@@ -386,9 +383,8 @@ def _fit_coroutine(
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
         tries = _points_after_steps(z, tries)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
-        about = (
-            [difference_points_and_steps(at) for at in tries] if model.sensor.predicts_in_bulk and not nearby else []
-        )
+        in_bulk = model.sensor.predicts_in_bulk
+        about = [difference_points_and_steps(at) for at in tries] if in_bulk and not nearby else []
         batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if nearby else None]
         if nearby and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
             batch = np.concatenate([batch, (yield tries[1:])])
@@ -397,14 +393,12 @@ def _fit_coroutine(
         values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)
         short = expected > tolerance and not best - values.min() > _AS_EXPECTED * expected
-        if short and model.sensor.predicts_in_bulk:
+        if short and in_bulk:
             # In a curved valley that is oblique to the coordinates, damping by their scales stops every step.
             more = _points_after_steps(z, _steps_along_valley(curvature, downhill))
             found = objective((yield more)[:, usable], more)
-            tries, values = (
-                np.concatenate([tries, more]),
-                np.append(values, np.where(np.isfinite(found), found, np.inf)),
-            )
+            tries = np.concatenate([tries, more])
+            values = np.append(values, np.where(np.isfinite(found), found, np.inf))
         at = int(np.argmin(values))
         gained = best - float(values[at])
         settled = gained < tolerance

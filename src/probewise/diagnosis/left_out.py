@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from probewise._arrays import BoolArray, IntArray
+from probewise._arrays import BoolArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.prepared import MOST_READINGS, positions_in_stretches
@@ -81,26 +81,18 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
         raise ParameterError(what, where, allowed)
     filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
-    return replace(
-        recording,
-        plan=cast(Plan, filled),
-        readings=np.where(lost, np.nan, recording.readings),
-        notes=(*recording.notes, _note_on_gaps(system, int(lost.sum()), gaps + table.first_line))
-        if lost.any()
-        else recording.notes,
-    )
-
-
-def _note_on_gaps(system: System, n_lost: int, gaps: IntArray) -> str:
-    """Say that readings are left out, since cells are missing in the rows `gaps` of the file."""
-    lost = count_with_noun(n_lost, "reading")
-    if system.simulator.law is None:
-        return f"{lost} left out: a column that the simulator reads is missing there"
-    more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
-    return (
-        f"{lost} left out: a column that the law reads is missing in row {gaps[0]}{more}, "
-        "and a law ends at the first gap of its run; fill the gaps in to use them"
-    )
+    said = list[str]()
+    if lost.any():
+        note = f"{count_with_noun(int(lost.sum()), 'reading')} left out: a column that the "
+        more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
+        if system.simulator.law is None:
+            note += "simulator reads is missing there"
+        else:
+            note += f"law reads is missing in row {gaps[0] + table.first_line}{more}, and a law ends at the first gap "
+            note += "of its run; fill the gaps in to use them"
+        said.append(note)
+    kept, notes = np.where(lost, np.nan, recording.readings), (*recording.notes, *said)
+    return replace(recording, plan=cast(Plan, filled), readings=kept, notes=notes)
 
 
 def without_readings_at_stop(

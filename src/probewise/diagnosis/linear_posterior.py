@@ -60,10 +60,6 @@ class AmplitudeGroup:
         unit = self.prior.to_unit_cube(values * self.typical)
         return np.asarray(np.clip(ndtri(unit), -FARTHEST, FARTHEST))
 
-    def log_prior_of_value(self, values: FloatArray) -> FloatArray:
-        """Return the log prior density of values of one amplitude, in typical sizes, (n_samples,), up to a constant."""
-        return np.asarray(self.prior.log_prob(values[:, None] * self.typical))
-
     def values_by_coordinates(self, z: FloatArray) -> FloatArray:
         """Return the derivatives of the values by the coordinates at z (n,), (n, n)."""
         steps = _STEP * np.eye(len(z))
@@ -138,15 +134,12 @@ def two_sided_amplitude_groups(found: Fit) -> Iterator[AmplitudeGroup]:
         if isinstance(own, SharedScalePrior):
             every = tuple(range(columns.start, columns.stop))
             yield AmplitudeGroup(every, own, own.typical, own.component_sds / own.typical)
-        for k, one in _two_sided_priors(effect).items():
-            alone = Product({own.names[k]: one})
-            yield AmplitudeGroup((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
-
-
-def _two_sided_priors(effect: NamedEffect[Any]) -> dict[int, HeavyTailedPrior]:
-    marginals = list(getattr(effect.prior, "marginals", {}).values())
-    own = {k: marginals[k] for k in effect.amplitudes if k < len(marginals)}
-    return {k: prior for k, prior in own.items() if isinstance(prior, HeavyTailedPrior) and not prior.positive}
+        marginals = list(getattr(own, "marginals", {}).values())
+        for k in (k for k in effect.amplitudes if k < len(marginals)):
+            one = marginals[k]
+            if isinstance(one, HeavyTailedPrior) and not one.positive:
+                alone = Product({own.names[k]: one})
+                yield AmplitudeGroup((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,9 +261,7 @@ class ConditionallyLinearDensity:
         `covariance`: of the coordinates, by Laplace's approximation, (n_params, n_params).
         """
         able = list(_grid_coordinates_with_amplitudes(found))
-        if not able:
-            return None
-        view = LinearView.of(found)
+        view = LinearView.of(found) if able else None
         if view is None:
             return None
         at, amplitude = max(able, key=lambda each: covariance[each[0], each[0]])
@@ -280,7 +271,10 @@ class ConditionallyLinearDensity:
         while (out := on_grid(low, high)) is not None and not out._ends_are_improbable and high - low < 2 * FARTHEST:
             reach *= _WIDER
             low, high = max(found.z[at] - reach, -FARTHEST), min(found.z[at] + reach, FARTHEST)
-        return None if out is None else on_grid(*out._probable_range)
+        if out is None:
+            return None
+        first, last = np.flatnonzero(out._probable_mask)[[0, -1]]  # with one more on either side
+        return on_grid(float(out.nodes[max(first - 1, 0)]), float(out.nodes[min(last + 1, _N_NODES - 1)]))
 
     @classmethod
     def _on_grid(
@@ -337,11 +331,6 @@ class ConditionallyLinearDensity:
         n = len(self.nodes) // 8
         return not (self._probable_mask[:n].any() or self._probable_mask[-n:].any())
 
-    @property
-    def _probable_range(self) -> tuple[float, float]:
-        first, last = np.flatnonzero(self._probable_mask)[[0, -1]]
-        return float(self.nodes[max(first - 1, 0)]), float(self.nodes[min(last + 1, len(self.nodes) - 1)])
-
     def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""
         shares = np.exp(self.log_shares).ravel()
@@ -367,7 +356,7 @@ class ConditionallyLinearDensity:
         volume = np.log(np.diagonal(self.roots[node], axis1=2, axis2=3)).sum(axis=2)
         in_values = logsumexp(self.log_shares[node] + volume - 0.5 * np.sum(eps**2, axis=2), axis=1)
         # From a density of the amplitude's value to that of its coordinate.
-        log_prior = self.amplitude.log_prior_of_value(x[:, self._own])
+        log_prior = self.amplitude.prior.log_prob(x[:, [self._own]] * self.amplitude.typical)
         with np.errstate(invalid="ignore"):
             out = in_values - 0.5 * z[:, at[0]] ** 2 - log_prior + self.view.log_volume(z)
         # Outside the support of the null's prior: there the posterior is 0, whatever this density.

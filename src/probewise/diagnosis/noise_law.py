@@ -91,9 +91,8 @@ class RoundedNormal:
 
     def add_rounding(self, normal: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Turn standard normal noise into that of whitened readings in units of sigma, (n_points, n_draws) both."""
-        return np.asarray(
-            normal * self.normal_sd + self.half / self.whitening_sd * rng.uniform(-1.0, 1.0, normal.shape)
-        )
+        uniform = rng.uniform(-1.0, 1.0, normal.shape)
+        return np.asarray(normal * self.normal_sd + self.half / self.whitening_sd * uniform)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return 2 pi, (k,): Laplace's integral over log sigma is then 1, since sigma is known."""
@@ -262,18 +261,9 @@ class NoiseLaw:
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
         above, carry = self._nearest_taken_before(rows)
         before = np.maximum(above, 0) if self.before.size else self.before
-        wide = self.wide[rows] if self.wide.size else self.wide
-        censored = self.censored[rows] if self.censored.size else self.censored
-        return replace(
-            self,
-            sd=self.sd[rows],
-            carry=carry,
-            lost=self.lost[rows],
-            walk=walk,
-            before=before,
-            wide=wide,
-            censored=censored,
-        )
+        some = ("sd", "lost", "wide", "censored")
+        taken = {name: own[rows] for name in some if (own := getattr(self, name)).size}
+        return replace(self, carry=carry, walk=walk, before=before, **taken)
 
     def _nearest_taken_before(self, rows: BoolArray) -> tuple[IntArray, FloatArray]:
         """Return for each reading taken the nearest taken before it, and its correlation with that: (n_taken,) both.
@@ -456,17 +446,13 @@ class Tail:
     ) -> FloatArray:
         """Return the most likely sigma, (k,), by EM; `n_points` rows count, the others (lost readings) are 0."""
         if self.is_normal:
-            return np.asarray(
-                np.maximum(np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points), max(floor, LEAST_SCALE))
-            )
-        squares = whitened**2
-        if start is None:  # start from the interquartile range of the readings not lost, which is robust to the tail
+            rms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points)
+            return np.asarray(np.maximum(rms, max(floor, LEAST_SCALE)))
+        squares, sigma = whitened**2, start
+        if sigma is None:  # from the interquartile range of the readings not lost, which is robust to the tail
             middle = len(whitened) - n_points // 2 - 1
-            sigma = (
-                np.maximum(np.partition(np.abs(whitened), middle, axis=0)[middle] / MAD_OF_NORMAL, floor) + LEAST_SCALE
-            )
-        else:
-            sigma = start
+            median = np.partition(np.abs(whitened), middle, axis=0)[middle]
+            sigma = np.maximum(median / MAD_OF_NORMAL, floor) + LEAST_SCALE
         for _ in range(_EM_STEPS if start is None else 3):
             weighed = self._relative_precisions(squares / sigma**2) * squares
             sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + LEAST_SCALE
@@ -519,17 +505,11 @@ def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
 
     Its parameters are (k,).
     """
-    one = len(laws) == 1
-    if laws[0].flat:
-        sd = laws[0].sd_beside_rounding
-        if one:
-            return RoundedNormal(laws[0].flat, laws[0].sigma, sd)
-        return RoundedNormal(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]), sd)
     if any(law.wide.size for law in laws):  # which readings are wide is in their sds
         return Tail(0.0, 1.0)
-    if one:
-        return Tail(laws[0].share, laws[0].times)
-    return Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))
+    pairs = [(law.flat, law.sigma) if laws[0].flat else (law.share, law.times) for law in laws]
+    first, second = pairs[0] if len(laws) == 1 else np.array(pairs).T
+    return RoundedNormal(first, second, laws[0].sd_beside_rounding) if laws[0].flat else Tail(first, second)
 
 
 @lru_cache(maxsize=256)

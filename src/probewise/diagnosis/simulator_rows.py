@@ -89,12 +89,8 @@ def _variations_of_run(
     if not ends:
         return
     if any(np.ptp(values) > 0 for values in own.values()):
-        yield (
-            "reversed",
-            f"take {of} with {join_names(list(ends))} in reverse order",
-            {k: v[::-1] for k, v in own.items()},
-            1.0,
-        )
+        words = f"take {of} with {join_names(list(ends))} in reverse order"
+        yield "reversed", words, {k: v[::-1] for k, v in own.items()}, 1.0
     if table.has_varying_time:
         yield "slow", f"take {of} again, twice as slowly", {}, 2.0
     n = len(rows)
@@ -113,19 +109,11 @@ def _variations_of_run(
     for name, (low, high) in ends.items():
         for kind, (said, shape) in shapes.items():
             text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{0.5 * (low + high):.4g}")
-            yield (
-                f"{name} {kind}",
-                f"take {of} with {name} {text}",
-                {name: _rounded_to_range(shape(low, high), low, high)},
-                1.0,
-            )
-
-
-def _rounded_to_range(values: FloatArray, low: float, high: float) -> FloatArray:
-    if not low < high:
-        return values
-    decimals = int(np.ceil(3 - np.log10(high - low)))
-    return np.where((values == low) | (values == high), values, np.round(values, decimals))
+            values = shape(low, high)
+            if low < high:  # to a thousandth of the range or finer, so that they can be set; its ends stay
+                rounded = np.round(values, int(np.ceil(3 - np.log10(high - low))))
+                values = np.where((values == low) | (values == high), values, rounded)
+            yield f"{name} {kind}", f"take {of} with {name} {text}", {name: values}, 1.0
 
 
 def _planned_run(

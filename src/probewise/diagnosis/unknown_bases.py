@@ -78,11 +78,12 @@ def bank_of_unknown_effects(
             sign[covariate.rows] = covariate.values
     along_axis = slope * np.where(sign == 0, 1.0, sign)
     ways = _BasisMultipliers(np.ones(len(signal)), signal, along_axis, sign, len(starts))
-    found = [
-        (_basis_family_name(covariate, template), template)
-        for covariate in covariates
-        for template in _bases_of_covariate(covariate, ways)
-    ]
+    found = []
+    for covariate in covariates:  # a family such as "time" or, of windows and steps, "time, locally"
+        name = covariate.published_name if covariate.scan is None else f"{covariate.published_name} within scans"
+        for template in _bases_of_covariate(covariate, ways):
+            whole = template.shape[1] > 1 or covariate.name == "slope"
+            found.append((name if whole else f"{name}, locally", template))
     found += [(PRODUCTS, template) for template in _product_bases(multiplied, len(signal))]
     if scan is not None:
         found += [(MEMORY, template[back]) for template in _memory_bases(signal[order], starts)]
@@ -111,9 +112,8 @@ def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: 
     products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
     if products.size == 0 or formulas.widths.size == 0:
         return bases
-    held = _are_held(
-        _orthonormal_blocks(bases.take_templates(products), problem).u, _orthonormal_blocks(formulas, problem)
-    )
+    own = _orthonormal_blocks(bases.take_templates(products), problem)
+    held = _are_held(own.u, _orthonormal_blocks(formulas, problem))
     return bases.take_templates(np.setdiff1d(np.arange(len(bases.widths)), products[held]))
 
 
@@ -134,24 +134,12 @@ def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> 
     spans, other_spans = (
         [u[:, np.any(u, axis=0)] for u in np.split(each.u, each.starts[1:], axis=1)] for each in (blocks, others)
     )
-    by_rank: dict[int, list[FloatArray]] = {}
-    for span in other_spans:
-        by_rank.setdefault(span.shape[1], []).append(span)
-    return np.array(
-        [
-            span.shape[1] > 1
-            and any(
-                np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE for other in by_rank.get(span.shape[1], [])
-            )
-            for span in spans
-        ]
-    )
 
+    def is_twin(span: FloatArray) -> bool:
+        alike = (other for other in other_spans if other.shape[1] == span.shape[1] > 1)
+        return any(np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE for other in alike)
 
-def _basis_family_name(covariate: Covariate, template: FloatArray) -> str:
-    name = covariate.published_name
-    where = name if covariate.scan is None else f"{name} within scans"
-    return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
+    return np.array([is_twin(span) for span in spans])
 
 
 def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:

@@ -377,12 +377,10 @@ class Refits:
 
     def fits_better_at_z(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
         """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""
-        found, law = candidate.found, candidate.law
-        readings = found.predicted + found.residuals
-        predicted = model.predict(z[None, :])[0, self.templates.usable]
+        found = candidate.found
+        left = found.predicted + found.residuals - model.predict(z[None, :])[0, self.templates.usable]
         with np.errstate(all="ignore"):  # of predictions that ran away: no number is less
-            whitened = law(readings - predicted)[:, None]
-            there = float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0]) + 0.5 * float(z @ z)
+            there = _minus_log_likelihood(candidate.law, left) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
     def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit | None:
@@ -537,11 +535,12 @@ def is_significantly_better(candidate: WeighedFit, parent: WeighedFit) -> bool:
 
 
 def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
-    def minus_log_likelihood(fitted: Fit) -> float:
-        whitened = law(fitted.residuals)[:, None]
-        return float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0])
+    return 2 * (_minus_log_likelihood(law, beyond.residuals) - _minus_log_likelihood(law, found.residuals)) > 3.0
 
-    return 2 * (minus_log_likelihood(beyond) - minus_log_likelihood(found)) > 3.0
+
+def _minus_log_likelihood(law: NoiseLaw, residuals: FloatArray) -> float:
+    whitened = law(residuals)[:, None]
+    return float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0])
 
 
 def _variant_to_show(log_z: FloatArray, variants: Sequence[NamedEffect[Any]]) -> int:

@@ -67,7 +67,8 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
     """Extend a verdict's reason by whether nested sampling agrees, by how many nats not, and its first warning."""
     if not weighings:
         return reason
-    apart = ", ".join(f"{w.label} by {_signed(w.gap)} nats" for w in weighings if not w.agree)
+    signed = {w.label: f"{w.gap:+.1f}".replace("-", "−") for w in weighings if not w.agree}
+    apart = ", ".join(f"{label} by {gap} nats" for label, gap in signed.items())
     doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
     if not apart:
         said = "nested sampling agrees to within a nat plus its standard error"
@@ -76,10 +77,6 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
     else:
         said = f"nested sampling moves {apart}, and the probabilities are by its evidence"
     return f"{reason.rstrip('.')}; {said}{'' if doubt is None else f', but its runs gave a warning ({doubt})'}."
-
-
-def _signed(nats: float) -> str:
-    return f"{nats:+.1f}".replace("-", "−")
 
 
 N_LIVE = 100
@@ -204,9 +201,8 @@ def _weigh_by_nested_sampling(
         explored = run(once)
 
         def weighing_from_samples(theta: FloatArray) -> Weighing:
-            found = _evidence_near_posterior(theta, once, run, rng)
-            log_z = found.log_z + log_factor
-            return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
+            log_z, error, doubts = _evidence_near_posterior(theta, once, run, rng)
+            return replace(weighing, nested=log_z + log_factor, error=error, doubts=doubts)
 
         told = weighing_from_samples(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
@@ -249,7 +245,9 @@ class _ProgressBar:
     def __init__(self, progress: Progress, n: int, minutes: tuple[float, float]) -> None:
         self._progress, self._n, self._runs = progress, n, 0
         self._at, self._depth = -1, 0.0
-        self._stage = f"weighing {n} hypotheses again, about {_minutes_in_words(minutes)}"
+        least, most = minutes
+        said = "a minute" if most < 1 else f"{max(least, 1):.0f} to {math.ceil(most):.0f} minutes"
+        self._stage = f"weighing {n} hypotheses again, about {said}"
         progress(self._stage, 0, n * _STEPS)
 
     def show_round(self, k: int, label: str, state: nested.RoundSummary) -> None:
@@ -264,17 +262,10 @@ class _ProgressBar:
         self._progress(self._stage, done, self._n * _STEPS, f"{label}, run {self._runs}")
 
 
-def _minutes_in_words(minutes: tuple[float, float]) -> str:
-    least, most = minutes
-    if most < 1:
-        return "a minute"
-    return f"{max(least, 1):.0f} to {math.ceil(most):.0f} minutes"
-
-
 def _evidence_near_posterior(
     theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator
-) -> _Evidence:
-    """Estimate the evidence by up to four runs from priors near the posterior, until its error is below 0.3 nats.
+) -> tuple[float, float, tuple[str, ...]]:
+    """Return log evidence, its error, and warnings, by up to four runs from priors near the posterior, to 0.3 nats.
 
     The first is near the samples `theta`, each further one near the samples of the last; the result is their weighted
     mean, or that of a run whose refinement has a smaller error.
@@ -286,19 +277,10 @@ def _evidence_near_posterior(
         runs.append(found)
         sharper = nested.refine(found, nearer, rng=rng, look=False)
         if sharper.sound and sharper.log_z_error < found.log_z_error:
-            return _Evidence(sharper.log_z, sharper.log_z_error)
+            return sharper.log_z, sharper.log_z_error, ()
         weights = np.array([1.0 / own.log_z_error**2 for own in runs])
         error = float(weights.sum() ** -0.5)
         if error <= _SHARP or len(runs) == _MOST_RUNS:
             log_z = float(np.average([own.log_z for own in runs], weights=weights))
-            return _Evidence(log_z, error, tuple(doubt for own in runs for doubt in own.warnings))
+            return log_z, error, tuple(doubt for own in runs for doubt in own.warnings)
         theta = found.samples(_N_SAMPLES, rng=rng)
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """Log evidence, its standard error, and warnings."""
-
-    log_z: float
-    error: float
-    warnings: tuple[str, ...] = ()

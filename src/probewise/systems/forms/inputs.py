@@ -162,24 +162,18 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     if about.system.caller is None:
         most = max_n_trial_frequencies(len(about.table))
     frequencies = trial_frequencies(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE, _LEAST_WAVES)
-    form = WaveForm(
-        name=f"periodic_error:{name}",
-        stage=Stage.INPUT,
-        parameters={
-            "a": POSITIVE,
-            "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(1 / frequencies[0]) / 0.9),
-            "phase": PHASE,
-        },
-        units=(name, name, "rad"),
-        covariates=(covariate_of_column(name),),
-        act=act,
-        entries=sine_and_cosine_entries(1.0, 1 / frequencies),
-        says=lambda m, s: (
-            f"{name} has a periodic error with an amplitude of {value_with_sd(m[0], s[0], '')} "
-            f"and a period of {value_with_sd(m[1], s[1], '')}, both in units of {name}"
-        ),
-        counted_from=origin_in_words(name, origin),
-    )
+    longest, shortest = (float(1 / frequencies[k]) for k in (0, -1))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, period = (value_with_sd(mean[k], sd[k], "") for k in (0, 1))
+        return (
+            f"{name} has a periodic error with an amplitude of {size} and a period of {period}, both in units of {name}"
+        )
+
+    priors = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
+    bank, along = sine_and_cosine_entries(1.0, 1 / frequencies), (covariate_of_column(name),)
+    own = (f"periodic_error:{name}", Stage.INPUT, priors, (name, name, "rad"), along, act, bank, says)
+    form = WaveForm(*own, counted_from=origin_in_words(name, origin))
     yield from about.scaled(form, 1e-4 * float(np.std(values)))
 
 

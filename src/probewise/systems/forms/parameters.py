@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import unit_of_name
-from probewise.priors import LogUniform, Marginal
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, ActInTime, Form, flag, says_value
 from probewise.systems.forms.modulations import (
@@ -89,14 +89,8 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
 
     def variant(as_factor: bool) -> Form:
         value, prior = flag(as_factor)
-        return replace(
-            form,
-            parameters={**cast(Mapping[str, Marginal], form.parameters), _AS_FACTOR: prior},
-            units=(*form.units, "1"),
-            act=act,
-            entries=np.insert(form.entries, 1, value, axis=2),
-            says=says,
-        )
+        priors, bank = {**form.marginals, _AS_FACTOR: prior}, np.insert(form.entries, 1, value, axis=2)
+        return replace(form, parameters=priors, units=(*form.units, "1"), act=act, entries=bank, says=says)
 
     linear = variant(False)
     there = about.system.parameters(about.theta, about.table)[name]

@@ -85,7 +85,7 @@ class _Term:
 def formula_forms(about: ReferenceFit) -> Iterator[Form]:
     """Yield all proposals: terms of the reading or of a state's rate, thresholds, and shapes in time or of a column."""
     yield from _reading_formula_forms(about)
-    columns = _varying_columns_by_name(about)
+    columns = _complete_columns(about)
     for name in columns:
         yield from _threshold_form(about, name)
     for name, values in columns.items():
@@ -202,11 +202,8 @@ def _terms_of_column(name: str) -> Iterator[_Term]:
         yield _Term(text.format(f"{_RADIANS[unit]:.6g} {name}"), (angle,), function)
 
 
-def _varying_columns_by_name(about: ReferenceFit) -> dict[str, FloatArray]:
-    """Return the columns of numbers that vary and are never missing, except the reading and its declared sd."""
-    own = about.system.simulator
-    kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
-    return {c: v for c, v in kept.items() if np.isfinite(v).all() and varies(v)}
+def _complete_columns(about: ReferenceFit) -> dict[str, FloatArray]:
+    return {name: values for name, values in about.varying_columns.items() if np.isfinite(values).all()}
 
 
 def _rounded_mean(values: FloatArray) -> float:
@@ -222,7 +219,7 @@ def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _Scaled
 
 def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
     own = about.system.simulator
-    columns = _varying_columns_by_name(about)
+    columns = _complete_columns(about)
     shapes = [term for name in columns for term in _terms_of_column(name)]
     if about.table.has_varying_time and about.table.time is not None:
         columns[about.table.time] = about.table.time_s
@@ -276,7 +273,7 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
     variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if varies(values)]
-    columns = {name: values for name, values in _varying_columns_by_name(about).items() if name not in states}
+    columns = {name: values for name, values in _complete_columns(about).items() if name not in states}
     variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
     rate = trial_rate(about, state)
     known: list[FloatArray] = []

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
+from probewise._arrays import FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
 from probewise.priors import LogUniform
@@ -39,14 +39,12 @@ Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
 
 def driving_columns(about: ReferenceFit) -> list[str]:
     """Return the names of the columns, except time, that the simulated readings depend on."""
-    own, table = about.system.simulator, about.table
     out = []
-    for name, values in table.covariates.items():
-        if name not in (own.reading, own.noise.sd) and varies(values):
-            nudges = (_column_with_offset, _NUDGE * float(np.nanstd(values))), (_scaled_column, _NUDGE)
-            acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
-            if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
-                out.append(name)
+    for name, values in about.varying_columns.items():
+        nudges = (_column_with_offset, _NUDGE * float(np.nanstd(values))), (_scaled_column, _NUDGE)
+        acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
+        if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
+            out.append(name)
     return out
 
 

@@ -174,24 +174,17 @@ class Effect(NamedEffect[Any]):
 
     Parameters
     ----------
-    name
-        `name` or `name:target`.
-    stage
-        Stage of the chain at which it acts.
-    parameters
-        Prior of each parameter, by name; or of all together.
-    units
-        Unit of each parameter.
+    name, stage
+        `name` or `name:target`; stage of the chain at which it acts.
+    parameters, units
+        Prior of each parameter, by name, or of all together; and unit of each.
     covariates
         Names of the covariates along which the residual shows if the effect is left out.
-    act
-        Function of the stage's value, parameters (n_samples, n_params) and plan or table; returns the value with the
-        effect.
+    act, says
+        What it does to its stage's value, and a sentence that describes it; see `Act` and `Say`.
     entries
         Template bank: trial settings, (n_entries, n_columns, n_params). The columns of an entry span the change of the
         readings to first order; entries differ in the nonlinear parameters.
-    says
-        Function that describes it in a sentence.
     amplitudes
         Indices of the parameters that are amplitudes: the readings change in proportion to first order.
     absent
@@ -204,12 +197,9 @@ class Effect(NamedEffect[Any]):
         Formula of a proposal, which has no name in the vocabulary; otherwise empty.
     needs_rising_time
         Whether it looks back to earlier times of a run, which time must then not fall within.
-    where
-        Of a light sensor's effect: origin, scans, patterns.
-    form
-        Which of several formulas of this name it has; "" for the vocabulary's.
-    source
-        Function that builds one with the same `act` and `says`, by which a pickled effect finds them again.
+    where, source
+        Of a light sensor's effect: origin, scans, patterns; and a function that builds one with the same `act` and
+        `says`, by which a pickled effect finds them again.
     """
 
     name: str
@@ -243,17 +233,14 @@ class Effect(NamedEffect[Any]):
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
-        """Parameter values, by index, at which it has no effect: `absent`, else all amplitudes 0; else None."""
         return dict(self.absent) or dict.fromkeys(self.amplitudes, 0.0) or None
 
     @property
     def scans(self) -> tuple[str, ...]:
-        """Names of the scans it is restricted to; () for all."""
         return self.where.scans
 
     @property
     def patterns(self) -> tuple[str, ...]:
-        """Names of the patterns it is restricted to; () for all."""
         return self.where.patterns
 
     @property
@@ -263,7 +250,6 @@ class Effect(NamedEffect[Any]):
 
     @property
     def relative_odds(self) -> float:  # type: ignore[override]
-        """Prior odds of this one of several variants against the first."""
         return math.prod((prior.odds for prior in self.marginals.values() if isinstance(prior, Fixed)), start=1.0)
 
     @property
@@ -272,24 +258,17 @@ class Effect(NamedEffect[Any]):
         return self.parameters if isinstance(self.parameters, Mapping) else {}
 
     def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
-        """Return the value of its stage with the effect applied, with parameters theta (n_samples, n_params)."""
         return self.act(value, theta, plan)
 
     def bank(self) -> FloatArray:
-        """Return the template bank: trial settings, (n_entries, n_columns, n_params)."""
         return self.entries
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect in plain words, given the parameters' mean and sd, (n_params,) each."""
         return self.says(mean, sd)
 
     @property
     def n_peaks(self) -> int:  # type: ignore[override]
-        """Number of equivalent posterior modes within the prior.
-
-        A phase spans two turns, which doubles it; a wave's second copy, or a second time constant, may be exchanged
-        with the first.
-        """
+        # A phase spans two turns, which doubles it; a second copy or time constant may be exchanged with the first.
         exchangeable = self.name.endswith(AGAIN) or "tau2" in self.prior.names
         return (2 if exchangeable else 1) * (2 if "phase" in self.prior.names else 1)
 
@@ -330,7 +309,6 @@ class StepEffect(Effect):
         return tuple(out)
 
     def with_fewer_variants(self) -> Self:
-        """Return the effect with its change points thinned to at most 48 intervals, unless it needs all of them."""
         return replace(self, change_points=self.change_points.fewer()) if self.is_thinned else self
 
     def variant_masks(self, plan: Any) -> VariantMasks | None:
@@ -341,7 +319,6 @@ class StepEffect(Effect):
         return self.change_points.masks(self.entries[0], plan) if self.stage in _ROW_BY_ROW else None
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw theta's last column, the change point: an interval by `weights`, (n_variants,), uniform within it."""
         return self.change_points.redrawn(theta, weights, rng=rng)
 
 
@@ -359,7 +336,6 @@ class WaveEffect(Effect):
     suggested: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def bank(self) -> FloatArray:
-        """Return the template bank, (n_entries, 2, n_params), suggested frequencies last."""
         if not self.suggested.size:
             return self.entries
         return np.concatenate([self.entries, sine_and_cosine_entries(self.entries[0, 0, 0], self.suggested)])
@@ -372,7 +348,6 @@ class WaveEffect(Effect):
         return np.asarray(setting)
 
     def with_fewer_variants(self) -> Self:
-        """Return the effect without suggested frequencies."""
         return self._without_suggested if self.suggested.size else self
 
     @cached_property
@@ -384,21 +359,10 @@ class WaveEffect(Effect):
 class LightEffect:
     """A light sensor's effect before it is bound to a recording; declared by `light_effect`.
 
-    Parameters
-    ----------
-    name, stage, covariates
-        As of `Effect`.
-    words
-        A noun phrase that follows "the model leaves out".
-    build
-        Function of this and the extent of a recording; returns the effect at the recording's scales, None where the
-        recording cannot show it.
-    counts
-        Whether its formula holds the "time" or the "place" itself, which count from the recording's origin.
-    reads
-        Names of the plan's columns that it reads besides place, time and scan.
-    is_absorbed_by_ssf
-        Function of the plan: whether a free SSF absorbs the effect, which hides it.
+    `words` follow "the model leaves out"; `build` is a function of this and the extent of a recording, and returns the
+    effect at the recording's scales, None where the recording cannot show it. `counts` tells whether its formula holds
+    the "time" or the "place" itself, which count from the recording's origin; `reads` are the plan's columns that it
+    reads besides place, time and scan; `is_absorbed_by_ssf` tells of a plan whether a free SSF hides the effect.
     """
 
     name: str

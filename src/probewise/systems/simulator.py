@@ -63,18 +63,10 @@ _TAKEN = (*_OF_NOISE, *RARE_EFFECTS, "unknown", "clean")  # names that no effect
 class Noise:
     """Prior knowledge of the noise.
 
-    Parameters
-    ----------
-    sd
-        Expected sd of a reading, in its unit; or the name of a column of sds, of which only the ratios count; or None.
-        The size of the noise is fitted in any case.
-    step
-        Rounding step of the readings; None if not declared.
-    range
-        Smallest and largest reading of the instrument, which reads an end where the signal and its noise are beyond
-        it; None for an open end.
-    zero
-        Reading at zero signal, about which a gain acts.
+    `sd` is the expected sd of a reading, in its unit; or the name of a column of sds, of which only the ratios count;
+    or None. The size of the noise is fitted in any case. `step` is the rounding step of the readings, None if not
+    declared. `range` are the smallest and largest reading of the instrument, which reads an end where the signal and
+    its noise are beyond it; None for an open end. `zero` is the reading at zero signal, about which a gain acts.
     """
 
     sd: float | str | None = None
@@ -117,21 +109,12 @@ class Noise:
 class Law:
     """A dynamical system: initial states, rates of the states, and the observation.
 
-    Parameters
-    ----------
-    states
-        Initial value of each state in every run: the name of a parameter, or a number.
-    rates
-        Function of states, parameters and columns that returns the rate of each state by name, per unit of time. All
-        are arrays that broadcast against each other: np.where and np.sin, no `if` and no math.sin.
-    observe
-        Function of states, parameters and columns that returns the reading, an array that broadcasts to the states'
-        shape; None: the first state.
-    hold
-        Interpolation of columns between rows: "previous" (held) or "linear".
-    max_step_s
-        Largest integration step at fourth order, in the unit of time; one of eighth order, taken where gaps need
-        several, may be three times as long. None: chosen automatically.
+    `states` are the initial value of each state in every run: the name of a parameter, or a number. `rates` returns the
+    rate of each state by name, per unit of time; all are arrays that broadcast against each other: np.where and np.sin,
+    no `if` and no math.sin. `observe` returns the reading, an array that broadcasts to the states' shape; None: the
+    first state. `hold` says how columns go on between rows: "previous" (held) or "linear". `max_step_s` is the largest
+    integration step at fourth order, in the unit of time; one of eighth order, taken where gaps need several, may be
+    three times as long. None: chosen automatically.
     """
 
     states: Mapping[str, str | float]
@@ -175,18 +158,13 @@ class Simulator:
         Name of the predicted column, and its unit.
     parameters
         Prior of each parameter, as in FILE.py: (low, high), ("log", low, high), ("normal", mean, sd), or a prior.
-    simulate
-        Function that predicts the readings of the whole table.
-    law
-        Alternatively a law, which is integrated between the rows of each run.
-    time, time_unit
-        Name of the time column, if any, and its unit.
-    run
-        Name of the column that assigns rows to runs, if any.
-    per_run
-        Parameters with a separate value in every run.
-    controls
-        Columns that the user can set.
+    simulate, law
+        Function that predicts the readings of the whole table; or a law, which is integrated between the rows of each
+        run.
+    time, time_unit, run
+        Name of the time column, if any, and its unit; name of the column that assigns rows to runs, if any.
+    per_run, controls
+        Parameters with a separate value in every run; columns that the user can set.
     noise
         Prior knowledge of the noise; may be a dict with some of "sd", "step", "range", "zero".
     extra

@@ -40,9 +40,9 @@ class RunTable:
     ----------
     columns
         Every column by name: numbers (NaN where missing) or texts.
-    time
-        Name of the time column; None if no time was recorded. Dates, clocks and time differences in it count from the
-        first row, in `time_unit`.
+    time, time_unit
+        Name of the time column, and its unit; None if no time was recorded. Dates, clocks and time differences in it
+        count from the first row.
     run
         Name of the column that assigns rows to runs; None for a single run. Names are texts; a number is its shortest
         text, 1.0 as "1".
@@ -53,12 +53,8 @@ class RunTable:
     first_row
         Number of the first row, counted from the first row of the recording to which effects are bound: 0 for that
         recording, its length for a table that follows it.
-    time_unit
-        Unit of the time column.
-    notes
-        How columns were read that are not plain numbers.
-    first_line
-        Row of the file, the first being 1, in which the first row stands.
+    notes, first_line
+        How columns were read that are not plain numbers; row of the file, from 1, in which the first row stands.
     """
 
     columns: Mapping[str, NDArray[Any]]

@@ -43,7 +43,7 @@ _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
-_Parameters = Mapping[str, tuple[Marginal, str]]
+_Parameters = dict[str, tuple[Marginal, str]]
 """Prior and unit of each parameter, by name."""
 
 
@@ -85,7 +85,7 @@ class _Term:
 def formula_forms(about: ReferenceFit) -> Iterator[Form]:
     """Yield all proposals: terms of the reading or of a state's rate, thresholds, and shapes in time or of a column."""
     yield from _reading_formula_forms(about)
-    columns = _varying_columns_by_name(about)
+    columns = _complete_columns(about)
     for name in columns:
         yield from _threshold_form(about, name)
     for name, values in columns.items():
@@ -133,14 +133,14 @@ def _proposal(
         return f"{what} lacks the term {expression} with {sizes}: a proposal, not a known effect"
 
     form = kind(
-        name=f"formula:{side}:{target}:{text}",
-        stage=Stage.RATE if state else Stage.OFFSET,
-        parameters={name: prior for name, (prior, _) in parameters.items()},
-        units=tuple(unit for _, unit in parameters.values()),
-        covariates=covariates,
-        act=act,
-        entries=entries,
-        says=says,
+        f"formula:{side}:{target}:{text}",
+        Stage.RATE if state else Stage.OFFSET,
+        {name: prior for name, (prior, _) in parameters.items()},
+        tuple(unit for _, unit in parameters.values()),
+        covariates,
+        act,
+        entries,
+        says,
         amplitudes=tuple(k for k, (prior, _) in enumerate(parameters.values()) if prior in (AMPLITUDE, POSITIVE)),
         expression=expression,
         **more,
@@ -202,11 +202,8 @@ def _terms_of_column(name: str) -> Iterator[_Term]:
         yield _Term(text.format(f"{_RADIANS[unit]:.6g} {name}"), (angle,), function)
 
 
-def _varying_columns_by_name(about: ReferenceFit) -> dict[str, FloatArray]:
-    """Return the columns of numbers that vary and are never missing, except the reading and its declared sd."""
-    own = about.system.simulator
-    kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
-    return {c: v for c, v in kept.items() if np.isfinite(v).all() and varies(v)}
+def _complete_columns(about: ReferenceFit) -> dict[str, FloatArray]:
+    return {name: values for name, values in about.varying_columns.items() if np.isfinite(values).all()}
 
 
 def _rounded_mean(values: FloatArray) -> float:
@@ -222,7 +219,7 @@ def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _Scaled
 
 def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
     own = about.system.simulator
-    columns = _varying_columns_by_name(about)
+    columns = _complete_columns(about)
     shapes = [term for name in columns for term in _terms_of_column(name)]
     if about.table.has_varying_time and about.table.time is not None:
         columns[about.table.time] = about.table.time_s
@@ -248,17 +245,14 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     if len(points) < 2:
         return
     at = thinned(points, _MOST_SWITCHES)
-    yield from _proposal(
-        about,
-        f"(1 + sign({name} - at)) / 2",
-        {"a": (AMPLITUDE, about.reading_unit), "at": (Uniform(at[0], at[-1]), name)},
-        np.array([[[1.0, 0.5 * (at[0] + at[-1])]]]),
-        lambda v, value, table: v[0] * (table.covariates[name] > v[1]),
-        (covariate_of_column(name),),
-        about.sd,
-        kind=StepForm,
-        change_points=ChangePoints(at, column=name),
-    )
+
+    def change(v: list[Any], value: Any, rows: RunTable) -> Any:
+        return v[0] * (rows.covariates[name] > v[1])
+
+    priors: _Parameters = {"a": (AMPLITUDE, about.reading_unit), "at": (Uniform(at[0], at[-1]), name)}
+    bank, along = np.array([[[1.0, 0.5 * (at[0] + at[-1])]]]), (covariate_of_column(name),)
+    own = (f"(1 + sign({name} - at)) / 2", priors, bank, change, along, about.sd)
+    yield from _proposal(about, *own, kind=StepForm, change_points=ChangePoints(at, column=name))
 
 
 def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
@@ -270,22 +264,16 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
         def change(v: list[Any], s: Any, u: Any, sign: float = sign) -> Any:
             return v[0] * np.maximum(sign * (s[state] - v[1]), 0.0)
 
-        yield from _proposal(
-            about,
-            text,
-            {"a": (AMPLITUDE, ""), "at": (Uniform(points[0], points[-1]), state)},
-            single_column_bank(1.0, np.clip(np.quantile(values, _THRESHOLDS), points[0], points[-1])),
-            change,
-            (f"state:{state}", "time"),
-            trial_rate(about, state) / float(np.ptp(values)),
-            state=state,
-        )
+        priors: _Parameters = {"a": (AMPLITUDE, ""), "at": (Uniform(points[0], points[-1]), state)}
+        bank = single_column_bank(1.0, np.clip(np.quantile(values, _THRESHOLDS), points[0], points[-1]))
+        guess, along = trial_rate(about, state) / float(np.ptp(values)), (f"state:{state}", "time")
+        yield from _proposal(about, text, priors, bank, change, along, guess, state=state)
 
 
 def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
     variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if varies(values)]
-    columns = {name: values for name, values in _varying_columns_by_name(about).items() if name not in states}
+    columns = {name: values for name, values in _complete_columns(about).items() if name not in states}
     variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
     rate = trial_rate(about, state)
     known: list[FloatArray] = []
@@ -298,16 +286,9 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
 
         shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
         if _add_if_new(shape, known):
-            yield from _proposal(
-                about,
-                term.text,
-                {"a": (AMPLITUDE, "")},
-                np.ones((1, 1, 1)),
-                change,
-                _covariates_of_term(about, "rate", term),
-                rate / float(np.sqrt(np.mean(shape**2))),
-                state=state,
-            )
+            guess = rate / float(np.sqrt(np.mean(shape**2)))
+            own = (term.text, {"a": (AMPLITUDE, "")}, np.ones((1, 1, 1)), change)
+            yield from _proposal(about, *own, _covariates_of_term(about, "rate", term), guess, state=state)
 
 
 def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
@@ -346,23 +327,18 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
 
     phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
     grid = np.meshgrid(1.0, frequencies, phases, shares, _SOFT, indexing="ij")
+    bank = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
     since = f"({table.time} - {origin:.12g})" if origin else table.time
-    yield from _proposal(
-        about,
-        f"while |({since} / period + phase) mod 1| < share / 2",
-        {
-            "a": (AMPLITUDE, about.reading_unit),
-            "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
-            "phase": (Uniform(-1.0, 1.0), "1"),
-            "share": (Uniform(0.03, 0.97), "1"),
-            "edge": (LogUniform(0.03, 1.0), "1"),
-        },
-        np.stack([each.ravel() for each in grid], axis=-1)[:, None, :],
-        change,
-        ("time",),
-        about.sd,
-        counted_from=origin_in_words(table.time, origin, about.time_unit),
-    )
+    priors: _Parameters = {
+        "a": (AMPLITUDE, about.reading_unit),
+        "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
+        "phase": (Uniform(-1.0, 1.0), "1"),
+        "share": (Uniform(0.03, 0.97), "1"),
+        "edge": (LogUniform(0.03, 1.0), "1"),
+    }
+    text = f"while |({since} / period + phase) mod 1| < share / 2"
+    counted = origin_in_words(table.time, origin, about.time_unit)
+    yield from _proposal(about, text, priors, bank, change, ("time",), about.sd, counted_from=counted)
 
 
 def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
@@ -382,21 +358,15 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
         settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
     turned = f"2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase"
-    yield from _proposal(
-        about,
-        f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}",
-        {
-            "a": (POSITIVE, about.reading_unit),
-            "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
-            "sweep": (Uniform(-1.2, 1.2), "1"),
-            "phase": (PHASE, "rad"),
-        },
-        sine_and_cosine_entries(1.0, *np.transpose(settings)),
-        change,
-        ("time",),
-        about.sd,
-        kind=WaveForm,
-    )
+    priors: _Parameters = {
+        "a": (POSITIVE, about.reading_unit),
+        "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
+        "sweep": (Uniform(-1.2, 1.2), "1"),
+        "phase": (PHASE, "rad"),
+    }
+    text = f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}"
+    bank = sine_and_cosine_entries(1.0, *np.transpose(settings))
+    yield from _proposal(about, text, priors, bank, change, ("time",), about.sd, kind=WaveForm)
 
 
 def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
@@ -409,17 +379,11 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     between, unit = settling_time_prior(about), about.reading_unit
     taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
     pairs = [(taus[i], taus[j]) for i in range(_N_SETTLING) for j in range(i + _APART, _N_SETTLING)]
+    bank = np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs])
+    sizes: _Parameters = {"a": (AMPLITUDE, unit), "b": (AMPLITUDE, unit)}
+    priors = sizes | dict.fromkeys(("tau1", "tau2"), (between, about.time_unit))
     text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
-    yield from _proposal(
-        about,
-        text,
-        {"a": (AMPLITUDE, unit), "b": (AMPLITUDE, unit)} | dict.fromkeys(("tau1", "tau2"), (between, about.time_unit)),
-        np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs]),
-        change,
-        ("time", "run"),
-        1.0,
-        expression=text,
-    )
+    yield from _proposal(about, text, priors, bank, change, ("time", "run"), 1.0, expression=text)
 
 
 def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
@@ -464,17 +428,11 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
         saturating = LogUniform(_LEAST_DOSE * largest, _MOST_DOSE * largest)
         summed = f"integral over {table.time}" if in_time else "sum over rows"
         grown = f"D the {summed} of {what} since the start of the run"
-        yield from _proposal(
-            about,
-            f"1 - exp(-D / d), {grown}",
-            {"a": (AMPLITUDE, about.reading_unit), "d": (saturating, "")},
-            single_column_bank(1.0, np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES)),
-            change,
-            (covariate_of_column(name), "time", "run"),
-            about.sd,
-            expression=f"a (1 - exp(-D / d)), {grown}",
-            needs_rising_time=in_time,
-        )
+        priors: _Parameters = {"a": (AMPLITUDE, about.reading_unit), "d": (saturating, "")}
+        bank = single_column_bank(1.0, np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES))
+        own = (f"1 - exp(-D / d), {grown}", priors, bank, change, (covariate_of_column(name), "time", "run"), about.sd)
+        said = f"a (1 - exp(-D / d)), {grown}"
+        yield from _proposal(about, *own, expression=said, needs_rising_time=in_time)
 
 
 def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time: bool) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, distinct_values, rounding_error, varies
+from probewise._arrays import FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
 from probewise.priors import LogUniform
@@ -39,14 +39,12 @@ Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
 
 def driving_columns(about: ReferenceFit) -> list[str]:
     """Return the names of the columns, except time, that the simulated readings depend on."""
-    own, table = about.system.simulator, about.table
     out = []
-    for name, values in table.covariates.items():
-        if name not in (own.reading, own.noise.sd) and varies(values):
-            nudges = (_column_with_offset, _NUDGE * float(np.nanstd(values))), (_scaled_column, _NUDGE)
-            acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
-            if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
-                out.append(name)
+    for name, values in about.varying_columns.items():
+        nudges = (_column_with_offset, _NUDGE * float(np.nanstd(values))), (_scaled_column, _NUDGE)
+        acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
+        if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
+            out.append(name)
     return out
 
 
@@ -162,24 +160,18 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     if about.system.caller is None:
         most = max_n_trial_frequencies(len(about.table))
     frequencies = trial_frequencies(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE, _LEAST_WAVES)
-    form = WaveForm(
-        name=f"periodic_error:{name}",
-        stage=Stage.INPUT,
-        parameters={
-            "a": POSITIVE,
-            "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(1 / frequencies[0]) / 0.9),
-            "phase": PHASE,
-        },
-        units=(name, name, "rad"),
-        covariates=(covariate_of_column(name),),
-        act=act,
-        entries=sine_and_cosine_entries(1.0, 1 / frequencies),
-        says=lambda m, s: (
-            f"{name} has a periodic error with an amplitude of {value_with_sd(m[0], s[0], '')} "
-            f"and a period of {value_with_sd(m[1], s[1], '')}, both in units of {name}"
-        ),
-        counted_from=origin_in_words(name, origin),
-    )
+    longest, shortest = (float(1 / frequencies[k]) for k in (0, -1))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, period = (value_with_sd(mean[k], sd[k], "") for k in (0, 1))
+        return (
+            f"{name} has a periodic error with an amplitude of {size} and a period of {period}, both in units of {name}"
+        )
+
+    priors = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
+    bank, along = sine_and_cosine_entries(1.0, 1 / frequencies), (covariate_of_column(name),)
+    own = (f"periodic_error:{name}", Stage.INPUT, priors, (name, name, "rad"), along, act, bank, says)
+    form = WaveForm(*own, counted_from=origin_in_words(name, origin))
     yield from about.scaled(form, 1e-4 * float(np.std(values)))
 
 

@@ -288,6 +288,17 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
     return Modulation(at_rows, form)
 
 
+def modulations_over_rows(about: ReferenceFit) -> dict[str, Modulation]:
+    """Return a drift where time passes, a step, and a value per run where there are several, by what each is called."""
+    table, out = about.table, dict[str, Modulation]()
+    if table.has_varying_time:
+        out["drift"] = linear_drift_modulation(table, about.time_unit)
+    out["step"] = change_point_step_modulation(table, about.time_unit)
+    if about.can_fit_value_per_run:
+        out["per_run"] = value_per_run_modulation(table)
+    return out
+
+
 def sinusoid_modulation(about: ReferenceFit) -> Modulation:
     """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from `time_origin`."""
     table, time_unit = about.table, about.time_unit

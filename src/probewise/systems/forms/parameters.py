@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray, varies
+from probewise._arrays import FloatArray
 from probewise._words import unit_of_name
-from probewise.priors import LogUniform, Marginal
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, ActInTime, Form, flag, says_value
 from probewise.systems.forms.modulations import (
     Modulation,
-    change_point_step_modulation,
     column_proportional_modulation,
-    linear_drift_modulation,
     modulated_form,
-    value_per_run_modulation,
+    modulations_over_rows,
 )
 from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.table import RunTable
@@ -31,6 +29,7 @@ _N_VALUES = 9
 _UNSEEN = 1e-7  # of the noise
 
 
+_KINDS = {"drift": "drifts", "step": "steps", "per_run": "differs"}
 _QUARTILES = np.array([0.25, 0.75])
 
 
@@ -39,26 +38,21 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     system, table = about.system, about.table
     simulator = system.simulator
     values = system.parameters(about.theta, table)
-    over: dict[str, Modulation] = {}
-    if table.has_varying_time:
-        over["drifts"] = linear_drift_modulation(table, about.time_unit)
-    over["steps"] = change_point_step_modulation(table, about.time_unit)
-    columns = [c for c, v in table.covariates.items() if c not in (simulator.reading, simulator.noise.sd) and varies(v)]
+    over = {_KINDS[kind]: how for kind, how in modulations_over_rows(about).items()}
     for name in simulator.parameters:
         guess = 1e-4 * (
             float(np.abs(values[name]).max()) or float(np.ptp(simulator.parameters[name].from_unit(_QUARTILES)))
         )
-        each = dict(over)
-        if name not in simulator.per_run and about.can_fit_value_per_run:
-            each["differs"] = value_per_run_modulation(table)
-        for kind, how in each.items():
+        for kind, how in over.items():
+            if kind == "differs" and name in simulator.per_run:
+                continue
             size = guess / (about.duration if kind == "drifts" else 1.0)
             act = _parameter_shifter(name, how)
             if how.between_rows is not None:
                 act = ActInTime(act, how.between_rows(name))
             own = (Stage.PARAMETER, how, act, size, name, unit_of_name(name))
             yield from modulated_form(about, f"{kind}:{name}", *own)
-        for column in columns:
+        for column in about.varying_columns:
             how = column_proportional_modulation(column, table)
             size, act = guess / float(np.nanstd(table.covariates[column])), _parameter_shifter(name, how)
             is_scale = isinstance(simulator.parameters[name], LogUniform)
@@ -89,14 +83,8 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
 
     def variant(as_factor: bool) -> Form:
         value, prior = flag(as_factor)
-        return replace(
-            form,
-            parameters={**cast(Mapping[str, Marginal], form.parameters), _AS_FACTOR: prior},
-            units=(*form.units, "1"),
-            act=act,
-            entries=np.insert(form.entries, 1, value, axis=2),
-            says=says,
-        )
+        priors, bank = {**form.marginals, _AS_FACTOR: prior}, np.insert(form.entries, 1, value, axis=2)
+        return replace(form, parameters=priors, units=(*form.units, "1"), act=act, entries=bank, says=says)
 
     linear = variant(False)
     there = about.system.parameters(about.theta, about.table)[name]

@@ -115,20 +115,16 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[str(time)] - origin) + phase))
 
-    form = WaveForm(
-        name=f"periodic_forcing:{state}",
-        stage=Stage.RATE,
-        parameters={"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE},
-        units=(unit, f"1/{about.time_unit}", "rad"),
-        covariates=("time",),
-        act=act,
-        entries=sine_and_cosine_entries(1.0, frequencies),
-        says=lambda mean, sd: (
-            f"the rate of {state} lacks a sinusoidal term with an amplitude of {value_with_sd(mean[0], sd[0], '')} "
-            f"per {about.time_unit} and a period of {period_with_sd(mean[1], sd[1], about.time_unit)}"
-        ),
-        counted_from=origin_in_words(time, origin, about.time_unit),
-    )
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, per = value_with_sd(mean[0], sd[0], ""), about.time_unit
+        period = period_with_sd(mean[1], sd[1], per)
+        lacks = f"the rate of {state} lacks a sinusoidal term"
+        return f"{lacks} with an amplitude of {size} per {per} and a period of {period}"
+
+    priors = {"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE}
+    units, bank = (unit, f"1/{about.time_unit}", "rad"), sine_and_cosine_entries(1.0, frequencies)
+    own = (f"periodic_forcing:{state}", Stage.RATE, priors, units, ("time",), act, bank, says)
+    form = WaveForm(*own, counted_from=origin_in_words(time, origin, about.time_unit))
     yield from about.scaled(form, trial_rate(about, state))
 
 
@@ -159,18 +155,10 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
     def variant(taking: str | None) -> Form:
         shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
         tried = [0.5 * (other == taking) for other in others]
-        return Form(
-            f"limit:{state}",
-            Stage.RATE,
-            {"level": ends.prior, **{f"share[{other}]": prior for other, prior in shares.items()}},
-            units=(state, *("1" for _ in others)),
-            covariates=(f"state:{state}", "level"),
-            act=act,
-            entries=single_column_bank(ends.trial_levels, *tried),
-            says=says,
-            amplitudes=(),
-            absent={0: ends.level_out_of_reach},
-        )
+        priors = {"level": ends.prior, **{f"share[{other}]": prior for other, prior in shares.items()}}
+        units, bank = (state, *("1" for _ in others)), single_column_bank(ends.trial_levels, *tried)
+        own = (f"limit:{state}", Stage.RATE, priors, units, (f"state:{state}", "level"), act, bank, says)
+        return Form(*own, amplitudes=(), absent={0: ends.level_out_of_reach})
 
     alone = variant(None)
     if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:

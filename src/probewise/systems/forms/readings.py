@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
+from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
 from probewise.effects.reading import decaying_sum
@@ -20,10 +20,9 @@ from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
     column_proportional_modulation,
-    linear_drift_modulation,
     modulated_form,
+    modulations_over_rows,
     sinusoid_modulation,
-    value_per_run_modulation,
 )
 from probewise.systems.forms.reference import N_SIZES, ReferenceFit, clipped, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
@@ -175,12 +174,6 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     table, unit, zero = about.table, about.reading_unit, about.system.simulator.noise.zero
     reading = about.system.simulator.reading
     span = float(np.ptp(about.predicted)) or about.sd
-    over: dict[str, Modulation] = {}
-    if table.has_varying_time:
-        over["drift"] = linear_drift_modulation(table, about.time_unit)
-    over["step"] = change_point_step_modulation(table, about.time_unit)
-    if about.can_fit_value_per_run:
-        over["per_run"] = value_per_run_modulation(table)
 
     def added(name: str, how: Modulation) -> Iterator[Form]:
         def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
@@ -195,7 +188,7 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         gain = f"the gain of {reading}"
         return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, gain, "1", ("level",))
 
-    for kind, how in over.items():
+    for kind, how in modulations_over_rows(about).items():
         yield from added(f"offset_{kind}", how)
         # Rows may be in another unit for a while.
         of_gain = change_point_step_modulation(table, about.time_unit, may_end=True) if kind == "step" else how
@@ -204,12 +197,11 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         yield from added("interference", sinusoid_modulation(about))
         yield from _settling_form(about)
         yield from late_forms(about)
-    for name, values in table.covariates.items():
-        if name not in (reading, about.system.simulator.noise.sd) and varies(values):
-            yield from added(f"sensitivity:{name}", column_proportional_modulation(name, table))
-            yield from _curve_form(about, name)
-            if name not in about.states:
-                yield from _friction_form(about, name)
+    for name in about.varying_columns:
+        yield from added(f"sensitivity:{name}", column_proportional_modulation(name, table))
+        yield from _curve_form(about, name)
+        if name not in about.states:
+            yield from _friction_form(about, name)
     yield from _hysteresis_form(about)
     yield from _nonlinearity_form(about)
     yield from _saturation_form(about)

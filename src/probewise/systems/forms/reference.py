@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
+from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.priors import LogUniform, Marginal, Uniform
@@ -250,6 +250,13 @@ class ReferenceFit:
             rates = (call_on_read_only(law.rates, read_only_views(s), *given) for s in (nudged, there))
             apart = np.subtract(*(each[other] for each in rates))
         return bool(np.any(np.abs(apart) > 0))
+
+    @cached_property
+    def varying_columns(self) -> dict[str, FloatArray]:
+        """Columns of numbers that vary, (n_points,), by name, except the reading and its declared sd."""
+        own = self.system.simulator
+        columns = {c: v for c, v in self.table.covariates.items() if c not in (own.reading, own.noise.sd)}
+        return {name: values for name, values in columns.items() if varies(values)}
 
     @cached_property
     def has_reading(self) -> BoolArray:

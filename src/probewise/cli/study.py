@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects; write its table and report; return the exit status."""
     from probewise.proof import pages
-    from probewise.proof.concealed_study import concealed_csv_rows, concealed_rows, run_concealed
+    from probewise.proof.concealed_study import concealed_csv_rows, concealed_forms, concealed_rows, run_concealed
     from probewise.recordings.table import csv_text_of_rows
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
@@ -114,6 +114,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
             max_readings=arguments.max_readings,
             sizes=(0, 1, 2) if arguments.size is None else (_SIZES.index(arguments.size),),
             n_clean=arguments.clean,
+            varied=arguments.varied,
             **({} if arguments.seed is None else {"seed": arguments.seed}),
             executor=executor,
             progress=progress,
@@ -124,7 +125,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     drawings.write_results(
         lambda stage: stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table))),
         {},
-        lambda _: pages.concealed_html(rows, command=command, draw=drawings.draw),
+        lambda _: pages.concealed_html(rows, concealed_forms(found), command=command, draw=drawings.draw),
     )
     return finish(drawings, pages.concealed_sentence(rows), f"written to {out}", quiet=arguments.quiet)
 
@@ -163,4 +164,5 @@ def _concealed_command_line(arguments: argparse.Namespace) -> str:
     for name in ("clean", "seed", "size"):
         value = getattr(arguments, name)
         words += [] if value is None else [f"--{name}", str(value)]
+    words += ["--varied"] if arguments.varied else []
     return shlex.join([*words, "--max-readings", str(arguments.max_readings)])

@@ -1,8 +1,9 @@
 """Studies of the robot with a concealed fault: success rates, named faults, and runs that are sure and wrong.
 
-The sensor model is exact except for one concealed effect, at three sizes each. The readings are simulated by
-`probewise.world`, which sums pixels and shares no code with the models. Every row has the same circles and noise, at
-two prior probabilities that the sensor model is complete (`trust`): `TRUST` and 1.
+The sensor model is exact except for what is concealed, at three sizes each: effects in the form that the robot's rivals
+have, in another, and effects that are in no list of theirs. The readings are simulated by `probewise.world`, which sums
+pixels and shares no code with the models. Every row has the same circles and noise, at two prior probabilities that the
+sensor model is complete (`trust`): `TRUST` and 1.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, Literal, Self, TypeAlias, cast
 
 import numpy as np
 
@@ -21,13 +22,15 @@ from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
-from probewise.experiment import CLEAN, TRUST, left_out_after_step, recording_of
+from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
+from probewise.inference import Rounded
 from probewise.progress import Progress, silent
 from probewise.proof.campaign import run_campaign
 from probewise.proof.configurations import FIELD, MOST_CIRCLES, POPULATIONS, REFERENCE
 from probewise.proof.estimates import Estimate, estimated_share
 from probewise.proof.results import CONCEALED_TRIAL, misfit
 from probewise.proof.trial import (
+    BLOB,
     BRIGHT,
     DARK,
     SEED,
@@ -36,96 +39,189 @@ from probewise.proof.trial import (
     experiment_of,
     footprint_pixels,
     has_reached_target,
+    mixture_of,
     timed_steps,
 )
 from probewise.recordings import Disc
-from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
-from probewise.world.concealed import (
-    AlbedoGradient,
-    AlbedoPatch,
-    AmbientStep,
-    CorrelatedNoise,
-    Dropouts,
-    EdgeBlur,
-    EdgeShadow,
-    Flicker,
-    Glint,
-    Halo,
-    HeightGradient,
-    Hysteresis,
-    Lag,
-    OffsetDrift,
-    Outliers,
-    PeriodicPositionError,
-    PositionScale,
-    Quantisation,
-    SensorTilt,
-    SignalDependentNoise,
-)
-from probewise.world.stages import Rows, Stage
+from probewise.sensor import Chain
+from probewise.world import Blob, Concealed, World
+from probewise.world import concealed as known
+from probewise.world import unlisted as strange
 
-_EACH_S = 8.0  # seconds between readings, about
+Form: TypeAlias = Literal["in the list", "another form", "in no list", "two at once"]
+"""Whether the robot's rivals have an effect as it is concealed, in another form, or not; or whether there are two."""
+
 _MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)
-_SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
+_MOVE_S = 0.8  # of a reading: what a move takes, about
+_SECOND = Blob(0.4, (7.0, -1.0), (2.5, 4.0))  # of the sensor of two Gaussians
 
 
 @dataclass(frozen=True)
-class FadingLamp:
-    """A lamp that fades linearly: every eight seconds it loses a `share` of its first signal, down to zero."""
+class Conditions:
+    """Noise sd, seconds between readings, about, rounding step and footprint; those of the study's table by default."""
 
-    share: float
+    noise_sd: float = REFERENCE.noise_sd
+    each_s: float = 8.0
+    step: float | None = None
+    blobs: tuple[Blob, ...] = (BLOB,)
 
-    name: ClassVar[str] = "gain_loss"
-    stage: ClassVar[Stage] = "gain"
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Self:
+        """Draw noise and pace log-uniformly, and whether readings are rounded and the sensor has two Gaussians."""
+        noise_sd, each_s = (math.exp(rng.uniform(*np.log(ends))) for ends in ((0.3, 2.0), (2.0, 20.0)))
+        rounded, two = rng.random(2) < 0.5
+        return cls(noise_sd, each_s, 1.0 if rounded else None, (BLOB, _SECOND) if two else (BLOB,))
 
-    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Multiply the signal by the fraction of light that the lamp still gives at each row's time."""
-        return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / _EACH_S, 0.0))
+    def experiment(self) -> Experiment:
+        """Return the reference experiment of a robot that knows these conditions."""
+        posed = experiment_of(replace(REFERENCE, noise_sd=self.noise_sd))
+        if len(self.blobs) > 1:
+            posed = replace(posed, model=replace(cast(Chain, posed.model), ssf=mixture_of(self.blobs)))
+        if self.step is not None:
+            rounded = Rounded(self.noise_sd, self.step, -math.inf, math.inf)
+            posed = replace(posed, likelihood=rounded, step=self.step)
+        return posed
 
 
-CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, float]]] = {
-    "backlash": (Backlash, (1.5, 6.0, 12.0)),
-    "saturation": (Saturation, (55.0, 40.0, 25.0)),
-    "nonlinearity": (Nonlinearity, (1.1, 1.5, 2.2)),
-    "albedo_gradient": (lambda share: AlbedoGradient(-share / FIELD.width_mm, 0.0), (0.1, 0.3, 0.5)),
-    "ambient_gradient": (lambda units: AmbientGradient(units / FIELD.width_mm, 0.0), (2.0, 10.0, 25.0)),
-    "ambient_step": (lambda units: AmbientStep(units, 6 * _EACH_S), (2.0, 8.0, 16.0)),
-    "offset_drift": (lambda units: OffsetDrift(units * 3600.0 / (30 * _EACH_S)), (2.0, 8.0, 16.0)),
-    "gain_drift": (lambda share: GainDrift(share, 15 * _EACH_S), (0.05, 0.15, 0.3)),
-    "edge_blur": (EdgeBlur, (3.0, 11.0, 20.0)),
-    "halo": (lambda share: Halo(share, 25.0), (0.05, 0.2, 0.4)),
-    "dropouts": (lambda share: Dropouts(share, DARK), (0.03, 0.1, 0.2)),
-    "outliers": (lambda share: Outliers(share, 12.0), (0.03, 0.1, 0.2)),
-    "gain_loss": (FadingLamp, (0.001, 0.005, 0.01)),
-    "hysteresis": (Hysteresis, (1.0, 4.0, 10.0)),
-    "lag": (Lag, (2.0, 4.0, 8.0)),
-    "flicker": (lambda units: Flicker(units, 0.37, 1.0), (1.5, 4.0, 8.0)),
-    "edge_shadow": (lambda share: EdgeShadow(share, 8.0), (0.05, 0.2, 0.4)),
-    "correlated_noise": (CorrelatedNoise, (0.3, 0.6, 0.9)),
-    "signal_dependent_noise": (SignalDependentNoise, (1.0, 8.0, 30.0)),
-    "quantisation": (Quantisation, (2.0, 5.0, 10.0)),
-    "periodic_position_error": (lambda mm: PeriodicPositionError(mm, 60.0, 0.0), (1.0, 4.0, 10.0)),
-    "height_gradient": (lambda mm: HeightGradient(mm / FIELD.width_mm), (0.5, 2.0, 5.0)),
-    "albedo_patch": (lambda share: AlbedoPatch(share, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
-    "glint": (lambda units: Glint(units, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
-    "sensor_tilt": (lambda mm: SensorTilt(mm, 0.0), (2.0, 6.0, 12.0)),
-    "position_scale": (lambda share: PositionScale(share, share), (0.005, 0.02, 0.05)),
+Make: TypeAlias = Callable[[float, Conditions, np.random.Generator], Concealed | tuple[Concealed, ...]]
+
+
+@dataclass(frozen=True)
+class HiddenForm:
+    """A form of an effect to conceal.
+
+    `make`: function of the size, the conditions and a generator; `sizes`: barely detectable, clear, gross; `right`: the
+    right answers, if not its name; `in_arm_frame`: function of size and true circle that returns the circle that the
+    robot can find, where an effect is equivalent to another one; `remembers`: a reading depends on earlier ones.
+    """
+
+    make: Make
+    sizes: tuple[float, float, float]
+    form: Form = "in the list"
+    right: tuple[str, ...] = ()
+    in_arm_frame: Callable[[float, FloatArray], FloatArray] = lambda size, circle: circle
+    remembers: bool = False
+
+
+def _of(kind: Callable[..., Concealed], *more: float) -> Make:
+    """Return the maker of an effect whose first parameter is the size."""
+    return lambda size, now, rng: kind(size, *more)
+
+
+def _four_and_ten_times(least: float) -> tuple[float, float, float]:
+    return least, 4 * least, 10 * least
+
+
+def _at_any_moment(now: Conditions, rng: np.random.Generator) -> float:
+    return float(now.each_s * rng.uniform(1, 20))
+
+
+def _scale_of_one_axis(share: float, circle: FloatArray) -> FloatArray:
+    return circle / [1.0 + share, 1.0, 1.0]
+
+
+_W = FIELD.width_mm
+CONCEALED: Mapping[str, HiddenForm] = {
+    "backlash": HiddenForm(_of(known.Backlash), (1.5, 6.0, 12.0)),
+    "saturation": HiddenForm(_of(known.Saturation), (55.0, 40.0, 25.0)),
+    "nonlinearity": HiddenForm(_of(known.Nonlinearity), (1.1, 1.5, 2.2)),
+    "albedo_gradient": HiddenForm(lambda a, now, rng: known.AlbedoGradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
+    "ambient_gradient": HiddenForm(lambda a, now, rng: known.AmbientGradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
+    "ambient_step": HiddenForm(lambda a, now, rng: known.AmbientStep(a, 6 * now.each_s), (2.0, 8.0, 16.0)),
+    "offset_drift": HiddenForm(lambda a, now, rng: known.OffsetDrift(a * 3600 / (30 * now.each_s)), (2.0, 8.0, 16.0)),
+    "gain_drift": HiddenForm(lambda a, now, rng: known.GainDrift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
+    "edge_blur": HiddenForm(_of(known.EdgeBlur), (3.0, 11.0, 20.0)),
+    "halo": HiddenForm(_of(known.Halo, 25.0), (0.05, 0.2, 0.4)),
+    "dropouts": HiddenForm(_of(known.Dropouts, DARK), (0.03, 0.1, 0.2)),
+    "outliers": HiddenForm(_of(known.Outliers, 12.0), (0.03, 0.1, 0.2)),
+    "gain_loss": HiddenForm(
+        lambda a, now, rng: strange.FadingLamp(a, now.each_s), (0.001, 0.005, 0.01), right=("gain_drift",)
+    ),
+    "hysteresis": HiddenForm(_of(known.Hysteresis), (1.0, 4.0, 10.0)),
+    "lag": HiddenForm(_of(known.Lag), (2.0, 4.0, 8.0), remembers=True),
+    "flicker": HiddenForm(_of(known.Flicker, 0.37, 1.0), (1.5, 4.0, 8.0)),
+    "edge_shadow": HiddenForm(_of(known.EdgeShadow, 8.0), (0.05, 0.2, 0.4)),
+    "correlated_noise": HiddenForm(_of(known.CorrelatedNoise), (0.3, 0.6, 0.9), remembers=True),
+    "signal_dependent_noise": HiddenForm(_of(known.SignalDependentNoise), (1.0, 8.0, 30.0)),
+    "quantisation": HiddenForm(_of(known.Quantisation), (2.0, 5.0, 10.0)),
+    "periodic_position_error": HiddenForm(_of(known.PeriodicPositionError, 60.0, 0.0), (1.0, 4.0, 10.0)),
+    "height_gradient": HiddenForm(lambda a, now, rng: known.HeightGradient(a / _W), (0.5, 2.0, 5.0)),
+    "albedo_patch": HiddenForm(_of(known.AlbedoPatch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
+    "glint": HiddenForm(_of(known.Glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
+    # An effect equivalent to another circle cannot be detected.
+    "sensor_tilt": HiddenForm(
+        _of(known.SensorTilt, 0.0),
+        (2.0, 6.0, 12.0),
+        right=(CLEAN,),
+        in_arm_frame=lambda mm, circle: circle - [mm, 0.0, 0.0],
+    ),
+    "position_scale": HiddenForm(
+        lambda a, now, rng: known.PositionScale(a, a),
+        (0.005, 0.02, 0.05),
+        right=(CLEAN,),
+        in_arm_frame=lambda share, circle: circle / (1.0 + share),
+    ),
+    "dark_level": HiddenForm(_of(known.AmbientStep, -math.inf), _four_and_ten_times(2.0)),
+    "gain": HiddenForm(_of(known.GainDrift, math.inf), _four_and_ten_times(0.05)),
+    "noise_sd": HiddenForm(lambda a, now, rng: known.RisingNoiseSd(1 + a, 1e-9), _four_and_ten_times(0.5)),
+    "play_of_axes": HiddenForm(lambda a, now, rng: strange.PlayOfAxes(a, a / 2), (1.5, 6.0, 12.0), right=("backlash",)),
+    "scale_of_x": HiddenForm(
+        _of(known.PositionScale, 0.0), (0.005, 0.02, 0.05), right=("position_scale",), in_arm_frame=_scale_of_one_axis
+    ),
+    "step_at_any_moment": HiddenForm(
+        lambda a, now, rng: known.AmbientStep(a, _at_any_moment(now, rng)), (2.0, 8.0, 16.0), right=("ambient_step",)
+    ),
+    "thermal_gain": HiddenForm(
+        lambda a, now, rng: strange.ThermalGain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10))),
+        _four_and_ten_times(0.02),
+        "another form",
+        ("gain_drift",),
+    ),
+    "soft_saturation": HiddenForm(_of(known.Saturation, 10.0), (55.0, 40.0, 25.0), "another form", ("saturation",)),
+    "dead_zone": HiddenForm(_of(strange.DeadZone), _four_and_ten_times(0.05), "another form", ("nonlinearity",)),
+    "ghost": HiddenForm(_of(strange.Ghost, 25.0, 0.0), (0.05, 0.2, 0.4), "another form", ("halo",)),
+    "stick_slip": HiddenForm(
+        _of(strange.StickSlip, 60.0, 0.0), (1.0, 4.0, 10.0), "another form", ("periodic_position_error",)
+    ),
+    "bent_rail": HiddenForm(
+        lambda a, now, rng: strange.QuadraticPositionError(a * (10 / _W) ** 2), _four_and_ten_times(2.0), "in no list"
+    ),
+    "place_step": HiddenForm(_of(strange.PlaceStep, _MIDDLE_MM[0]), _four_and_ten_times(1.0), "in no list"),
+    "chirp": HiddenForm(
+        lambda a, now, rng: strange.Chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0),
+        (1.5, 4.0, 8.0),
+        "another form",
+        ("flicker",),
+    ),
+    "after_glow": HiddenForm(
+        lambda a, now, rng: strange.AfterGlow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)),
+        (1.5, 4.0, 8.0),
+        "in no list",
+        remembers=True,
+    ),
+    "peak_memory": HiddenForm(_of(strange.PeakMemory), (0.05, 0.2, 0.4), "in no list", remembers=True),
+    "backlash_and_step": HiddenForm(
+        lambda a, now, rng: (known.Backlash(a), known.AmbientStep(a, _at_any_moment(now, rng))),
+        (1.5, 6.0, 12.0),
+        "two at once",
+        ("backlash", "ambient_step"),
+    ),
+    "gain_and_dark_level": HiddenForm(
+        lambda a, now, rng: (known.GainDrift(a / 100, math.inf), known.AmbientStep(a / 2, -math.inf)),
+        _four_and_ten_times(4.0),
+        "two at once",
+        ("gain", "dark_level"),
+    ),
 }
-"""For each name: the concealed effect as a function of its size, and three sizes: barely detectable, clear, gross."""
-
-NAMES: Mapping[str, str] = {"": CLEAN, "gain_loss": GainDrift.name, "sensor_tilt": CLEAN, "position_scale": CLEAN}
-"""The right answer of a row, if not its name: an effect equivalent to another circle cannot be detected."""
-
-_IN_ARM_FRAME: Mapping[str, Callable[[float, FloatArray], FloatArray]] = {
-    "sensor_tilt": lambda mm, circle: circle - np.array([mm, 0.0, 0.0]),
-    "position_scale": lambda share, circle: circle / (1.0 + share),
-}
-_REMEMBERING = frozenset({"lag", "correlated_noise"})  # effects by which a reading depends on earlier ones
+"""What is concealed in each row, by name; the robot's rivals have the first in the form in which they are concealed."""
 
 
 @dataclass(frozen=True)
 class ConcealedTrial:
-    """One run: concealed effect ("": none), index of its size, number of the circle, trust, reading limit, seed."""
+    """One run: concealed effect ("": none), index of its size, number of the circle, trust, reading limit, seed.
+
+    If `varied`, the circle has conditions of its own, otherwise those of the study's table.
+    """
 
     effect: str
     size: int
@@ -133,6 +229,7 @@ class ConcealedTrial:
     trust: float
     max_readings: int = 100
     seed: int = SEED
+    varied: bool = False
 
     @property
     def circle_mm(self) -> FloatArray:
@@ -142,13 +239,21 @@ class ConcealedTrial:
     @property
     def true_circle_in_arm_frame(self) -> FloatArray:
         """The circle that the robot can find, (3,): the true one, but as changed by a tilt or an error of scale."""
-        frame = _IN_ARM_FRAME.get(self.effect)
-        return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
+        hidden = CONCEALED.get(self.effect)
+        return self.circle_mm if hidden is None else hidden.in_arm_frame(hidden.sizes[self.size], self.circle_mm)
 
     @property
-    def right_answer(self) -> str:
-        """The name that a run should give: of the concealed effect, of an equivalent one, or "clean"."""
-        return NAMES.get(self.effect, self.effect)
+    def conditions(self) -> Conditions:
+        """Noise, pace, rounding and footprint."""
+        return Conditions.draw(np.random.default_rng([self.seed, self.circle, 1])) if self.varied else Conditions()
+
+    @property
+    def right_answers(self) -> tuple[str, ...]:
+        """The names that a run may give: of the concealed effect or an equivalent one, or "clean"; none in no list."""
+        hidden = CONCEALED.get(self.effect)
+        if hidden is None:
+            return (CLEAN,)
+        return () if hidden.form == "in no list" else hidden.right or (self.effect,)
 
     @property
     def key(self) -> str:
@@ -159,7 +264,7 @@ class ConcealedTrial:
 @own_arithmetic
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     """Search for a circle with a sensor that has a concealed effect; return a `results.CONCEALED_TRIAL`."""
-    experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
+    experiment = replace(trial.conditions.experiment(), trust=trial.trust)
     cpu = []
     steps = timed_steps(
         _arm_in_concealed_world(trial),
@@ -176,7 +281,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
         "known": has_reached_target(last, experiment),
         "readings": last.number,
         **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
-        "p_truth": round(left_out.probability.get(trial.right_answer, 0.0), 4),
+        "p_truth": round(sum(left_out.probability.get(name, 0.0) for name in trial.right_answers), 4),
         "credible": list(left_out.credible_set),
         "noticed": experiment.fit_is_doubtful(last.p_value) or left_out.leading != CLEAN,
         "cpu_s": [round(float(np.quantile(cpu, q)), 3) for q in (0.5, 0.95)],
@@ -185,11 +290,18 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
 
 def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     """Return an arm in the world with the concealed effect; seed, circle and reading number determine its noise."""
-    concealed: tuple[Concealed, ...] = ()
-    if trial.effect:
-        make, sizes = CONCEALED[trial.effect]
-        concealed = (make(sizes[trial.size]),)
-    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=REFERENCE.noise_sd, concealed=concealed)
+    now, hidden, made = trial.conditions, CONCEALED.get(trial.effect), ()
+    if hidden is not None:
+        rng = np.random.default_rng([trial.seed, trial.circle, trial.size, 2])
+        made = hidden.make(hidden.sizes[trial.size], now, rng)
+    world = World(
+        footprint_pixels(now.blobs),
+        black=DARK,
+        white=BRIGHT,
+        noise_sd=now.noise_sd,
+        step=now.step,
+        concealed=made if isinstance(made, tuple) else (made,),
+    )
     x_mm, y_mm, radius_mm = trial.circle_mm.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
     came: list[tuple[Pose, float, tuple[float, float]]] = []
@@ -199,14 +311,14 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         if came and (away := math.hypot(pose.x_mm - came[-1][0].x_mm, pose.y_mm - came[-1][0].y_mm)) > 0:
             direction = ((pose.x_mm - came[-1][0].x_mm) / away, (pose.y_mm - came[-1][0].y_mm) / away)
         came.append((pose, time_s, direction))
-        if trial.effect in _REMEMBERING:
+        if hidden is not None and hidden.remembers:
             so_far = recording_of([Reading(0.0, was, at_s) for was, at_s, _ in came], patterns={"field": disc}).plan
             return float(world.simulate(so_far, rng=np.random.default_rng([trial.seed, trial.circle])).readings[-1])
         rng = np.random.default_rng([trial.seed, trial.circle, len(came) - 1])
         return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
 
     everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
-    return SimulatedArm(light_reading, reach=everywhere, speed=_SPEED, scale=None)
+    return SimulatedArm(light_reading, reach=everywhere, speed=Speed(500.0, now.each_s - _MOVE_S), scale=None)
 
 
 def run_concealed(
@@ -218,33 +330,22 @@ def run_concealed(
     sizes: Sequence[int] = (0, 1, 2),
     n_clean: int | None = None,
     seed: int = SEED,
+    varied: bool = False,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> dict[ConcealedTrial, dict[str, Any]]:
     """Run every row over the first circles, with trust `TRUST` and 1, or resume an interrupted study.
 
-    Parameters
-    ----------
-    n_circles
-        Circles per row.
-    path
-        The campaign's file; runs in it are not repeated.
-    max_readings
-        A run that has not reached the target precision after this many readings is a miss.
-    effects, sizes
-        Names in CONCEALED and indices of sizes to run besides the clean row.
-    n_clean
-        Circles of the clean row; by default as many as for the others.
-    seed
-        Of circles, noise and robot.
-    executor, progress
-        As for `run_study`.
+    `n_circles`: circles per row; `path`: the campaign's file, whose runs are not repeated; `max_readings`: a run that
+    has not reached the target precision after so many is a miss; `effects`, `sizes`: names in CONCEALED and indices of
+    sizes to run besides the clean row, which has `n_clean` circles, by default as many as the others; `seed`: of
+    circles, noise and robot; `varied`: whether each circle has conditions of its own; others as for `run_study`.
     """
     for n in (n_circles, n_clean or n_circles):
         checked_whole("n_circles", n, most=MOST_CIRCLES)
     rows = {("", 0): n_clean or n_circles, **{(name, size): n_circles for name in effects for size in sizes}}
     trials = [
-        ConcealedTrial(name, size, circle, trust, max_readings, seed)
+        ConcealedTrial(name, size, circle, trust, max_readings, seed, varied)
         for circle in range(max(rows.values()))
         for (name, size), n in rows.items()
         if circle < n
@@ -254,7 +355,8 @@ def run_concealed(
         run_concealed_trial,
         {trial.key: trial for trial in trials},
         path=path,
-        settings={"concealed": __version__, "max_readings": max_readings, "seed": seed},
+        settings={"concealed": __version__, "max_readings": max_readings, "seed": seed}
+        | ({"varied": True} if varied else {}),
         executor=executor,
         progress=progress,
         noun="runs",
@@ -295,10 +397,17 @@ _COLUMNS = tuple(column.name for column in fields(ConcealedRow))
 
 def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
     """Summarise the runs of each row (effect, size and trust), in the order of `results`."""
-    rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
-    for trial, result in results.items():
-        rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.right_answer, result))
-    return [_summary_row(key, runs) for key, runs in rows.items()]
+    return _summaries(
+        results, lambda t: (t.effect or "nothing", CONCEALED[t.effect].sizes[t.size] if t.effect else None, t.trust)
+    )
+
+
+def concealed_forms(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
+    """Summarise the runs with effects of each form, at each trust, in the order of `results`."""
+    return _summaries(
+        {trial: result for trial, result in results.items() if trial.effect},
+        lambda t: (CONCEALED[t.effect].form, None, t.trust),
+    )
 
 
 def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -306,23 +415,30 @@ def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> l
     return [{name: _csv_value(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
 
 
-def _summary_row(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> ConcealedRow:
-    effect, size, trust = key
+def _summaries(
+    results: Mapping[ConcealedTrial, Mapping[str, Any]],
+    row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]],
+) -> list[ConcealedRow]:
+    rows: dict[tuple[str, float | None, float], list[tuple[tuple[str, ...], Mapping[str, Any]]]] = {}
+    for trial, result in results.items():
+        rows.setdefault(row_of(trial), []).append((trial.right_answers, result))
+    return [_summary_row(key, runs) for key, runs in rows.items()]
+
+
+def _summary_row(
+    key: tuple[str, float | None, float], runs: list[tuple[tuple[str, ...], Mapping[str, Any]]]
+) -> ConcealedRow:
     found = [run for _, run in runs]
-    held = [hit for run in found for hit in run["held"]]
-    n = len(found)
     return ConcealedRow(
-        concealed=effect or "nothing",
-        size=CONCEALED[effect][1][size] if effect else None,
-        trust=trust,
-        runs=n,
+        *key,
+        runs=len(found),
         readings=float(np.median([run["readings"] for run in found])),
         mean_readings=round(float(np.mean([run["readings"] for run in found])), 1),
         reached=estimated_share([run["known"] for run in found]),
-        intervals_hold=estimated_share(held),
+        intervals_hold=estimated_share([hit for run in found for hit in run["held"]]),
         sure_and_wrong=estimated_share([run["known"] and run["error_mm"] > WRONG_MM for run in found]),
         noticed=estimated_share([run["noticed"] for run in found]),
-        in_credible_set=estimated_share([name in run["credible"] for name, run in runs]),
+        in_credible_set=estimated_share([not {*names}.isdisjoint(run["credible"]) for names, run in runs if names]),
         names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
         cpu_s_median=round(float(np.median([run["cpu_s"][0] for run in found])), 2),
         cpu_s_95=round(float(np.median([run["cpu_s"][1] for run in found])), 2),
@@ -331,5 +447,7 @@ def _summary_row(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str,
 
 def _csv_value(value: object) -> object:
     if isinstance(value, Estimate):
+        if not value.n:
+            return ""
         return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})"
     return "" if value is None else value

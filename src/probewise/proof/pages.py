@@ -217,8 +217,13 @@ def concealed_sentence(rows: Sequence[ConcealedRow]) -> str:
     )
 
 
-def concealed_html(rows: Sequence[ConcealedRow], *, command: str, draw: Draw = draw_or_raise) -> str:
-    """Return the HTML of the page of a study of concealed effects; parameters as in `study_html`."""
+def concealed_html(
+    rows: Sequence[ConcealedRow], forms: Sequence[ConcealedRow] = (), *, command: str, draw: Draw = draw_or_raise
+) -> str:
+    """Return the HTML of the page of a study of concealed effects, with the rows of their forms, if there are several.
+
+    Other parameters as in `study_html`.
+    """
     drawn = figure(
         draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
         "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
@@ -236,6 +241,12 @@ def _sure_and_wrong_text(rows: Sequence[ConcealedRow]) -> str:
     return f"{n_wrong} of {count_with_noun(sum(row.runs for row in rows), 'run')}"
 
 
+_FORMS = (
+    "In the list: concealed as the robot's rivals have it. Another form: as a rival of the same name, which is right, "
+    "does not have it. In no list: no name is right, and only noticing counts."
+)
+
+
 def _of_both(name: str) -> Callable[[tuple[ConcealedRow, ConcealedRow]], str]:
     return lambda pair: " | ".join(f"{getattr(row, name).value:.2f}" for row in pair)
 
@@ -247,7 +258,7 @@ _PAIRS: Columns[tuple[ConcealedRow, ConcealedRow]] = {
     "sure and wrong": _of_both("sure_and_wrong"),
     "intervals that hold": _of_both("intervals_hold"),
     "noticed": _of_both("noticed"),
-    "in the credible set": lambda pair: f"{pair[0].in_credible_set.value:.2f}",
+    "in the credible set": lambda pair: f"{pair[0].in_credible_set.value:.2f}" if pair[0].in_credible_set.n else "–",
     "names in it": lambda pair: f"{pair[0].names:g}",
     "seconds per decision": lambda pair: " | ".join(f"{row.cpu_s_median:.2g}" for row in pair),
 }

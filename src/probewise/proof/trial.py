@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -39,7 +39,7 @@ WRONG_MM = 12.0
 """Three times the 4 mm of the stopping rule: a run that ends with a larger error is sure and wrong."""
 # The study's sensor: one Gaussian, in mm and LEGO units; the world uses the same numbers, rasterised to pixels.
 DARK, BRIGHT = 10.0, 60.0
-_CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
+BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)
 _ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
 _PIXEL_MM = 0.5
 _UNROUNDED = ReadingScale(-math.inf, math.inf, None)
@@ -81,9 +81,7 @@ def experiment_of(row: SearchConfiguration) -> Experiment:
         model = NaiveSensor(FixedLevels(DARK, BRIGHT), scene)
         # A reading on the edge fits neither level, and the naive model has no partial coverage.
         return Experiment(shape, model, likelihood, **common, doubt_p=0.0)
-    sd_u, sd_v = (row.width * sd for sd in _SD)
-    covariance = np.array([[sd_u**2, _CORRELATION * sd_u * sd_v], [_CORRELATION * sd_u * sd_v, sd_v**2]])
-    mixture = FixedMixture(np.ones(1), np.array([_CENTRE]), covariance[None])
+    mixture = mixture_of((BLOB,), row.width)
     if not row.learn_sensor:
         levels = FixedLevels(DARK, BRIGHT)
         chain = Chain(mixture, levels, scene, n_nodes=FAST_NODES)
@@ -94,6 +92,15 @@ def experiment_of(row: SearchConfiguration) -> Experiment:
     return Experiment(
         shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=sensor_change_prior((DARK, BRIGHT))
     )
+
+
+def mixture_of(blobs: Sequence[Blob], width: float = 1.0) -> FixedMixture:
+    """Return the robot's model of a footprint of these Gaussians, or of one that is so many times as wide."""
+    share = np.array([blob.share for blob in blobs])
+    sd = np.array([[width * sd for sd in blob.sd_mm] for blob in blobs])
+    across = np.array([blob.correlation for blob in blobs]) * sd[:, 0] * sd[:, 1]
+    covariance = np.stack([sd[:, 0] ** 2, across, across, sd[:, 1] ** 2], axis=1).reshape(-1, 2, 2)
+    return FixedMixture(share / share.sum(), np.array([blob.center_mm for blob in blobs]), covariance)
 
 
 def experiment_of_trial(trial: Trial) -> Experiment:
@@ -183,7 +190,7 @@ def arm_of(trial: Trial) -> SimulatedArm:
     return SimulatedArm(light_reading, reach=everywhere, scale=None)
 
 
-@lru_cache(maxsize=1)
-def footprint_pixels() -> Spot:
-    """Return the footprint of the study's simulated sensor as pixels."""
-    return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
+@lru_cache(maxsize=2)
+def footprint_pixels(blobs: tuple[Blob, ...] = (BLOB,)) -> Spot:
+    """Return the footprint of the study's simulated sensor, or another of Gaussians, as pixels."""
+    return gaussian_spot(blobs, pixel_mm=_PIXEL_MM)

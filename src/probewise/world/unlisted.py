@@ -198,5 +198,31 @@ class Chirp:
         return values + self.amp * np.sin(2 * math.pi * turns + self.phase)
 
 
+@dataclass(frozen=True)
+class PlayOfAxes:
+    """Play of each axis by itself: it stops `x_mm` / 2 or `y_mm` / 2 short, whatever the way of the other."""
+
+    name: ClassVar[str] = "play_of_axes"
+    stage: ClassVar[Stage] = "place"
+    x_mm: float
+    y_mm: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        return np.asarray(values - np.sign(rows.direction) * [self.x_mm / 2, self.y_mm / 2])
+
+
+@dataclass(frozen=True)
+class FadingLamp:
+    """A lamp that fades linearly: every `each_s` it loses a `share` of its first signal, down to zero."""
+
+    name: ClassVar[str] = "gain_loss"
+    stage: ClassVar[Stage] = "gain"
+    share: float
+    each_s: float
+
+    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
+        return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / self.each_s, 0.0))
+
+
 def _with_x_error(place_mm: FloatArray, error_mm: FloatArray) -> FloatArray:
     return place_mm + np.stack([error_mm, np.zeros_like(error_mm)], axis=-1)

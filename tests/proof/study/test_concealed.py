@@ -1,0 +1,72 @@
+"""What a study conceals, and under which conditions: the robot knows all but the effect."""
+
+import numpy as np
+import pytest
+
+from probewise.arm import Pose
+from probewise.experiment import CLEAN
+from probewise.experiment.rivals import rivals_of
+from probewise.proof.concealed_study import CONCEALED, ConcealedTrial, _arm_in_concealed_world, concealed_forms
+from probewise.proof.configurations import FIELD, REFERENCE
+from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
+from probewise.recordings import Disc, Plan
+from probewise.world import World
+
+
+def _readings(trial):
+    """Readings inside the circle, across its edge and beside it, and back."""
+    x, y, r = trial.circle_mm
+    with _arm_in_concealed_world(trial) as arm:
+        return np.array([arm.measure(Pose(x + d, y, 0.0)).value for d in 3 * (0, r + 2, 0, r - 1, r + 30, 1 - r, 0)])
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(k, marks=pytest.mark.slow) if k == "edge_blur" else k for k in CONCEALED]
+)
+def test_every_form_changes_readings_over_some_circle(name):
+    plain, hidden = (
+        np.array([_readings(ConcealedTrial(effect, 2, circle, 1.0, varied=True)) for circle in range(2)])
+        for effect in ("", name)
+    )
+    assert np.isfinite(hidden).all()
+    assert np.abs(hidden - plain).max() > 0.05
+
+
+def test_every_right_answer_is_a_rival_of_the_robot():
+    known = experiment_of(REFERENCE)
+    rivals = {r.name for r in rivals_of(known.model, known.likelihood, (FIELD.width_mm, FIELD.height_mm))}
+    assert {name for k in CONCEALED for name in ConcealedTrial(k, 0, 0, 1.0).right_answers} <= rivals | {CLEAN}
+
+
+def test_under_varied_conditions_the_robot_knows_noise_rounding_and_sensor():
+    """Two routes: the robot's model, and pixels; over a hundred circles every kind of conditions comes up."""
+    trials = [ConcealedTrial("", 0, k, 1.0, varied=True) for k in range(100)]
+    now = [trial.conditions for trial in trials]
+    assert {len(c.blobs) for c in now} == {1, 2}
+    assert {c.step for c in now} == {None, 1.0}
+    assert 0.3 < min(c.noise_sd for c in now) < 0.4 < 1.7 < max(c.noise_sd for c in now) < 2.0
+    assert 2 < min(c.each_s for c in now) < 3 < 17 < max(c.each_s for c in now) < 20
+    trial = next(t for t in trials if len(t.conditions.blobs) > 1)
+    x, y, r = trial.circle_mm
+    steps = np.linspace(r - 20, r + 20, 9)
+    zero = np.zeros(9, dtype=np.int64)
+    plan = Plan(x + steps, np.full(9, y), np.zeros(9), 8.0 * np.arange(9), zero, ("s",), zero, ("field",))
+    world = World(footprint_pixels(trial.conditions.blobs), black=DARK, white=BRIGHT, noise_sd=0.0)
+    seen = world.expected_readings(plan, {"field": Disc((x, y), r)})
+    predicted = trial.conditions.experiment().model.predict(trial.circle_mm[None, :], plan)[0]
+    np.testing.assert_allclose(predicted, seen, atol=0.1)
+
+
+def test_forms_are_summed_up_by_form():
+    run = {"known": True, "readings": 9, "error_mm": 1.0, "held": [True] * 3, "noticed": True, "cpu_s": [0.1, 0.2]}
+    results = {
+        ConcealedTrial(name, 1, 0, 0.9): {**run, "credible": ["backlash"]}
+        for name in ("", "backlash", "play_of_axes", "halo", "ghost", "bent_rail")
+    }
+    forms = {row.concealed: row for row in concealed_forms(results)}
+    assert {name: (row.runs, row.in_credible_set.n) for name, row in forms.items()} == {
+        "in the list": (3, 3),
+        "another form": (1, 1),
+        "in no list": (1, 0),
+    }
+    assert forms["in the list"].in_credible_set.value == pytest.approx(2 / 3)

@@ -163,16 +163,9 @@ class Joint:
 
 
 class EmulatedArm:
-    """The arm: three joints and the sensor at its end.
+    """The arm, at first at home: `joints` base, shoulder and elbow, and the sensor at its end.
 
-    `geometry`: dimensions of the arm; every joint starts at home.
-
-    Attributes
-    ----------
-    joints
-        Base, shoulder, elbow.
-    lowest
-        Lowest pose of the sensor so far; a height below 0 means that the sensor went through the table.
+    `lowest` is the lowest pose of the sensor so far; a height below 0 means that it went through the table.
     """
 
     def __init__(self, geometry: Geometry) -> None:

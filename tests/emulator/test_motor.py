@@ -156,6 +156,16 @@ def test_the_three_counters_are_reset_apart(ask, clock, brick) -> None:
     assert ask("00 06 00").endswith(f"{little(count)} 00 00 00 00 00 00 00 00".upper())
 
 
+def test_braking_is_shorter_than_coasting() -> None:
+    ends = []
+    for brake in (True, False):
+        motor = Motor(speed_deg_s=600.0)
+        for _ in range(1000):
+            motor.step(1e-3, 0, brake=brake, battery_mv=7400)
+        ends.append(motor.angle_deg)
+    assert ends[0] < ends[1] / 2
+
+
 def test_a_motor_stands_still_at_its_stop() -> None:
     motor = Motor(MotorParameters(stops_deg=(-50.0, 100.0)))
     for _ in range(1000):

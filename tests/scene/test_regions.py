@@ -96,6 +96,7 @@ def test_vertices_in_either_sense_make_the_same_polygon():
     one, other = PolygonRegion.from_vertices(corners), PolygonRegion.from_vertices(corners[:, ::-1])
     zero = np.zeros(100)
     assert np.array_equal(one.coverage(points, 1.0, zero), other.coverage(points, 1.0, zero))
+    assert one.coverage(np.array([[2.0, 2.8], [0.1, 1.0]]), 1.0, zero[:2])[0] == pytest.approx([0.7, 0.6])
 
 
 def test_quadrant_and_half_plane_follow_the_format_at_the_edge():

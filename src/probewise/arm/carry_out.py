@@ -181,22 +181,17 @@ def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
     the planned one, or NaN if none is planned. `Plan.sessions` is left out.
     """
     rows = plan.take(np.arange(len(readings)))
-    names = sorted({name for reading in readings for name in reading.covariates})
-    covariates = {}
-    for name in names:
-        planned = rows.covariates.get(name, np.full(len(readings), math.nan))
-        covariates[name] = np.array(
-            [reading.covariates.get(name, own) for reading, own in zip(readings, planned.tolist(), strict=True)]
-        )
-    taken = dataclasses.replace(
-        rows,
-        x_mm=np.array([reading.pose.x_mm for reading in readings]),
-        y_mm=np.array([reading.pose.y_mm for reading in readings]),
-        orientation_rad=np.array([reading.pose.orientation_rad for reading in readings]),
-        time_s=np.array([reading.time_s for reading in readings]),
-        covariates={**rows.covariates, **covariates},
-        sessions=(),
-    )
+    covariates = dict(rows.covariates)
+    for name in sorted({name for reading in readings for name in reading.covariates}):
+        planned = rows.covariates.get(name, np.full(len(readings), math.nan)).tolist()
+        own = [reading.covariates.get(name, usual) for reading, usual in zip(readings, planned, strict=True)]
+        covariates[name] = np.array(own)
+    there = {
+        name: np.array([getattr(reading.pose, name) for reading in readings])
+        for name in ("x_mm", "y_mm", "orientation_rad")
+    }
+    time_s = np.array([reading.time_s for reading in readings])
+    taken = dataclasses.replace(rows, **there, time_s=time_s, covariates=covariates, sessions=())
     return Recording(taken, np.array([reading.value for reading in readings]))
 
 

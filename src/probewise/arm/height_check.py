@@ -33,23 +33,12 @@ class HeightReading:
 
 @dataclass(frozen=True, eq=False)
 class HeightCheck:
-    """Heights measured by the light, compared with those by the motors' counters.
+    """Heights measured by the light, compared with those by the motors' counters."""
 
-    Parameters
-    ----------
-    per_mm
-        Relative decrease of a reading per mm, at the lowest of the heights at the first place.
-    off_mm, sd_mm
-        Height by the light, relative to the first place, minus height by the motors' counters, at each other place, and
-        its sd, (n_places,).
-    p_value
-        Chi-square p-value of `off_mm`: probability of larger ones if the counters are right.
-    """
-
-    per_mm: float
-    off_mm: FloatArray
+    per_mm: float  # relative decrease of a reading per mm, at the lowest of the heights at the first place
+    off_mm: FloatArray  # by the light, relative to the first place, minus by the counters, elsewhere, (n_places,)
     sd_mm: FloatArray
-    p_value: float
+    p_value: float  # chi-square: the probability of larger `off_mm` if the counters are right
 
     @property
     def agrees(self) -> bool:

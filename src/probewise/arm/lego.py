@@ -55,19 +55,13 @@ class LegoArm:
     `machine`: the machine that moves it; entered and exited with the arm; `geometry`: dimensions of the arm; `clock`:
     clock for the times of readings; `start_s`: time at the start, for resuming an earlier run.
 
-    Attributes
-    ----------
-    turned_rad
-        Angle by which the sensor has been turned by hand on its mount, relative to the geometry.
-    mounted_rad
-        Angle to which a person was last asked to turn the sensor on its mount, see `carry_out`; NaN: not known.
-    first_down
-        Function that the arm calls with the height, in mm, after each step of its first lowering; it returns when a
-        person has confirmed that height. None: the first lowering is one move, like all later ones.
-    turns, lifts
-        Always False: a person turns the sensor, and it reads at one height.
+    `turned_rad` is the angle by which the sensor has been turned by hand on its mount, relative to the geometry;
+    `mounted_rad` that to which a person was last asked to turn it, see `carry_out`, NaN: not known. `first_down` is
+    called with the height, in mm, after each step of the first lowering, and returns when a person has confirmed that
+    height; None: the first lowering is one move, like all later ones.
     """
 
+    # A person turns the sensor, and it reads at one height.
     turns = lifts = False
 
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:

@@ -38,16 +38,9 @@ class SoftLimits:
         return base, shoulder, elbow
 
     def heights_along_move_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
-        """Return the sensor's height at 33 points along a move of one joint, shape (33,).
+        """Return the sensor's height at 33 points along a move of one joint to the count `to`, shape (33,).
 
-        Parameters
-        ----------
-        counts
-            Counts of all motors at the start.
-        joint, to
-            The joint that moves, and its target count.
-        here
-            Starting count of that joint; None: as in `counts`.
+        `counts` are those of all motors at the start, but for the moving joint's where `here` is given.
         """
         joints = self._geometry.joints
         way = np.empty((N_CHECKED, 3))
@@ -61,8 +54,6 @@ class SoftLimits:
 
         `here` and `to` are the counts of the joint's motor at start and end. A joint beyond its limits may move back,
         and a sensor below the lowest height may rise.
-
-        Raises ReachError if the move is refused.
         """
         geometry, mechanics = self._geometry, self._geometry.joints[joint]
         angle, start = mechanics.angle_at(to), mechanics.angle_at(here)

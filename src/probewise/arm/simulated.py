@@ -43,23 +43,15 @@ class SimulatedArm:
         Function of pose, time (s) and height (mm) that returns the reading before the conversion by `scale`.
     reach
         Reachable places and orientations: a `Reach`, whose sensor does not turn, or the `Geometry` of a real arm.
-    speed
-        Speed of moving and reading.
     scale
         Conversion of readings, by default to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
     height_mm
         Height of the sensor above the surface when reading, unless the pose gives one.
     last
         Last reading of an earlier run: the arm starts at its pose and time. None: it starts at rest, at time 0.
-
-    Attributes
-    ----------
-    mounted_rad
-        Always 0, since no person turns the sensor.
-    turns, lifts
-        Always True: it takes the orientation and the height of every pose.
     """
 
+    # It takes the orientation and the height of every pose, so no person turns the sensor: mounted_rad is always 0.
     turns = lifts = True
 
     def __init__(

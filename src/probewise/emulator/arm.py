@@ -64,14 +64,22 @@ def read_geometry(path: Path) -> Geometry:
     except (ValueError, RecursionError) as error:  # not TOML, a number of thousands of digits, or nested too deep
         raise FileError(path, f"not TOML: {error}", "an arm's file of format arm/1") from error
 
+    def entry(*keys: str) -> object:
+        found: Any = table
+        for key in keys:
+            if not isinstance(found, Mapping) or key not in found:
+                raise FileError(path, f"{'.'.join(keys)} is missing", "every number of format arm/1")
+            found = found[key]
+        return found
+
     def number(*keys: str) -> float:
-        value = _value_in_file(path, table, keys)
+        value = entry(*keys)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
             raise FileError(path, f"{'.'.join(keys)} is {shown(value)}", f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
     def joint(name: str) -> JointParameters:
-        port = _value_in_file(path, table, ("joints", name, "port"))
+        port = entry("joints", name, "port")
         if port not in ("A", "B", "C"):
             raise FileError(path, f"joints.{name}.port is {shown(port)}", "A, B or C")
         ratio = number("joints", name, "gear_ratio")
@@ -86,7 +94,7 @@ def read_geometry(path: Path) -> Geometry:
             raise FileError(path, f"joints.{name}.stop_deg is {stop:g}", allowed)
         return JointParameters(port, ratio, home_deg=home, low_deg=low, high_deg=high, play_deg=play, stop_deg=stop)
 
-    elbow = _value_in_file(path, table, ("links", "elbow"))
+    elbow = entry("links", "elbow")
     if elbow not in ("absolute", "relative"):
         raise FileError(path, f"links.elbow is {shown(elbow)}", '"absolute" or "relative"')
     joints = (joint("base"), joint("shoulder"), joint("elbow"))
@@ -106,15 +114,6 @@ def read_geometry(path: Path) -> Geometry:
         read_height_mm=number("sensor", "read_height_mm"),
         joints=joints,
     )
-
-
-def _value_in_file(path: Path, table: Mapping[str, Any], keys: tuple[str, ...]) -> object:
-    found: Any = table
-    for key in keys:
-        if not isinstance(found, Mapping) or key not in found:
-            raise FileError(path, f"{'.'.join(keys)} is missing", "every number of format arm/1")
-        found = found[key]
-    return found
 
 
 _BEYOND_LIMITS_DEG = 3.0  # a mechanical stop that the file does not give lies this far outside the limit
@@ -163,16 +162,9 @@ class Joint:
 
 
 class EmulatedArm:
-    """The arm: three joints and the sensor at its end.
+    """The arm, at first at home: `joints` base, shoulder and elbow, and the sensor at its end.
 
-    `geometry`: dimensions of the arm; every joint starts at home.
-
-    Attributes
-    ----------
-    joints
-        Base, shoulder, elbow.
-    lowest
-        Lowest pose of the sensor so far; a height below 0 means that the sensor went through the table.
+    `lowest` is the lowest pose of the sensor so far; a height below 0 means that it went through the table.
     """
 
     def __init__(self, geometry: Geometry) -> None:

@@ -364,20 +364,8 @@ class Recording(ShowsItself):
         Raises ParameterError if a pattern is named but not described, an argument has the wrong type, or no reading is
         usable; ShapeError if the arguments differ in length.
 
-        Parameters
-        ----------
-        x_mm, y_mm
-            Commanded position of the sensor, shape (n_points,); a single number holds for all readings.
-        readings
-            Readings in `unit`, shape (n_points,); NaN, None or a text such as "n/a" where one is missing.
-        patterns
-            What lay under the sensor: patterns by name, or one pattern under every reading.
-        unit
-            Unit of a reading, such as "V" or "LEGO".
-        pattern, orientation_rad, time_s, scan, session, covariates, min, max, step, sensor, height_mm, controls
-            As in `Plan.from_arrays`.
-        source
-            Origin of the readings, for reports.
+        `readings` are in `unit`, shape (n_points,), NaN, None or a text such as "n/a" where one is missing; `source` is
+        their origin, for reports. All else is as in `Plan.from_arrays`.
 
         Examples
         --------

@@ -226,11 +226,7 @@ def mean_ssf_field(
         raise ParameterError(
             "u_mm, v_mm", (u_mm[:2].tolist(), v_mm[:2].tolist()), "evenly spaced, one spacing for both"
         )
-    n_samples = max(a.shape[0] for a in (footprint.weight, footprint.u_mm, footprint.var_u))
-    shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
-    arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
-    w, mu, mv, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
-    w = w * np.repeat(shares, arrays[0].shape[2])
+    w, mu, mv, var_u, var_v, cov = _gaussians_of_mean(footprint, weights)
     total = np.zeros((len(v_mm), len(u_mm)))
     weight = np.abs(w)  # a free form's may be negative
     lightest_first = np.argsort(weight)
@@ -254,6 +250,15 @@ def mean_ssf_field(
     return SSFField(total, pixel, (float(u_mm[0]), float(v_mm[0])))
 
 
+def _gaussians_of_mean(footprint: Footprint, weights: FloatArray | None) -> tuple[FloatArray, ...]:
+    """Return shares and moments of all Gaussians of the mean of sampled mixtures, (n_samples n_gaussians,) each."""
+    arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
+    n_samples, _, n = arrays[0].shape
+    shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
+    w, *moments = (a[:, 0].ravel() for a in arrays)
+    return (w * np.repeat(shares, n), *moments)
+
+
 def _reached_slice(centres: FloatArray, mean: float, sd: float) -> slice:
     """Return the slice of the pixel centres, along one axis, that lie within 6.5 sds of a Gaussian's mean."""
     return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
@@ -269,11 +274,7 @@ def merged_mean_mixture(
     """
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")
-    arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
-    n_samples, _, n = arrays[0].shape
-    shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
-    w, u, v, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
-    w = w * np.repeat(shares, n)
+    w, u, v, var_u, var_v, cov = _gaussians_of_mean(footprint, weights)
     w = w / w.sum()
     means, covs = np.stack([u, v], axis=-1), np.stack([var_u, cov, cov, var_v], axis=-1)
     sd_u, sd_v = np.sqrt(var_u), np.sqrt(var_v)

@@ -80,16 +80,10 @@ class Brick:
         return self._lights.setdefault(port, LightSensor(self.link, port, clock=self._clock))
 
     def battery_mv(self) -> int:
-        """Read the battery's voltage, in mV; warn once if it is low.
+        """Read the battery's voltage, in mV; warn once (LowBatteryWarning) if it is below 6 V.
 
-        Since the protocol has no checksum, the voltage is read until two successive values agree within 50 mV.
-
-        Raises LinkError if the brick does not answer, or no two of six successive voltages agree.
-
-        Warns
-        -----
-        LowBatteryWarning
-            If the voltage is below 6 V.
+        Since the protocol has no checksum, the voltage is read until two successive values agree within 50 mV. Raises
+        LinkError if the brick does not answer, or no two of six successive voltages agree.
         """
         for _ in range(N_ASKED):
             before, self._last_mv = self._last_mv, self.link.ask(GetBatteryLevel())

@@ -11,12 +11,11 @@ from scipy.integrate import solve_ivp
 from scipy.special import ndtri
 
 from probewise.diagnosis import diagnose_system, fit_simulator
-from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system, readings_near_ends, recording_from_table
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.diagnosis.held_out import held_out_gain
-from probewise.diagnosis.left_out import readings_near_ends, recording_from_table
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 
 from probewise.arm import readings_of_recording, recording_of_readings
-from probewise.diagnosis.aliases import Alias, projected_cosine
+from probewise.diagnosis.advice import Alias, projected_cosine
 from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,

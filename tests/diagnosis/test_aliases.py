@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from heater import SIMULATOR, runs
 
-from probewise.diagnosis.aliases import (
+from probewise.diagnosis.advice import (
     COUNTS,
     Alias,
     EffectEntry,

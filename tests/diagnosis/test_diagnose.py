@@ -382,3 +382,22 @@ def test_a_sensor_that_is_known_shows_that_it_was_turned():
     found = diagnose(turned, sensor=earlier, rng=rng)
     assert (found.verdict, found.combination) == ("named", ("orientation_error",))
     assert found.p_value < 1e-6
+
+
+@pytest.mark.slow
+def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
+    monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: 0.2)
+    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("cannot_tell", ())
+    assert found.hypotheses[0].effects == ("hysteresis",)
+    amp = found.repaired.effect_samples("hysteresis")[:, 0]
+    # The share that does without it is that of the rest.
+    assert np.mean(amp != 0) == pytest.approx(found.hypotheses[0].probability, abs=0.05)
+
+
+@pytest.mark.slow
+def test_two_effects_are_both_named():
+    both = recording("two_way", hidden.Backlash(0.5), hidden.GainDrift(0.05, 200.0))
+    found = diagnose(both, rng=np.random.default_rng(0))
+    strict(found)
+    assert found.combination == ("backlash", "gain_drift")

@@ -317,3 +317,20 @@ def test_a_template_is_the_same_about_a_large_constant(name):
     assert (sizes > 0.01).all()
     # A step of the last digit is 2e-7, and the amplitude is found by changes ten thousand times smaller.
     np.testing.assert_allclose(columns[1] / sizes, columns[0] / sizes, atol=0.1)
+
+
+def test_rows_after_the_recording_have_the_whole_walk_in_their_sd(diagnosis):
+    """As the guide says: predictions look at no reading, and the walk counts from the recording's first row."""
+    t = np.arange(_N, _N + 30, dtype=float)
+    later = predict_system(repaired_of(diagnosis), {"t_s": t}, rng=np.random.default_rng(2))
+    samples = diagnosis.repaired
+    step = samples.noise_sd * samples.effect_samples("random_walk")[:, 0]
+    law = np.var(samples.chain.predict(samples.theta, diagnosis.recording.plan)[:, -1])
+    expected = np.sqrt(np.mean(samples.noise_sd**2) + np.mean(step**2) * (t + 1) + law)
+    np.testing.assert_allclose(later.sd, expected, rtol=0.1)
+
+
+@pytest.mark.slow
+def test_a_size_is_that_of_a_refit_from_values_that_predict_something(diagnosis_of_impossible):
+    """Not that of readings a thousand noise sds off, which stands for an impossible one."""
+    assert max(effect.size_lambda for effect in diagnosis_of_impossible.effects) < 200

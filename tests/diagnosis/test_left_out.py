@@ -11,12 +11,11 @@ from scipy.integrate import solve_ivp
 from scipy.special import ndtri
 
 from probewise.diagnosis import diagnose_system, fit_simulator
-from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system, readings_near_ends, recording_from_table
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.diagnosis.held_out import held_out_gain
-from probewise.diagnosis.left_out import readings_near_ends, recording_from_table
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent
@@ -314,3 +313,21 @@ def test_a_drag_is_found_beside_the_stop_behind_which_the_law_alone_slides_on():
     assert all(names in ({"limit:x", "drag:v"}, {"limit:x", "quadratic:v:v"}) for names in likely)  # one law: v > 0
     stop = next(effect for effect in found.effects if effect.name == "limit:x").parameters[0]
     assert abs(stop.mean - STOP_M) < 4 * stop.sd
+
+
+@pytest.mark.parametrize("row", ["r0", "m1"])
+def test_a_moderate_outlier_at_an_end_of_a_run_is_no_jump_and_no_delay(row):
+    true = {"r0": 20.0, "m1": 72.1}[row]
+    diagnosis = diagnose_system(OVEN, oven(**{row: true + 2}), rng=np.random.default_rng(1))
+    assert (diagnosis.verdict, diagnosis.combination) == ("noise", ("outliers",))
+
+
+def test_an_end_that_no_reading_reaches_leaves_nothing_out_however_wrong_the_simulator_is():
+    rng = np.random.default_rng(2)
+    x, w = rng.uniform(0, 10, 300), rng.uniform(0, 6, 300)
+    line = {"y": 10 + 4 * x + 28 * np.sin(w) + rng.normal(0, 0.2, 300), "x": x}
+    simulator = Simulator(
+        "y", "V", {"a": (-50, 50), "b": (0, 10)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
+        noise={"range": (-30, 90)},
+    )  # fmt: skip
+    assert prepare_system(simulator, table_for(simulator, line), with_effects=False).recording.usable.all()

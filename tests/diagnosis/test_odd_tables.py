@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import audit_system, diagnose_system, fit_simulator
-from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.left_out import recording_from_table
+from probewise.diagnosis.diagnose_simulator import prepare_system, recording_from_table
 from probewise.errors import ParameterError
 from probewise.systems import Law, Simulator, table_for
 

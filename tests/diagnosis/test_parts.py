@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 
 from probewise.arm import readings_of_recording, recording_of_readings
-from probewise.diagnosis.aliases import Alias, projected_cosine
+from probewise.diagnosis.advice import Alias, projected_cosine
 from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
@@ -28,7 +28,7 @@ from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templat
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
-from probewise.effects.reference import candidate_scan_groups
+from probewise.effects.reference import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import (
     HalfPlane,
@@ -571,3 +571,13 @@ def test_what_readings_cannot_tell_apart_is_not_named(lag, verdict):
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():
     found = hypotheses(clean=0.02, backlash=0.7, backlash__lag=0.26, glint=0.02)
     assert credible_labels(found) == ("backlash", "backlash+lag")
+
+
+def test_where_nearly_all_readings_move_one_way_hysteresis_shows_in_those_at_rest():
+    """An offset of all that move is absorbed by the levels."""
+    plan = line().plan
+    kept = plan.take(np.r_[0:12, 12])  # of the second scan a single reading
+    effect = VOCABULARY["hysteresis"].for_extent(Extent(0.0, 1.0, kept))
+    change = 3.0 * sign_of_motion(kept)
+    (place,) = placed(effect, change, change, kept, [])
+    assert (place.covariate, place.start, place.end) == ("direction", 0.0, 0.0)

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from probewise.diagnosis.diagnosis import PredictionAndResiduals, Repair, _controls_before_time, repair_of
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
-from probewise.diagnosis.repair import PredictionAndResiduals, Repair, _controls_before_time, repair_of
 from probewise.recordings import Plan, Recording, Uniform
 
 LAG = SimpleNamespace(

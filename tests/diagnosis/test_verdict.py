@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from probewise.diagnosis.aliases import Alias
+from probewise.diagnosis.advice import Alias
 from probewise.diagnosis.search.searched import Posterior
 from probewise.diagnosis.verdict import (
     Hypothesis,

@@ -5,8 +5,7 @@ finds a poor likelihood: it tests and locates residuals, explains them by named 
 the gain on held-out readings.
 """
 
-from probewise.diagnosis.advice import NextMeasurement
-from probewise.diagnosis.aliases import Alias
+from probewise.diagnosis.advice import Alias, NextMeasurement
 from probewise.diagnosis.apparatus import MOST_READINGS, SETTLED
 from probewise.diagnosis.audit import (
     CURE_PLAN,
@@ -21,7 +20,15 @@ from probewise.diagnosis.audit import (
 )
 from probewise.diagnosis.best_repair import Improvement
 from probewise.diagnosis.diagnose_simulator import diagnose_system, notes_on_calls
-from probewise.diagnosis.diagnosis import NEXT_PLAN, Diagnosis, VerdictReport, diagnosis_json, diagnosis_schema
+from probewise.diagnosis.diagnosis import (
+    NEXT_PLAN,
+    Diagnosis,
+    PredictionAndResiduals,
+    Repair,
+    VerdictReport,
+    diagnosis_json,
+    diagnosis_schema,
+)
 from probewise.diagnosis.engine import Thorough, diagnose, model_with
 from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
 from probewise.diagnosis.fit import Null
@@ -30,7 +37,6 @@ from probewise.diagnosis.locate import ALARM, Place
 from probewise.diagnosis.prepared import join
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.reason import TO_SEPARATE
-from probewise.diagnosis.repair import PredictionAndResiduals, Repair
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.search.thorough import Weighing, weigh_thoroughly
 from probewise.diagnosis.sensors import SensorPrior

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray, own_arithmetic, read_only_fl
 from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
-from probewise.diagnosis.aliases import LAMBDA, LEAST_SHARE
+from probewise.diagnosis.advice import LAMBDA, LEAST_SHARE
 from probewise.diagnosis.apparatus import Command, Words
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups

@@ -1,27 +1,233 @@
-"""The result of a diagnosis: verdict, probabilities, places, repair, next measurement; and as diagnosis.json."""
+"""The result of a diagnosis: calibrated and repaired model, verdict, places, next readings; and as diagnosis.json."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+
+from probewise._arrays import FloatArray, read_only_floats
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
 from probewise.diagnosis.advice import NextMeasurement
 from probewise.diagnosis.apparatus import Apparatus
-from probewise.diagnosis.best_repair import Improvement
+from probewise.diagnosis.best_repair import BestRepair, Improvement
+from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
-from probewise.diagnosis.locate import ALARM, Place
-from probewise.diagnosis.repair import Repair
+from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.locate import ALARM, Place, places_of_effect, significant_places
+from probewise.diagnosis.noise_models import walk_given_readings
+from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
 from probewise.diagnosis.samples import ModelSamples
+from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.thorough import Weighing
-from probewise.diagnosis.verdict import Hypothesis, Judged, Verdict
-from probewise.diagnosis.words import hypothesis_in_words, p_in_words
-from probewise.effects import name_without_copy_suffix
+from probewise.diagnosis.verdict import N_DRAWS, GlobalTest, Hypothesis, Judged, Verdict
+from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, join_lists, join_names, p_in_words
+from probewise.effects import NamedEffect, is_out_of_vocabulary, name_without_copy_suffix
+from probewise.effects.effect import sentence_from_samples
 from probewise.recordings.plan import Recording
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionAndResiduals:
+    """A model's predicted readings of every row, and residuals, NaN without a usable reading: (n_points,) each.
+
+    `walk`, (n_points,), is the random walk of the offset that all readings show about the prediction, by default 0.
+    Residuals are what neither explains.
+    """
+
+    readings: FloatArray
+    residuals: FloatArray
+    walk: FloatArray = field(default_factory=lambda: np.zeros(1))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "readings", read_only_floats(self.readings))
+        object.__setattr__(self, "residuals", read_only_floats(self.residuals))
+        object.__setattr__(self, "walk", read_only_floats(np.broadcast_to(self.walk, self.readings.shape)))
+
+    @property
+    def has_walk(self) -> bool:
+        """Whether the noise contains a random walk."""
+        return bool(np.any(self.walk))
+
+    @property
+    def readings_with_walk(self) -> FloatArray:
+        """Predicted readings with the walk, (n_points,): what residuals count from."""
+        return np.asarray(self.readings + self.walk)
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """The calibrated and the repaired model, as posterior samples (`null`, `model`), and the gain of the latter.
+
+    `before`, `after`: predictions and residuals of both, for all rows, under the same noise. `by_rows`: whether an
+    unknown effect is corrected row by row; `improvement` and `after` include that, `model` does not.
+    """
+
+    null: ModelSamples
+    model: ModelSamples
+    improvement: Improvement
+    before: PredictionAndResiduals
+    after: PredictionAndResiduals
+    by_rows: bool = False
+
+    @property
+    def changes_predictions(self) -> bool:
+        """Whether the residuals of the repaired and of the calibrated model differ."""
+        return not np.array_equal(self.before.residuals, self.after.residuals, equal_nan=True)
+
+    @property
+    def after_in_words(self) -> str:
+        """What the later one of the two predictions is: "repaired", or, row by row, "corrected in these readings"."""
+        return "corrected in these readings" if self.by_rows else "repaired"
+
+    def not_in_model(self, model: str) -> str:
+        """Say that the file `model` lacks the correction by rows, or what share of its samples has a formula."""
+        named = [name for name in self.model.effects if is_out_of_vocabulary(name)]
+        marks = [self.model.absent.get(name, np.zeros(1, dtype=np.bool_)) for name in named]
+        share = 1.0 - float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*marks)))) if marks else 0.0
+        if share:
+            return f"of the samples in {model}, {100 * share:.0f} % contain a formula for it instead"
+        return f"{model} does not contain it"
+
+    @property
+    def combination_shares(self) -> dict[tuple[str, ...], float]:
+        """Share of the repaired model's samples with each combination of the effects that not all samples contain.
+
+        Largest share first; {} if all samples contain the same effects.
+        """
+        absent = self.model.absent
+        if not absent:
+            return {}
+        held = Counter(zip(*(np.where(marks, "", name).tolist() for name, marks in absent.items()), strict=True))
+        return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
+
+    @property
+    def shares_in_words(self) -> str:
+        """Which effects all samples of the repaired model contain, and which only a share of them, in words."""
+        everywhere = tuple(name for name in self.model.effects if name not in self.model.absent)
+        opening, nothing = "", "no effect"
+        if everywhere:
+            opening, nothing = f"{join_names(effects_in_words(everywhere))}; beside that ", "nothing more"
+        held = (
+            f"{hypothesis_in_words(names, nothing=nothing)} ({100 * share:.0f} %)"
+            for names, share in self.combination_shares.items()
+        )
+        return opening + join_lists([*held])
+
+    def unstated_effects(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
+        """List the repaired model's effects that are not `stated`: name, share of the samples with it, sentence."""
+        out = []
+        for effect in cast(Sequence[NamedEffect[Any]], self.model.chain.effects):
+            values = self.model.effect_samples(effect.name)
+            marks = self.model.absent.get(effect.name)
+            held = values if marks is None else values[~marks]
+            if effect.name not in stated and len(held):
+                out.append((effect.name, len(held) / len(values), sentence_from_samples(effect, held)))
+        return tuple(out)
+
+
+def repair_of(
+    prepared: Prepared, best: BestRepair, null: ModelSamples, repaired: ModelSamples, change: FloatArray
+) -> Repair:
+    """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
+
+    `change`: correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
+    """
+    everything, law = prepared.everything, best.problem.law
+    used = prepared.usable_rows_of_everything
+    by_rows = np.zeros(len(everything))
+    by_rows[used] = change
+    readings = np.where(everything.usable, everything.readings, np.nan)
+
+    def shown(found: Fit, added: FloatArray) -> PredictionAndResiduals:
+        model = replace(found.model, plan=everything.plan) if prepared.is_thinned else found.model
+        predicted = np.asarray(model.predict(found.z[None, :])[0] + added)
+        left = found.residuals - added[used]
+        # Between readings, the expected walk is straight; it begins at 0 before the first row.
+        known = walk_given_readings(law, left)
+        walk = np.interp(np.arange(len(everything)), np.append(-1, used), np.append(0.0, known))
+        if prepared.is_thinned:
+            return PredictionAndResiduals(predicted, readings - predicted - walk, walk)
+        return PredictionAndResiduals(predicted, prepared.expand_usable_to_all_rows(left - walk[used]), walk)
+
+    before, after = shown(best.calibrated, np.zeros(len(everything))), shown(best.repaired, by_rows)
+    return Repair(null, repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
+
+
+_SAME = 0.8  # overlap from which two places hold the same rows
+
+
+def locate_effects_and_residuals(
+    searched: Searched,
+    test: GlobalTest,
+    judged: Judged,
+    best: BestRepair,
+    sizes: Mapping[str, float],
+    *,
+    rng: np.random.Generator,
+) -> tuple[Place, ...]:
+    """Return the places of the repair's effects, largest first, then of other significant residuals of the null.
+
+    A place is a range of a covariate, such as time. Of several places with the same figure, only the first is kept.
+
+    `searched`, `test`, `judged`, `best`: result of the search; global test of the null; the verdict; the repair.
+    """
+    prepared, problem, law = searched.prepared, test.problem, test.problem.law
+    covariates, residuals = searched.misfit_templates.covariates, test.null.found.residuals
+    plan, found = prepared.recording.plan.take(prepared.usable_rows), best.fit.found
+    scans = next((c for c in covariates if c.name == "scan"), None)
+    named: list[Place] = []
+    for effect in sorted(found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
+        change = found.change_by_effect(effect.name, prepared.usable_rows)
+        shows_in = prepared.apparatus.covariate_of_effect(effect, change, found.predicted - change, plan, covariates)
+        if shows_in is not None:
+            size = sizes.get(effect.name, 0.0)
+            named += places_of_effect(
+                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size, sd=problem.sd
+            )
+    scan_names = prepared.recording.plan.scan_names
+    scanned = significant_places(problem, covariates, scan_names, residuals, test.draws)
+    if judged.verdict == "unknown" and not (named or scanned) and law.share:
+        # Under heavy-tailed noise, residuals in outlying readings only are not significant.
+        white = Linearised.of(test.null.found, law.without_tail_or_rounding())
+        scanned = significant_places(
+            white, covariates, scan_names, residuals, white.draw_null_residuals(N_DRAWS, rng=rng)
+        )
+    first: dict[str, Place] = {}
+    for place in [*named, *_controls_before_time(scanned, prepared.apparatus.controls)]:
+        first.setdefault(place.figure_name, place)
+    return tuple(_place_in_everything(place, prepared) if prepared.is_thinned else place for place in first.values())
+
+
+def _controls_before_time(places: Sequence[Place], controls: Sequence[str]) -> list[Place]:
+    """Move the place of a control before that of time if they hold the same rows: what a person moves is the cause."""
+    out = list(places)
+    for place in places:
+        at = next((k for k, other in enumerate(out) if other is place), 0)
+        before = [k for k in range(at) if out[k].covariate in ("time", "row") and place.overlap(out[k]) >= _SAME]
+        if place.covariate in controls and before:
+            out.insert(before[0], out.pop(at))
+    return out
+
+
+def _place_in_everything(place: Place, prepared: Prepared) -> Place:
+    """Return a place found in some of the readings with values at all usable ones, and scans by their numbers there."""
+    values, at = place.values, place.curve_at
+    if values is None:
+        return place
+    if place.covariate == "scan":
+        number = np.unique(prepared.everything.plan.scan[rows_to_diagnose(prepared.everything)])
+        values, at = (number[codes.astype(np.int64)].astype(np.float64) for codes in (values, at))
+    everywhere = np.full(int(prepared.everything.usable.sum()), np.nan)
+    usable = np.flatnonzero(prepared.everything.usable)
+    everywhere[np.searchsorted(usable, prepared.usable_rows_of_everything)] = values
+    return replace(place, values=everywhere, curve_at=at)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_texts, require_like, require_one_of, require_progress, require_rng
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
 from probewise.diagnosis.best_repair import BestRepair, improvement_and_correction, judged_and_best_repair
-from probewise.diagnosis.diagnosis import Diagnosis, VerdictReport
+from probewise.diagnosis.diagnosis import Diagnosis, VerdictReport, locate_effects_and_residuals, repair_of
 from probewise.diagnosis.findings import EffectFound, effects_found, formula_of, noise_found, remainder_of
 from probewise.diagnosis.fit import Null
 from probewise.diagnosis.light_sensor import LightSensorApparatus
@@ -31,7 +31,6 @@ from probewise.diagnosis.reason import (
     combinations_in_reason,
     reason_of,
 )
-from probewise.diagnosis.repair import locate_effects_and_residuals, repair_of
 from probewise.diagnosis.samples import ModelSamples, draw_models, sample_model
 from probewise.diagnosis.search.refits import effects_out_of_vocabulary
 from probewise.diagnosis.search.search import MAX_ORDER, search, search_with_formulas

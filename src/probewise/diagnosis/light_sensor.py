@@ -262,8 +262,8 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         excerpts = excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE))
         parts += [(label, words, plan, part, stripes) for part in excerpts]
     out = []
-    for label, words, whole, part, pattern in parts:
-        taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+    for label, words, whole, part, laid_pattern in parts:
+        taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, laid_pattern)
         out.append(scan_command("lay", f"{words}{part.words}", taken))
     return out
 

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.aliases import Alias, aliases_with_separating_plans
+from probewise.diagnosis.advice import Alias, aliases_with_separating_plans
 from probewise.diagnosis.apparatus import SETTLED
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value

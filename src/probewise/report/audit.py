@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from probewise._words import count_with_noun, unit_after_number
 from probewise.diagnosis import EffectAudit, PlanAudit
-from probewise.diagnosis.aliases import LAMBDA
+from probewise.diagnosis.advice import LAMBDA
 from probewise.diagnosis.audit import ALIAS, LEAST_NATS
 from probewise.effects import spoken_name
 from probewise.report.html import Markup, Section, figure, page, table

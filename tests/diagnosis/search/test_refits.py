@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -266,3 +267,24 @@ def test_the_curve_of_a_slow_column_is_tried_before_a_walk_takes_what_it_explain
     assert [proposal.added for proposal in stepwise._proposals_under_simplest_noise(state, state.null)] == [
         "curve:temp"
     ]
+
+
+def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
+    """Eight pairs promise 500 nats by screening, of which six are refitted and keep nothing: the others fall, too."""
+    state = _state(prepared)
+    promised = state.null.log_z + 500.0
+    pairs = list(itertools.combinations(sorted(state.effects), 2))[:8]
+    state.about_null |= {(tuple(sorted(pair)), ()): promised for pair in pairs}
+
+    def posterior():
+        return posterior_of(
+            Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
+        )
+
+    searching._refit_favoured_by_screening(state, posterior, silent)
+    left = {
+        names: value for (names, _), value in state.screened_log_evidences().items() if names not in state.undetected
+    }
+    assert len(left) >= 2
+    assert all(value < max(c.log_z for c in state.candidates.values()) + 3.0 for value in left.values())
+    assert state.optimism > 400

@@ -321,12 +321,7 @@ def challenge_csv(rows: Sequence[ScoreRow]) -> str:
 
 
 def challenge_html(
-    results: Results,
-    rows: Sequence[ScoreRow],
-    *,
-    command: str,
-    systems: bool = False,
-    draw: Draw = draw_or_raise,
+    results: Results, rows: Sequence[ScoreRow], *, command: str, systems: bool = False, draw: Draw = draw_or_raise
 ) -> str:
     """Return the HTML of a challenge's page from the cases' results and the table's `rows`.
 

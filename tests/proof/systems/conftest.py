@@ -24,7 +24,7 @@ def rates(s, p, u):
     kind = SystemKind(
         name="by hand",
         text=text,
-        draw=lambda rng: {"k": k},
+        shared={"k": (k, k)},
         design=lambda rng, n, regime: (T, {}),
         decimals={},
         drives=("u",),

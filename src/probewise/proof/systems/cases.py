@@ -18,7 +18,7 @@ from probewise.proof.sensors.cases import Stratum, stratum_in_wheel
 from probewise.proof.sensors.sizing import amplitude_of_size
 from probewise.proof.systems.form import Form, FormWithParameters, Numbers, TrueSystem
 from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
-from probewise.proof.systems.kind import SystemKind, SystemTable, design_runs
+from probewise.proof.systems.kind import SystemKind, SystemTable, design_runs, draw_values
 from probewise.proof.systems.kinds import FORMULAS, LAWS
 from probewise.proof.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
 from probewise.proof.systems.simulate import simulate_noise_free
@@ -174,10 +174,9 @@ class SystemCase:
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
     """Draw a system of this kind: the table of all runs and the true parameters."""
     rows = design_runs(kind, rng=rng)
-    each = [kind.draw_run(rng) for _ in range(rows.n_runs)]
-    return DrawnSystem(
-        kind, rows, kind.draw(rng), {name: np.array([own[name] for own in each]) for name in kind.per_run}
-    )
+    each = [draw_values(kind.of_run, rng) for _ in range(rows.n_runs)]
+    by_run = {name: np.array([own[name] for own in each]) for name in kind.per_run}
+    return DrawnSystem(kind, rows, draw_values(kind.shared, rng), by_run)
 
 
 def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> SystemCase:
@@ -235,12 +234,7 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
 
 
 def _draw_effects(
-    stratum: Stratum,
-    n_earlier: int,
-    family: str,
-    drawn: DrawnSystem,
-    after_refit: AfterRefit,
-    rng: np.random.Generator,
+    stratum: Stratum, n_earlier: int, family: str, drawn: DrawnSystem, after_refit: AfterRefit, rng: np.random.Generator
 ) -> tuple[tuple[SystemEffect, ...], float | None]:
     """Draw the effects of a stratum once; return them and the cosine of a pair (None: no pair)."""
     if stratum.kind == "clean":
@@ -370,12 +364,11 @@ def simulator_file_text(case: SystemCase) -> str:
 def table_text(case: SystemCase, rows: IntArray) -> str:
     """Return the rows with these indices, readings last, as CSV text with a header."""
     kind, laid = case.drawn.kind, case.drawn.table
-    decimals = {**kind.decimals, **{c.name: c.decimals for c in kind.logged}, kind.reading: kind.reading_decimals}
     columns: dict[str, list[str]] = {}
     if kind.run is not None:
         columns[kind.run] = [case.labels[k] for k in laid.run[rows]]
     names = [n for n in (kind.time, *kind.drives) if n is not None]
     values = {**laid.columns, kind.reading: case.readings}
     for name in (*names, *(n for n in laid.columns if n not in names), kind.reading):
-        columns[name] = [f"{value:.{decimals[name]}f}" for value in values[name][rows].tolist()]
+        columns[name] = [f"{value:.{kind.column_decimals[name]}f}" for value in values[name][rows].tolist()]
     return csv_text(dict(columns))

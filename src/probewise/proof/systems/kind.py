@@ -87,75 +87,45 @@ class Law:
     linear: bool = False
 
 
-@dataclass(frozen=True)
-class IrrelevantColumn:
-    """A logged column without influence: a random walk (scale `wander`) about `middle`, plus `jitter` of sd per row.
+Range: TypeAlias = tuple[float, float] | tuple[str, float, float]
+"""Ends of a uniform distribution, or "normal" with mean and sd."""
 
-    `beyond` shifts `middle` in the last held-out run.
-    """
 
-    name: str
-    middle: float
-    wander: float
-    jitter: float
-    decimals: int
-    beyond: float = 0.0
+def draw_values(ranges: Mapping[str, Range], rng: np.random.Generator) -> dict[str, float]:
+    """Draw a value from each of these distributions, by name."""
+    return {name: float(rng.normal(*of[1:]) if of[0] == "normal" else rng.uniform(*of)) for name, of in ranges.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class SystemKind:
     """A kind of system.
 
-    What the simulator file states (parameters, reading, time, runs, and its formula or law) is taken from its text.
-
-    Parameters
-    ----------
-    name
-        Its name in a truth.
-    text
-        The simulator file as a user would provide it; `{noise}` stands for its line on noise.
-    draw
-        Draws the true shared parameters.
-    draw_run
-        Draws the true parameters of a run.
-    design
-        Designs a run: draws its times from 0 and its columns, from (rng, n_rows, regime). The regime is 1, or larger
-        for a run with inputs beyond the others' range.
-    decimals
-        Decimals of the designed columns and of time.
-    drives
-        Columns that the law uses.
-    sd
-        Sd of a reading's white noise.
-    stated_law
-        The law of a file that integrates by itself.
-    restarts_time
-        Whether time restarts in each run.
-    logged
-        Irrelevant columns.
-    n_runs
-        Number of runs not held out.
-    reading_decimals
-        Decimals of a reading.
+    What the simulator file states (parameters, reading, time, runs, and its formula or law) is taken from its `text`,
+    which is as a user would provide it; `{noise}` stands for its line on noise. True parameters are drawn from the
+    ranges `shared` and, in each run, `of_run`. `design` draws the times of a run, from 0, and its columns, from (rng,
+    n_rows, regime): the regime is 1, or larger for a run with inputs beyond the others' range. `decimals` are those of
+    designed columns and time, `drives` the columns that the law uses, `sd` that of a reading's white noise. Irrelevant
+    columns are `logged`: a random walk about a middle, scaled, plus noise of an sd in each row; then come the decimals,
+    and what shifts the middle in the last held-out run, if anything does. `stated_law` is the law of a file that
+    integrates by itself; `n_runs` are not held out.
     """
 
     name: str
     text: str
-    draw: Callable[[np.random.Generator], dict[str, float]]
+    shared: Mapping[str, Range]
     design: Callable[[np.random.Generator, int, float], tuple[FloatArray, Columns]]
     decimals: Mapping[str, int]
     drives: tuple[str, ...]
     sd: float
-    draw_run: Callable[[np.random.Generator], dict[str, float]] = field(default=lambda rng: {})
+    of_run: Mapping[str, Range] = field(default_factory=dict)
     stated_law: Law | None = None
     restarts_time: bool = False
-    logged: tuple[IrrelevantColumn, ...] = ()
+    logged: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     n_runs: int = 5
     reading_decimals: int = 4
 
     @cached_property
     def _file(self) -> dict[str, Any]:
-        """What the simulator file defines, by name."""
         names: dict[str, Any] = {}
         exec(self.text.replace("{noise}\n", ""), names)
         return names
@@ -184,6 +154,12 @@ class SystemKind:
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return tuple(self._file["parameters"])
+
+    @property
+    def column_decimals(self) -> dict[str, int]:
+        """Decimals of each column of the table, and of the reading."""
+        logged = {name: int(about[3]) for name, about in self.logged.items()}
+        return {**self.decimals, **logged, self.reading: self.reading_decimals}
 
     @property
     def defines_states(self) -> bool:
@@ -255,8 +231,7 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
         if kind.time is not None:
             whole[kind.time] = t
         for name, values in whole.items():
-            decimals = {**kind.decimals, **{c.name: c.decimals for c in kind.logged}}[name]
-            columns.setdefault(name, []).append(np.round(values, decimals))
+            columns.setdefault(name, []).append(np.round(values, kind.column_decimals[name]))
         run.append(np.full(n, k))
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
     return SystemTable(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
@@ -264,8 +239,8 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
 
 def _irrelevant_columns(kind: SystemKind, n: int, regime: float, rng: np.random.Generator) -> Columns:
     out = {}
-    for column in kind.logged:
+    for name, (middle, wander, jitter, _, *beyond) in kind.logged.items():
         walk = np.cumsum(rng.standard_normal(n)) / np.sqrt(n) + rng.standard_normal()
-        beyond = column.beyond if regime > 1 else 0.0
-        out[column.name] = column.middle + beyond + column.wander * walk + column.jitter * rng.standard_normal(n)
+        shifted = middle + sum(beyond) * (regime > 1)
+        out[name] = shifted + wander * walk + jitter * rng.standard_normal(n)
     return out

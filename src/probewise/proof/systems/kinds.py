@@ -7,7 +7,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.proof.systems.kind import (
     Columns,
-    IrrelevantColumn,
     Law,
     SystemKind,
     irregular_times,
@@ -39,19 +38,14 @@ def simulate(p, data):
     gone = np.exp(-data["t_s"] / p["tau_s"])
     return p["scale"] * data["bath_c"] * (1 - gone) + p["start_c"] * gone
 """,
-    draw=lambda rng: {"tau_s": float(rng.uniform(18, 45)), "scale": float(rng.normal(1.0, 0.01))},
-    draw_run=lambda rng: {"start_c": float(rng.normal(21, 2))},
+    shared={"tau_s": (18, 45), "scale": ("normal", 1.0, 0.01)},
+    of_run={"start_c": ("normal", 21, 2)},
     design=_bath_design,
     decimals={"t_s": 2, "bath_c": 2},
     drives=("bath_c",),
     sd=0.05,
     restarts_time=True,
-    logged=(
-        IrrelevantColumn("room_c", 21.5, 0.8, 0.03, 2, 4.0),
-        IrrelevantColumn("stir_rpm", 300, 15, 3, 0),
-        IrrelevantColumn("rh_pct", 45, 3, 0.3, 1),
-    ),
-    n_runs=5,
+    logged={"room_c": (21.5, 0.8, 0.03, 2, 4.0), "stir_rpm": (300, 15, 3, 0), "rh_pct": (45, 3, 0.3, 1)},
 )
 
 
@@ -76,19 +70,14 @@ controls = ["room_c"]
 def simulate(p, data):
     return data["room_c"] + (p["hot_c"] - data["room_c"]) * exp(-data["t_min"] / p["tau_min"])
 """,
-    draw=lambda rng: {"tau_min": float(rng.uniform(25, 60))},
-    draw_run=lambda rng: {"hot_c": float(rng.normal(76, 6))},
+    shared={"tau_min": (25, 60)},
+    of_run={"hot_c": ("normal", 76, 6)},
     design=_cup_design,
     decimals={"t_min": 2, "room_c": 2},
     drives=("room_c",),
     sd=0.12,
     restarts_time=True,
-    logged=(
-        IrrelevantColumn("rh_pct", 50, 4, 0.4, 1),
-        IrrelevantColumn("fill_ml", 240, 6, 0.4, 1),
-        IrrelevantColumn("baro_hpa", 1012, 2, 0.1, 1),
-    ),
-    n_runs=5,
+    logged={"rh_pct": (50, 4, 0.4, 1), "fill_ml": (240, 6, 0.4, 1), "baro_hpa": (1012, 2, 0.1, 1)},
     reading_decimals=3,
 )
 
@@ -110,21 +99,12 @@ vectorized = True
 def simulate(p, data):
     return p["dark_mv"] + p["power"] / (data["dist_mm"] + p["behind_mm"]) ** 2
 """,
-    draw=lambda rng: {
-        "dark_mv": float(rng.normal(0, 2)),
-        "power": float(rng.uniform(2e5, 5e5)),
-        "behind_mm": float(rng.uniform(8, 20)),
-    },
+    shared={"dark_mv": ("normal", 0, 2), "power": (2e5, 5e5), "behind_mm": (8, 20)},
     design=_photodiode_design,
     decimals={"dist_mm": 2},
     drives=("dist_mm",),
     sd=0.4,
-    logged=(
-        IrrelevantColumn("board_c", 27, 1.5, 0.05, 2, 6.0),
-        IrrelevantColumn("rail_v", 5.0, 0.01, 0.002, 4),
-        IrrelevantColumn("rh_pct", 42, 3, 0.3, 1),
-    ),
-    n_runs=5,
+    logged={"board_c": (27, 1.5, 0.05, 2, 6.0), "rail_v": (5.0, 0.01, 0.002, 4), "rh_pct": (42, 3, 0.3, 1)},
     reading_decimals=3,
 )
 
@@ -148,16 +128,12 @@ controls = ["flow_lpm"]
 def simulate(p, data):
     return p["zero_kpa"] + p["k"] * data["flow_lpm"] ** 2
 """,
-    draw=lambda rng: {"zero_kpa": float(rng.normal(0, 0.2)), "k": float(rng.uniform(0.08, 0.2))},
+    shared={"zero_kpa": ("normal", 0, 0.2), "k": (0.08, 0.2)},
     design=_flow_design,
     decimals={"t_s": 1, "flow_lpm": 3},
     drives=("flow_lpm",),
     sd=0.03,
-    logged=(
-        IrrelevantColumn("water_c", 18, 1.5, 0.05, 2, 8.0),
-        IrrelevantColumn("pump_v", 24, 0.1, 0.02, 3),
-        IrrelevantColumn("baro_hpa", 1009, 2, 0.1, 1),
-    ),
+    logged={"water_c": (18, 1.5, 0.05, 2, 8.0), "pump_v": (24, 0.1, 0.02, 3), "baro_hpa": (1009, 2, 0.1, 1)},
     n_runs=4,
 )
 
@@ -179,16 +155,12 @@ def simulate(p, data):
     index = 1.504 + p["b_um2"] / (data["nm"] / 1000) ** 2
     return p["radius_mm"] / (2 * (index - 1))
 """,
-    draw=lambda rng: {"radius_mm": float(rng.normal(100, 0.5)), "b_um2": float(rng.uniform(0.003, 0.008))},
+    shared={"radius_mm": ("normal", 100, 0.5), "b_um2": (0.003, 0.008)},
     design=_lens_design,
     decimals={"t_s": 1, "nm": 1},
     drives=("nm",),
     sd=0.01,
-    logged=(
-        IrrelevantColumn("glass_c", 22, 1.2, 0.03, 2, 7.0),
-        IrrelevantColumn("lamp_w", 40, 0.3, 0.05, 2),
-        IrrelevantColumn("baro_hpa", 1015, 2, 0.1, 1),
-    ),
+    logged={"glass_c": (22, 1.2, 0.03, 2, 7.0), "lamp_w": (40, 0.3, 0.05, 2), "baro_hpa": (1015, 2, 0.1, 1)},
     n_runs=3,
 )
 
@@ -212,23 +184,17 @@ def simulate(p, data):
     kelvin = data["probe_c"] + 273.15
     return p["e0_mv"] - p["slope_mv"] * kelvin / 298.15 * (data["buffer_ph"] - 7)
 """,
-    draw=lambda rng: {"e0_mv": float(rng.normal(0, 12)), "slope_mv": float(rng.uniform(56, 60))},
+    shared={"e0_mv": ("normal", 0, 12), "slope_mv": (56, 60)},
     design=_ph_design,
     decimals={"t_s": 1, "buffer_ph": 3, "probe_c": 2},
     drives=("buffer_ph", "probe_c"),
     sd=0.5,
-    logged=(IrrelevantColumn("salt_g_l", 3.0, 0.15, 0.02, 3), IrrelevantColumn("rh_pct", 48, 3, 0.3, 1)),
+    logged={"salt_g_l": (3.0, 0.15, 0.02, 3), "rh_pct": (48, 3, 0.3, 1)},
     n_runs=4,
     reading_decimals=3,
 )
 
 FORMULAS = (BATH, CUP, PHOTODIODE, FLOW, LENS, PH)
-
-
-def _tank_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular_times(rng, n, 5.0), {
-        "valve_v": random_steps(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)
-    }
 
 
 TANK = SystemKind(
@@ -255,9 +221,12 @@ def simulate(p, data):
         out.append(level)
     return out
 """,
-    draw=lambda rng: {"cm_per_v": float(rng.uniform(5, 10)), "tau_s": float(rng.uniform(35, 90))},
-    draw_run=lambda rng: {"start_cm": float(rng.uniform(5, 30))},
-    design=_tank_design,
+    shared={"cm_per_v": (5, 10), "tau_s": (35, 90)},
+    of_run={"start_cm": (5, 30)},
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 5.0),
+        {"valve_v": random_steps(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)},
+    ),
     decimals={"t_s": 2, "valve_v": 2},
     drives=("valve_v",),
     sd=0.04,
@@ -266,19 +235,9 @@ def simulate(p, data):
         lambda s, p, u: {"level": (p["cm_per_v"] * u["valve_v"] - s["level"]) / p["tau_s"]},
         lambda s, p, u: s["level"],
     ),
-    logged=(
-        IrrelevantColumn("water_c", 16, 1.0, 0.04, 2, 6.0),
-        IrrelevantColumn("hall_c", 20, 0.8, 0.04, 2),
-        IrrelevantColumn("supply_v", 12, 0.05, 0.01, 3),
-    ),
+    logged={"water_c": (16, 1.0, 0.04, 2, 6.0), "hall_c": (20, 0.8, 0.04, 2), "supply_v": (12, 0.05, 0.01, 3)},
     n_runs=4,
 )
-
-
-def _filter_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular_times(rng, n, 0.002), {
-        "in_v": random_steps(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)
-    }
 
 
 FILTER = SystemKind(
@@ -297,16 +256,15 @@ def rates(s, p, u):
 def observe(s, p, u):
     return s["second"]
 """,
-    draw=lambda rng: {
-        "gain": float(rng.normal(1.0, 0.03)),
-        "tau1_s": float(rng.uniform(0.003, 0.006)),
-        "tau2_s": float(rng.uniform(0.010, 0.018)),
-    },
-    design=_filter_design,
+    shared={"gain": ("normal", 1.0, 0.03), "tau1_s": (0.003, 0.006), "tau2_s": (0.010, 0.018)},
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 0.002),
+        {"in_v": random_steps(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)},
+    ),
     decimals={"t_s": 6, "in_v": 3},
     drives=("in_v",),
     sd=0.004,
-    logged=(IrrelevantColumn("board_c", 30, 1.5, 0.04, 2, 8.0), IrrelevantColumn("rail_v", 12.0, 0.02, 0.004, 3)),
+    logged={"board_c": (30, 1.5, 0.04, 2, 8.0), "rail_v": (12.0, 0.02, 0.004, 3)},
     n_runs=4,
     reading_decimals=5,
 )
@@ -334,22 +292,16 @@ def rates(s, p, u):
 def observe(s, p, u):
     return 1000 * s["x"]
 """,
-    draw=lambda rng: {"k_n_m": float(rng.uniform(25, 70)), "c_kg_s": float(rng.uniform(0.4, 1.2))},
-    draw_run=lambda rng: {"x0_m": float(rng.normal(0, 0.03))},
+    shared={"k_n_m": (25, 70), "c_kg_s": (0.4, 1.2)},
+    of_run={"x0_m": ("normal", 0, 0.03)},
     design=_oscillator_design,
     decimals={"t_s": 4, "force_n": 4},
     drives=("force_n",),
     sd=0.15,
-    logged=(IrrelevantColumn("air_c", 22, 0.8, 0.03, 2, 5.0), IrrelevantColumn("mains_v", 230, 1.0, 0.3, 1)),
+    logged={"air_c": (22, 0.8, 0.03, 2, 5.0), "mains_v": (230, 1.0, 0.3, 1)},
     n_runs=4,
     reading_decimals=3,
 )
-
-
-def _servo_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular_times(rng, n, 0.03), {
-        "volts": random_steps(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)
-    }
 
 
 SERVO = SystemKind(
@@ -365,23 +317,17 @@ states = {"angle": 0.0, "speed": 0.0}
 def rates(s, p, u):
     return {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]}
 """,
-    draw=lambda rng: {"deg_s_v": float(rng.uniform(30, 70)), "tau_s": float(rng.uniform(0.08, 0.2))},
-    design=_servo_design,
+    shared={"deg_s_v": (30, 70), "tau_s": (0.08, 0.2)},
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 0.03),
+        {"volts": random_steps(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)},
+    ),
     decimals={"t_s": 4, "volts": 2},
     drives=("volts",),
     sd=0.8,
-    logged=(
-        IrrelevantColumn("case_c", 33, 2.5, 0.05, 2, 10.0),
-        IrrelevantColumn("bus_v", 9.0, 0.05, 0.01, 3),
-        IrrelevantColumn("load_g", 120, 6, 0.5, 1),
-    ),
-    n_runs=5,
+    logged={"case_c": (33, 2.5, 0.05, 2, 10.0), "bus_v": (9.0, 0.05, 0.01, 3), "load_g": (120, 6, 0.5, 1)},
     reading_decimals=3,
 )
-
-
-def _reactor_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular_times(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}
 
 
 REACTOR = SystemKind(
@@ -401,25 +347,16 @@ def rates(s, p, u):
 def observe(s, p, u):
     return s["b"]
 """,
-    draw=lambda rng: {"k1_per_s": float(rng.uniform(0.018, 0.03)), "k2_per_s": float(rng.uniform(0.004, 0.008))},
-    draw_run=lambda rng: {"dose": float(rng.uniform(0.7, 2.0))},
-    design=_reactor_design,
+    shared={"k1_per_s": (0.018, 0.03), "k2_per_s": (0.004, 0.008)},
+    of_run={"dose": (0.7, 2.0)},
+    design=lambda rng, n, regime: (irregular_times(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}),
     decimals={"t_s": 1},
     drives=(),
     sd=0.003,
     restarts_time=True,
-    logged=(
-        IrrelevantColumn("jacket_c", 30, 0.7, 0.04, 2, 4.0),
-        IrrelevantColumn("stir_rpm", 500, 12, 4, 0),
-        IrrelevantColumn("lamp_a", 0.8, 0.01, 0.001, 4),
-    ),
-    n_runs=5,
+    logged={"jacket_c": (30, 0.7, 0.04, 2, 4.0), "stir_rpm": (500, 12, 4, 0), "lamp_a": (0.8, 0.01, 0.001, 4)},
     reading_decimals=5,
 )
-
-
-def _predator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular_times(rng, n, 0.5), {"feed": random_steps(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
 
 
 PREDATOR = SystemKind(
@@ -436,20 +373,15 @@ def rates(s, p, u):
     born = p["grow_per_d"] * u["feed"] * s["prey"]
     return {"prey": born - caught, "hunters": 0.3 * caught - p["die_per_d"] * s["hunters"]}
 """,
-    draw=lambda rng: {
-        "grow_per_d": float(rng.uniform(0.5, 0.9)),
-        "eat": float(rng.uniform(0.06, 0.1)),
-        "die_per_d": float(rng.uniform(0.4, 0.7)),
-    },
-    design=_predator_design,
+    shared={"grow_per_d": (0.5, 0.9), "eat": (0.06, 0.1), "die_per_d": (0.4, 0.7)},
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 0.5),
+        {"feed": random_steps(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)},
+    ),
     decimals={"t_d": 3, "feed": 2},
     drives=("feed",),
     sd=0.3,
-    logged=(
-        IrrelevantColumn("room_c", 21, 0.8, 0.04, 2, 5.0),
-        IrrelevantColumn("oxygen_mg_l", 7.5, 0.3, 0.05, 2),
-        IrrelevantColumn("light_lx", 400, 15, 4, 0),
-    ),
+    logged={"room_c": (21, 0.8, 0.04, 2, 5.0), "oxygen_mg_l": (7.5, 0.3, 0.05, 2), "light_lx": (400, 15, 4, 0)},
     n_runs=4,
     reading_decimals=3,
 )

@@ -37,10 +37,7 @@ class NoiseFreeResult:
 
 
 def simulate_noise_free(
-    kind: SystemKind,
-    rows: SystemTable,
-    parameters: Mapping[str, Any],
-    effects: Sequence[FormWithParameters] = (),
+    kind: SystemKind, rows: SystemTable, parameters: Mapping[str, Any], effects: Sequence[FormWithParameters] = ()
 ) -> NoiseFreeResult:
     """Simulate a system without noise.
 
@@ -198,14 +195,7 @@ class _Integration:
             return slope(share, y)
 
         solved = solve_ivp(
-            counted,
-            (begin, end),
-            s,
-            method="DOP853",
-            rtol=_RTOL,
-            atol=_ATOL,
-            first_step=end - begin,
-            events=events,
+            counted, (begin, end), s, method="DOP853", rtol=_RTOL, atol=_ATOL, first_step=end - begin, events=events
         )
         if not solved.success:
             raise NotConvergedError(f"the law of the {self.kind.name} cannot be solved: {solved.message}")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.arm import Pose, Reading
+from probewise.experiment.kinds import prior_posterior
 from probewise.experiment.rivals import EACH_S, EffectInPacedTime, Pace, gain_loss, rivals_of
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import experiment_of
@@ -66,3 +67,21 @@ def test_the_ways_of_one_name_share_what_it_has():
         shares[kind.left_out] = shares.get(kind.left_out, 0.0) + float(np.exp(kind.log_prior))
     assert shares["gain_drift"] == pytest.approx(shares["backlash"])
     assert sum(kind.left_out == "gain_drift" for kind in experiment.kinds) == 2
+
+
+def test_samples_keep_their_seconds_where_the_pace_changes():
+    """A step of the light between two readings stays there, and is as probable as by the other pace's prior."""
+    experiment = replace(experiment_of(REFERENCE), trust=0.9)
+    kind = next(kind for kind in experiment.kinds if kind.left_out == "ambient_step")
+    rng = np.random.default_rng(2)
+    slow = prior_posterior([kind], 4000, rng=rng).particles[0]
+    fast = kind.at_pace(slow, 8.0, 4.0)
+    np.testing.assert_allclose(fast.weighted.theta[:, -1], 2.0 * slow.weighted.theta[:, -1])
+    np.testing.assert_array_equal(fast.weighted.theta[:, :-1], slow.weighted.theta[:, :-1])
+    lost = slow.weighted.theta[:, -1] > 400.0  # later than a run by the new pace may be; log-uniform within
+    np.testing.assert_allclose(fast.weighted.weight, np.where(lost, 0.0, 1.0 / (~lost).sum()))
+    assert fast.log_z == pytest.approx(np.log((~lost).mean()))
+    assert kind.at_pace(fast, 4.0, 8.0).log_z == pytest.approx(fast.log_z)
+    plain = next(kind for kind in experiment.kinds if not kind.left_out)
+    own = prior_posterior([plain], 300, rng=rng).particles[0]
+    assert plain.at_pace(own, 8.0, 4.0) is own

@@ -57,8 +57,8 @@ def with_evidence_from_prior(
 ) -> Posterior:
     """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those never solved too.
 
-    `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. Unsure are
-    kinds whose samples followed a reading with difficulty or were woken, and in doubt those never solved, too. After a
+    `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. Unsure is a
+    kind whose samples followed a reading with difficulty or were woken, and in doubt one never solved, too. After a
     reading, a few of these are solved; before a run ends, all. Where no effect can be left out, the end changes samples
     only if they had lost a mode.
     """

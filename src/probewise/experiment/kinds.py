@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
-from probewise.experiment.rivals import DescribedEffect, SensorModelRival
+from probewise.experiment.rivals import DescribedEffect, SensorModelRival, powers_of_s
 from probewise.inference.problem import Likelihood, SensorProblem, checked_log_prob
 from probewise.inquiry import TabulatedChain
 from probewise.inquiry.smc import Particles, prior_particles
@@ -105,6 +105,26 @@ class HypothesisKind:
     to_whole_theta: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
     effect: DescribedEffect | None = None
+
+    def at_pace(self, particles: Particles, before_s: float, now_s: float) -> Particles:
+        """Return the samples of the same hypotheses where a paced second stands for another time.
+
+        `before_s` and `now_s` are the mean seconds per reading. The prior, which is of paced time, weighs them anew.
+        """
+        powers = powers_of_s(self.effect)
+        if before_s == now_s or not powers.any() or particles.log_z == -math.inf:
+            return particles
+        had, factors = particles.weighted, (before_s / now_s) ** powers
+        theta = had.theta.copy()
+        theta[:, -len(powers) :] *= factors
+        alive = np.isfinite(had.log_weight)
+        before, after = (np.where(alive, self.prior.log_prob(own), 0.0) for own in (had.theta, theta))
+        log_weight = had.log_weight + after - before + np.log(factors).sum()
+        gained = float(logsumexp(log_weight))
+        if gained == -math.inf:
+            return particles
+        moved = replace(had, theta=theta, log_weight=log_weight - gained, log_z=had.log_z + gained)
+        return replace(particles, weighted=moved)
 
     def problem(self, recording: Recording) -> KindProblem:
         """Set up the inference of this kind from a recording."""

@@ -12,6 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import can_sleep_mask, with_evidence_from_prior
 from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
+from probewise.experiment.rivals import Pace
 from probewise.inquiry.smc import BRIEF, STEADY, THOROUGH, nested_sampling_from_scratch, resample_and_move, update
 from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
@@ -79,12 +80,13 @@ class SequentialMonteCarlo:
         usual, unsuspected = STEADY if previous.doubts_sensor else THOROUGH, SUSPECTED[1][0]
         updated = list(previous.particles)
         probability, can_sleep = previous.probability, can_sleep_mask(previous)
+        each_s = [Pace.from_times(times).each_s for times in (recording.plan.time_s[:-1], recording.plan.time_s)]
         for k, (kind, own, problem) in enumerate(zip(previous.kinds, previous.particles, problems, strict=True)):
             if can_sleep[k]:
                 updated[k] = own.asleep_with(problem.perfect_log_likelihood)
             else:
                 effort = BRIEF if kind.left_out and probability[k] < unsuspected else usual
-                updated[k] = update(own, problem, rng=rng, effort=effort)
+                updated[k] = update(kind.at_pace(own, *each_s), problem, rng=rng, effort=effort)
         now = replace(previous, particles=tuple(updated))
         now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():

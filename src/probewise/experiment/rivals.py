@@ -319,11 +319,16 @@ class Pace:
     each_s: float = EACH_S
 
     @classmethod
+    def from_times(cls, time_s: FloatArray) -> Self:
+        """Take the start and the mean seconds per reading from the readings' times; the default for fewer than two."""
+        if len(time_s) < 2 or time_s[-1] <= time_s[0]:
+            return cls(float(time_s[0]) if len(time_s) else 0.0)
+        return cls(float(time_s[0]), float(time_s[-1] - time_s[0]) / (len(time_s) - 1))
+
+    @classmethod
     def from_readings(cls, readings: Sequence[Reading]) -> Self:
-        """Take the start and the mean seconds per reading of some readings; the default pace for fewer than two."""
-        if len(readings) < 2 or readings[-1].time_s <= readings[0].time_s:
-            return cls(readings[0].time_s if readings else 0.0)
-        return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
+        """Take the pace of some readings."""
+        return cls.from_times(np.array([reading.time_s for reading in readings]))
 
     def plan_with_paced_time(self, plan: Plan) -> Plan:
         """Return the plan with a column of paced time."""
@@ -336,10 +341,14 @@ class Pace:
 
     def in_seconds(self, effect: AnyEffect, theta: FloatArray) -> FloatArray:
         """Return an effect's parameters, (..., n_params), in seconds, those of an `EffectInPacedTime` converted."""
-        if not isinstance(effect, EffectInPacedTime):
-            return theta
-        powers = np.array([_POWERS_OF_S.get(name, 0) for name in effect.prior.names])
-        return np.asarray(theta * (self.each_s / EACH_S) ** powers)
+        return np.asarray(theta * (self.each_s / EACH_S) ** powers_of_s(effect))
+
+
+def powers_of_s(effect: AnyEffect | None) -> FloatArray:
+    """Return the power of paced seconds in each parameter's unit, (n_params,); 0 but for an `EffectInPacedTime`."""
+    if not isinstance(effect, EffectInPacedTime):
+        return np.zeros(0 if effect is None else len(effect.prior.names))
+    return np.array([float(_POWERS_OF_S.get(name, 0)) for name in effect.prior.names])
 
 
 def paced_time_s(plan: Plan) -> FloatArray | None:

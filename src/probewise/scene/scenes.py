@@ -45,16 +45,13 @@ class KnownScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its free parameters: none."""
         return ()
 
     @property
     def prior(self) -> Prior:
-        """The prior of no parameters."""
         return Empty()
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Return the region by pattern name; theta (n_samples, 0) is ignored."""
         return self._region_by_name
 
     @cached_property
@@ -73,12 +70,10 @@ class HypothesisScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the shape's parameters."""
         return self.shape.prior.names
 
     @property
     def prior(self) -> Prior:
-        """The shape's prior."""
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
@@ -155,16 +150,13 @@ class CardedRegion:
 
     @property
     def n_regions(self) -> int:
-        """Number of hypotheses, or 1 if all share one region."""
         return self.region.n_regions
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         covered = [card.region.albedo(points_mm) for card in self.cards]
         return mean_albedo_with_cards(self.region.albedo(points_mm), self.cards, covered)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, (n_regions, n_points)."""
         covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
         return mean_albedo_with_cards(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from probewise.emulator import Battery, Brick, Motor, MotorParameters, VirtualClock
-from probewise.emulator.motors import OutputPort, RunState
+from probewise.emulator.motors import OutputPort, OutputSetting, RunState
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
 
@@ -67,6 +67,18 @@ def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(
     brick.answer(bytes.fromhex(f"80 04 00 1E {RUN} 00 00 00 00"))
     begun = wait(clock, brick, 2.0).tacho_count
     assert wait(clock, brick, 4.0).tacho_count - begun == pytest.approx(1200, abs=15)
+
+
+def test_the_regulator_is_the_firmwares_by_hand() -> None:
+    """Power is half of 3 e (to 100), the sum of errors (3 s + e) / 4, and the change of e, all in whole numbers."""
+    port = OutputPort(Motor(MotorParameters(stops_deg=(0.0, 0.0))))
+    port.apply_setting(OutputSetting(20, 7, 1, 0, 0x20))
+    powers = []
+    for _ in range(3):  # e = 20, 40, 60: s = 5, 13, 24
+        for _ in range(101):
+            port.simulate_millisecond(7400.0)
+        powers.append(port.power)
+    assert powers == [(60 + 5 + 20) // 2, (100 + 13 + 20) // 2, (100 + 24 + 20) // 2]
 
 
 def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(ask, clock, brick) -> None:

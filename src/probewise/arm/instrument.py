@@ -235,7 +235,6 @@ class Reach:
 
     @property
     def rest_mm(self) -> tuple[float, float]:
-        """Rest position (x, y): `nearest_mm` from the axis, straight towards the field, and within the field."""
         x_mm, y_mm = self.axis_mm
         return x_mm, max(0.0, min(self.field_mm[1], y_mm - self.nearest_mm))
 
@@ -244,14 +243,12 @@ class Reach:
         return np.zeros(len(places_mm))
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, shape (n_places, 2), are within reach and on the field: shape (n_places,)."""
         x_mm, y_mm = places_mm[:, 0], places_mm[:, 1]
         away = np.hypot(x_mm - self.axis_mm[0], y_mm - self.axis_mm[1])
         on_field = (x_mm >= 0) & (x_mm <= self.field_mm[0]) & (y_mm >= 0) & (y_mm <= self.field_mm[1])
         return on_field & (away >= self.nearest_mm) & (away <= self.farthest_mm)
 
     def sentence(self) -> str:
-        """Describe the allowed places in words."""
         (width, height), (x_mm, y_mm) = self.field_mm, self.axis_mm
         return (
             f"a place on the field, 0 to {width:g} mm by 0 to {height:g} mm, that is {self.nearest_mm:g} to "

@@ -114,7 +114,6 @@ class LegoArm:
         return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + self.turned_rad)
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         return self.geometry.contains(places_mm)
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:

@@ -135,30 +135,24 @@ class DryRun:
         self.release()
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Print the move and record its count; ReachError if it would leave the limits."""
         self._check_and_print_move(joint, goal, "up" if side > 0 else "down")
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Print the move and record its count; ReachError if it would leave the limits."""
         self._check_and_print_move(joint, goal, "roughly")
 
     def release(self) -> None:
-        """Print the command."""
         self._say("release all motors")
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Print the command and record the count of the stop."""
         self.limits.record_present_count(joint, self._geometry.joints[joint].stop_counts)
         self._say(f"{JOINTS[joint]:<8} {'up' if side > 0 else 'down'} to its stop")
 
     def reset(self, joints: Sequence[int]) -> None:
-        """Print that these counters are set to 0, and record it."""
         for joint in joints:
             self.limits.record_present_count(joint, 0)
         self._say(f"set to 0 the counters of {', '.join(JOINTS[joint] for joint in joints)}")
 
     def read_percent(self) -> float:
-        """Print the command and return NaN: nothing is read."""
         self._say("read the light sensor")
         return math.nan
 

@@ -96,15 +96,12 @@ class SimulatedArm:
         return self._time_s
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         return self.reach.contains(_checked_places(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,)."""
         return self.reach.orientation_rad(_checked_places(places_mm))
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Return the seconds to move from `start` to each place (n_places, 2) and read there, shape (n_places,)."""
         places = _checked_places(places_mm)
         away = np.hypot(places[:, 0] - start.x_mm, places[:, 1] - start.y_mm)
         return np.asarray(away / self.speed.move_mm_s + self.speed.read_s, dtype=np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -45,16 +45,13 @@ class KnownScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its free parameters: none."""
         return ()
 
     @property
     def prior(self) -> Prior:
-        """The prior of no parameters."""
         return Empty()
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Return the region by pattern name; theta (n_samples, 0) is ignored."""
         return self._region_by_name
 
     @cached_property
@@ -64,26 +61,26 @@ class KnownScene:
 
 @dataclass(frozen=True)
 class HypothesisScene:
-    """One shape with unknown parameters under every reading, whatever the pattern's name."""
+    """One shape with unknown parameters, and known cards on it, under every reading, whatever the pattern's name."""
 
     shape: Shape
+    cards: tuple[Card, ...] = ()
 
     def __post_init__(self) -> None:
         require_shape(self.shape)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the shape's parameters."""
         return self.shape.prior.names
 
     @property
     def prior(self) -> Prior:
-        """The shape's prior."""
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return, for any pattern name, the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
-        return OneRegionForAllNames(self.shape.region(theta))
+        region = self.shape.region(theta)
+        return OneRegionForAllNames(CardedRegion(region, self.cards) if self.cards else region)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,16 +152,13 @@ class CardedRegion:
 
     @property
     def n_regions(self) -> int:
-        """Number of hypotheses, or 1 if all share one region."""
         return self.region.n_regions
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         covered = [card.region.albedo(points_mm) for card in self.cards]
         return mean_albedo_with_cards(self.region.albedo(points_mm), self.cards, covered)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, (n_regions, n_points)."""
         covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
         return mean_albedo_with_cards(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
 
@@ -188,14 +182,3 @@ def _outlines_of_carded_region(region: CardedRegion, *, n_vertices: int = 96) ->
 @edge_distance.register
 def _edge_distance_of_carded_region(region: CardedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return edge_distance(region.region, x_mm, y_mm)
-
-
-@dataclass(frozen=True)
-class CardedScene(HypothesisScene):
-    """One shape of unknown parameters, and known cards on it, under every reading."""
-
-    cards: tuple[Card, ...] = field(default=())
-
-    def regions(self, theta: FloatArray) -> OneRegionForAllNames:
-        """Return, for any pattern name, the shape's regions with the cards on them, theta (n_samples, n_params)."""
-        return OneRegionForAllNames(CardedRegion(self.shape.region(theta), self.cards))

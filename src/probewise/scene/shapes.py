@@ -100,24 +100,20 @@ class PlacedPrior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters: x_mm, y_mm, then the shape's own."""
         return ("x_mm", "y_mm", *self.own.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the unit cube to parameters, both (n_samples, n_params)."""
         u = checked_columns(u, self.names)
         own = self.own.from_unit_cube(u[:, 2:])
         low, high = self._bounds_of_centre(own)
         return np.concatenate([low + (high - low) * u[:, :2], own], axis=1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to the unit cube, both (n_samples, n_params)."""
         low, high = self._bounds_of_centre(theta[:, 2:])
         centre = np.clip((theta[:, :2] - low) / np.maximum(high - low, 1e-300), 0.0, 1.0)
         return np.concatenate([centre, self.own.to_unit_cube(theta[:, 2:])], axis=1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the natural log of the density, (n_samples,); -inf outside the support."""
         own = self.own.log_prob(theta[:, 2:])
         low, high = self._bounds_of_centre(theta[:, 2:])
         inside = ((theta[:, :2] >= low) & (theta[:, :2] <= high)).all(axis=1)

@@ -65,11 +65,9 @@ class FreeLevels:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """I_min, I_max."""
         return ("I_min", "I_max")
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the two columns of theta, each (n_samples, 1)."""
         return theta[:, :1], theta[:, 1:2]
 
 
@@ -88,11 +86,9 @@ class FixedLevels:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """No free parameters."""
         return ()
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return I_min and I_max, each (1, 1); theta is ignored."""
         return np.array([[self.i_min]]), np.array([[self.i_max]])
 
 
@@ -147,7 +143,6 @@ class Chain:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters, one per column of theta."""
         return (*self.ssf.names, *self.levels.names, *self.scene.names, *parameter_names_of_effects(self.effects))
 
     def with_effects(self, *effects: AnyEffect) -> Chain:

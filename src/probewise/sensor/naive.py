@@ -30,11 +30,9 @@ class NaiveSensor:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
         return (*self.levels.names, *self.scene.names)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Predict noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         require_theta_columns(theta, self.names)
         n_levels = len(self.levels.names)
         i_min, i_max = self.levels.values(theta[:, :n_levels])

@@ -80,11 +80,9 @@ class FreeMixture:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The paper's a_1 to C_N."""
         return mixture_parameter_names(self.n_gaussians)
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Return the mixture of each hypothesis, theta (n_samples, 6 n_gaussians)."""
         return footprint_of(theta, self.n_gaussians)
 
 
@@ -112,7 +110,6 @@ class FixedMixture:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """No free parameters."""
         return ()
 
     @property
@@ -127,7 +124,6 @@ class FixedMixture:
         return np.asarray(np.einsum("n,nij->ij", self.weights, self.covs_mm2 + off[:, :, None] * off[:, None, :]))
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Return the mixture, arrays (1, 1, n_gaussians); theta (n_samples, 0) is ignored."""
         return self._footprint
 
     @cached_property
@@ -199,7 +195,6 @@ class DiscreteSSF:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """No free parameters."""
         return ()
 
     def footprint(self, theta: FloatArray) -> Footprint:

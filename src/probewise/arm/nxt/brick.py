@@ -172,22 +172,18 @@ class BrickMachine:
         self.brick.__exit__(kind, error, trace)
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Turn a joint's motor to a count from home, approaching with the count rising (side 1) or falling (-1)."""
         with self._recording_counts(joint) as motor:
             motor.move_to(goal + self._zeros[joint], side)
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Turn a joint's motor approximately to a count from home, and hold it; see `Motor.move_near`."""
         with self._recording_counts(joint) as motor:
             motor.move_near(goal + self._zeros[joint])
 
     def release(self) -> None:
-        """Let all motors turn freely; turns by hand are noticed at the next move."""
         for motor in self._motors:
             motor.release()
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint gently to its stop, angle rising (side 1) or falling (-1); its count becomes `stop_counts`."""
         mechanics = self._joints[joint]
         motor = self._motors[joint]
         with_gears: Side = side if mechanics.gear_ratio > 0 else -side
@@ -200,22 +196,18 @@ class BrickMachine:
         self.limits.record_present_count(joint, at_stop)
 
     def reset(self, joints: Sequence[int]) -> None:
-        """Set the counters of these joints' motors to 0."""
         for joint in joints:
             self._motors[joint].reset_counter()
             self._zeros[joint] = 0
             self.limits.record_present_count(joint, 0)
 
     def read_percent(self) -> float:
-        """Flash the light sensor's LED and read: 0 to 100, with fractions."""
         return self._light.flash().fine_percent
 
     def battery_mv(self) -> float:
-        """Read the battery's voltage, in mV."""
         return self.brick.battery_mv()
 
     def keep_awake(self) -> None:
-        """Keep the brick from falling asleep."""
         self.brick.link.keep_awake()
 
     @contextlib.contextmanager

@@ -474,7 +474,7 @@ class Refits:
         )
 
     def _hopeless_above(self, model: Model) -> float:
-        if not model.sensor.predicts_cheaply_nearby:
+        if not model.sensor.predicts_dearly:
             return math.inf
         return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + _HOPELESS
 

@@ -55,7 +55,7 @@ def weights_beside_other_effects(
         if effect.has_change_point and len(effect.variants()) == len(weights[effect.name]) > 1:
             without = _fit_without(found, effect.name, usable)
             templates = templates_of_effect(without, effect, usable)
-            bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(found.residuals))
+            bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
             scores = log_bayes_factors_by_label(Linearised.of(without, law), bank)[effect.name]
             if np.isfinite(scores).all():
                 out[effect.name] = templates.variant_probabilities(scores)

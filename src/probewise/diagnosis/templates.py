@@ -147,7 +147,7 @@ class TemplateBank:
             whitened = known[number]
             if whitened is None:
                 whitened = _Whitened.of(self.templates[group], law)
-                known[number] = whitened if kept_whole else replace(whitened, templates=whitened.templates[:0])
+                known[number] = whitened if kept_whole else replace(whitened, templates=np.zeros((0, 0)))
             elif not kept_whole:
                 again = law(np.concatenate(self.templates[group], axis=1))
                 again *= whitened.scale

@@ -64,7 +64,7 @@ def _corrected(law, noise):
     residuals = _BUMP + noise
     found = SimpleNamespace(slopes=10 * np.ones((_N, 1)), residuals=residuals, z=np.zeros(1), sd=0.1)
     problem = Linearised.of(found, law)
-    bank = TemplateBank.of([_BUMP[:, None]], ["time"], _N)
+    bank = TemplateBank.of([_BUMP[:, None]], ["time"])
     return found, problem, correct_by_best_basis(found, problem, bank, _PARTS)
 
 

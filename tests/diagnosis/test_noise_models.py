@@ -181,14 +181,14 @@ def test_the_memory_of_mixed_runs_is_along_each_run():
     signal = np.abs(np.random.default_rng(6).normal(size=len(order)))
     mixed = bank_of_unknown_effects((), signal, signal, scan)
     apart = bank_of_unknown_effects((), signal[order], signal[order], scan[order])
-    np.testing.assert_array_equal(mixed.columns[order], apart.columns)
+    np.testing.assert_array_equal(np.hstack(mixed.templates)[order], np.hstack(apart.templates))
     each = [bank_of_unknown_effects((), *(2 * [signal[scan == k]]), np.zeros(np.sum(scan == k), int)) for k in range(4)]
     for k, own in enumerate(each):  # route two: the memory of each run, alone in its table
         there = [label == "what was seen before" for label in mixed.labels]
         alone = [label == "what was seen before" for label in own.labels]
         columns, others = (
-            mixed.take_templates(np.flatnonzero(there)).columns,
-            own.take_templates(np.flatnonzero(alone)).columns,
+            np.hstack(mixed.take_entries(np.flatnonzero(there)).templates),
+            np.hstack(own.take_entries(np.flatnonzero(alone)).templates),
         )
         np.testing.assert_array_equal(columns[scan == k], others)
 

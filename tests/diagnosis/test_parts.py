@@ -260,7 +260,7 @@ def test_a_bank_weighs_as_blocks_do():
     problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
     blocks = OrthonormalBlocks.of(problem, templates)
     wanted = block_log_bayes_factors(blocks, residuals, problem.n_kept)
-    np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
+    np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4).log_bayes_factors(problem, residuals), wanted)
 
 
 def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
@@ -277,7 +277,7 @@ def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
         left = unit - slopes @ np.linalg.lstsq(slopes, unit)[0]
         wanted.append(np.linalg.norm(left) / np.linalg.norm(unit))
     np.testing.assert_allclose(
-        TemplateBank.of(templates, ["a", "b", "c"], n).unabsorbed_shares(problem), wanted, atol=1e-7
+        TemplateBank.of(templates, ["a", "b", "c"]).unabsorbed_shares(problem), wanted, atol=1e-7
     )
 
 

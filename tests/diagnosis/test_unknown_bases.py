@@ -90,7 +90,7 @@ def test_what_a_name_describes_is_no_unknown():
     each = (run[:, None] == np.arange(6)).astype(np.float64)
     mean = np.ones((len(x), 1)) / np.sqrt(len(x))
     problem = Linearised(mean, rng.standard_normal(len(x)), white_noise(len(x)), 1.0, len(x))
-    named = TemplateBank.of([each], ["offset_per_run"], len(x))
+    named = TemplateBank.of([each], ["offset_per_run"])
     left = bases_unlike_named(bases, named, problem)
     of_runs = left.indices_by_label["run"]
     assert len(of_runs) == len(bases.indices_by_label["run"])
@@ -131,7 +131,7 @@ def test_a_product_that_is_a_formula_is_no_basis():
     a, b, _ = columns - columns.mean(axis=1, keepdims=True)
     problem = Linearised(np.ones((200, 1)) / np.sqrt(200), np.zeros(200), white_noise(200), 1.0, 200)
     formulas = [(a * b)[:, None], apart[0]]
-    left = without_products_like(bases, TemplateBank.of(formulas, ["formula", "other"], 200), problem)
+    left = without_products_like(bases, TemplateBank.of(formulas, ["formula", "other"]), problem)
     assert left.labels.count(PRODUCTS) == bases.labels.count(PRODUCTS) - 1
     assert len(left.labels) == len(bases.labels) - 1
-    assert without_products_like(apart, TemplateBank.of(formulas, ["formula", "other"], 200), problem) is apart
+    assert without_products_like(apart, TemplateBank.of(formulas, ["formula", "other"]), problem) is apart

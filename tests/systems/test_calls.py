@@ -110,7 +110,7 @@ def test_every_call_is_told():
     ProgressWithCallCount(lambda stage, done=0, total=0, note="": told.append((stage, note)), system.caller)("fitting")
     n_calls = system.caller.n_calls
     system.chain(table, ()).predict(system.theta(system.starts[-1:]), table)
-    assert told[-1] == ("fitting", f"{n_calls + 1} of about 20,000 calls of simulate")
+    assert told[-1] == ("fitting", f"{n_calls + 1} of about 10,000 calls of simulate")
 
 
 def test_a_law_that_raises_for_some_parameters_is_counted_and_the_others_are_integrated():

@@ -201,10 +201,11 @@ def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calib
 def _frame_png(search: RobotSearch, step: Step) -> bytes:
     """Draw the view of a search after a step; return a PNG."""
     from probewise._words import count_with_noun
-    from probewise.report.plots.canvas import grid_of_axes, png
+    from probewise.report.plots.canvas import axes_of_frame, png
 
     title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
-    return png(search.draw_view(step.number, title=title, ax=grid_of_axes(1, 1, size_in=(6.6, 4.0))[0, 0]), dpi=90)
+    ax = axes_of_frame((6.6, 3.45), (0.7, 0.55, 0.9, 0.3))
+    return png(search.draw_view(step.number, title=title, ax=ax), dpi=90, tight=False)
 
 
 def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:

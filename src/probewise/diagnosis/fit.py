@@ -88,8 +88,8 @@ class Null(Protocol):
         return False
 
     @property
-    def predicts_cheaply_nearby(self) -> bool:
-        """Whether predictions near a point cost little once it was predicted itself; by default False."""
+    def predicts_dearly(self) -> bool:
+        """Whether predictions are worth sparing, but for those near a point just predicted; by default False."""
         return False
 
     @property
@@ -350,7 +350,8 @@ def _fit_coroutine(
     """Fit from one start: yields points (n, n_params), is sent their predictions (n, n_points), returns the fit."""
     usable = recording.usable
     readings = recording.readings[usable]
-    nearby = model.sensor.predicts_cheaply_nearby
+    dear = model.sensor.predicts_dearly
+    one_by_one = dear and not model.sensor.predicts_in_bulk
 
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         with np.errstate(all="ignore"):  # of predictions that ran away: not finite, and not taken
@@ -364,13 +365,13 @@ def _fit_coroutine(
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
-    if nearby:
+    if dear:
         yield z[None, :]
     predicted, slopes = yield from request_slopes(z)
     best = float(objective(predicted[None, :], z[None, :])[0])
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # no finite starting point
         return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
-    settled = False
+    settled, exact = False, True
     for k in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
         sigma = law.likeliest_sigma(whitened)
@@ -381,14 +382,20 @@ def _fit_coroutine(
         if not len(tries):
             break
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
+        if one_by_one and k and exact and expected < tolerance:
+            settled = True
+            break
         tries = _points_after_steps(z, tries)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
         in_bulk = model.sensor.predicts_in_bulk
-        about = [difference_points_and_steps(at) for at in tries] if in_bulk and not nearby else []
-        batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if nearby else None]
-        if nearby and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
+        about = [difference_points_and_steps(at) for at in tries] if in_bulk and not dear else []
+        batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if dear else None]
+        if dear and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
+            if not exact:
+                (predicted, slopes), exact = (yield from request_slopes(z)), True
+                continue
             batch = np.concatenate([batch, (yield tries[1:])])
-        tries = tries[: len(batch)] if nearby else tries
+        tries = tries[: len(batch)] if dear else tries
         all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
         values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)
@@ -404,13 +411,18 @@ def _fit_coroutine(
         settled = gained < tolerance
         if gained <= 0:
             break
-        z, best = tries[at], float(values[at])
+        step, z, best = tries[at] - z, tries[at], float(values[at])
         if at < len(about):
             predicted, slopes = _prediction_and_slopes(all_predicted[at], about[at][1])
+        elif one_by_one and not settled:  # Broyden's update, until the fit is as good as its slopes tell
+            before, predicted, exact = predicted, all_predicted[at, 0], False
+            slopes = slopes + np.outer(predicted - before - slopes @ step, step / (step @ step))
         else:
-            predicted, slopes = yield from request_slopes(z)
+            (predicted, slopes), settled, exact = (yield from request_slopes(z)), settled and exact, True
         if settled or best - gained * (max_steps - k - 1) > hopeless_above:
             break
+    if not exact:
+        predicted, slopes = yield from request_slopes(z)
     sd = law.likeliest_sigma_of(readings - predicted)
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
 

@@ -292,7 +292,7 @@ def _nested_sampling(
 ) -> Evidence:
     """Compute the evidence by nested sampling; of a law, from a prior near the samples, which takes fewer calls."""
     method, target = "nested sampling", cast(nested.Samplable, problem)
-    if problem.model.sensor.predicts_cheaply_nearby:
+    if problem.model.sensor.predicts_dearly:
         method, target = "nested sampling near the posterior", repartitioned(problem, z)
 
     def report_round(state: nested.RoundSummary) -> None:

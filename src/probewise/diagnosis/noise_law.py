@@ -17,7 +17,8 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solve_banded
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
@@ -303,10 +304,15 @@ class NoiseLaw:
 
     def _whiten_with_walk(self, columns: FloatArray) -> FloatArray:
         """Whiten columns (n_points, n_columns) with a random walk: differences correlate only with their neighbours."""
-        out = np.zeros(columns.shape)
         kept = ~self.lost
-        steps = np.diff(columns[kept], axis=0, prepend=0.0)
-        out[kept] = solve_banded((1, 0), self._difference_covariance_root, steps, check_finite=False)
+        own = columns if kept.all() else columns[kept]
+        steps = np.array(own, dtype=np.float64, order="F")
+        steps[1:] -= own[:-1]
+        solved, _ = dtbtrs(self._difference_covariance_root, steps, uplo="L", overwrite_b=1)
+        if own is columns:
+            return np.asarray(solved)
+        out = np.zeros(columns.shape)
+        out[kept] = solved
         return out
 
     @cached_property

@@ -21,7 +21,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import NoiseEvidence
-from probewise.diagnosis.fit import FARTHEST, Fit
+from probewise.diagnosis.fit import FARTHEST, Fit, Model
 from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
@@ -33,6 +33,7 @@ from probewise.recordings.plan import Recording
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
 _LEAST_OF_IT = 0.5  # least acceptable share of the target
+_ALIKE = 0.98  # effective share of a few draws, from which means of all are off by a seventh of an sd at most
 _EFFECTIVE = 0.5  # least effective share of the samples after a step of beta
 _AT_LAST = 3  # factor on the number of moves at beta = 1
 _LEAST_STEP = 1e-3
@@ -49,21 +50,26 @@ def importance_resample(
     n_wanted: int,
     rng: np.random.Generator,
     least: float = _LEAST_OF_IT * _ENOUGH,
+    n_tried: int | None = None,
 ) -> FloatArray | None:
     """Draw from a density by importance resampling: (n_wanted, n_params), in random order.
 
     `first`: samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated,
     for an effective sample size of half of `n_wanted`. `log_q`, `log_p`: unnormalised log densities of the proposal and
     the target; the latter is minus infinity outside its support. `least`: share of `n_wanted` that the effective sample
-    size must reach; else None.
+    size must reach; else None. `n_tried`: samples evaluated first; if these are fewer than wanted and nearly all
+    effective, so are the others.
     """
-    gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
-    share = _n_distinct_effective(gain, first[:n_wanted]) / len(gain)
+    tried = first[: n_tried or n_wanted]
+    gain = log_p(tried) - log_q(tried)
+    share = _n_distinct_effective(gain, tried) / len(gain)
     if share * len(first) < least * n_wanted:
         return None
+    if len(tried) < n_wanted and share > _ALIKE:
+        return first[:n_wanted]
     enough = min(math.ceil(_ENOUGH * n_wanted / share), len(first))
-    if enough > n_wanted:
-        more = first[n_wanted:enough]
+    if enough > len(tried):
+        more = first[len(tried) : enough]
         gain = np.append(gain, log_p(more) - log_q(more))
     if _n_distinct_effective(gain, first[: len(gain)]) < least * n_wanted:
         return None
@@ -238,6 +244,11 @@ _N_NEAR = 2000
 _MOVES_NEAR = 20
 
 
+def n_tried(model: Model) -> int | None:
+    """Return the number of draws that are tried first, 100 where each is a call; None: as many as wanted."""
+    return 100 if model.sensor.predicts_dearly and not model.sensor.predicts_in_bulk else None
+
+
 def posterior_draws(
     found: Fit,
     noise: NoiseEvidence,
@@ -273,7 +284,10 @@ def posterior_draws(
     grid = ConditionallyLinearDensity.of(found, laplace.law, recording, laplace.steps.T @ laplace.steps, laplace.sd)
     if grid is not None:
         first, least = grid.draw(n_samples if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
-        drawn = importance_resample(first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least)
+        tried = n_tried(found.model)
+        drawn = importance_resample(
+            first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least, n_tried=tried
+        )
         if drawn is not None:
             return drawn
     if in_bulk:
@@ -348,13 +362,15 @@ def _annealed(
     quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
     near = surrogate_log_density(quadratic, center, steps, laplace.recording.readings[usable], laplace.law)
 
-    def resampled_or_annealed(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
-        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
+    def resampled_or_annealed(
+        first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int, tried: int | None = None
+    ) -> FloatArray:
+        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng, n_tried=tried)
         if weighed is not None:
             return weighed
         some = first[:_N_WALKERS]
         return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
 
     e = resampled_or_annealed(draws, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)
-    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples)
+    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples, n_tried(model))
     return center + e @ steps

@@ -23,7 +23,7 @@ from probewise.diagnosis.best_repair import BestRepair, predicts_far_worse
 from probewise.diagnosis.evidence import Linearised, NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Null, Predictor, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.posterior import posterior_draws
+from probewise.diagnosis.posterior import n_tried, posterior_draws
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit, effects_out_of_vocabulary
 from probewise.diagnosis.search.searched import Searched
@@ -55,7 +55,7 @@ def weights_beside_other_effects(
         if effect.has_change_point and len(effect.variants()) == len(weights[effect.name]) > 1:
             without = _fit_without(found, effect.name, usable)
             templates = templates_of_effect(without, effect, usable)
-            bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(found.residuals))
+            bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
             scores = log_bayes_factors_by_label(Linearised.of(without, law), bank)[effect.name]
             if np.isfinite(scores).all():
                 out[effect.name] = templates.variant_probabilities(scores)
@@ -154,9 +154,11 @@ def sample_model(
     weights = weights_beside_other_effects(found, law, np.flatnonzero(recording.usable), weights)
     draws = posterior_draws(found, noise, recording, N_SAMPLES, annealed=annealed, rng=rng, progress=progress)
     z = np.clip(draws, -FARTHEST, FARTHEST)
-    # Samples that are not annealed serve for the effects only: their noise is that of the fit.
-    predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
-    residuals = recording.readings[recording.usable] - predicted
+    # Samples that are not annealed serve for the effects only: their noise is that of the fit. Where each sample is a
+    # call, those that were tried serve for all.
+    tried = z[: n_tried(found.model)]
+    predicted = found.model.predict(tried)[:, recording.usable] if annealed else found.predicted[None, :]
+    residuals = np.resize(recording.readings[recording.usable] - predicted, (n_samples, predicted.shape[1]))
     noise_sd = draw_noise_sd(law, residuals, rng=rng)
     largest = float(np.abs(recording.readings[recording.usable]).max()) or 1.0
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + largest * 1e-12)
@@ -190,13 +192,9 @@ def sample_model(
 
 
 def draw_noise_sd(law: NoiseLaw, residuals: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw the sd of the noise, rounding included, for each sample: residuals (n_samples, n_usable) -> (n_samples,).
-
-    One row of residuals serves 500 samples.
-    """
+    """Draw the sd of the noise, rounding included, for each sample: residuals (n_samples, n_usable) -> (n_samples,)."""
     sigma = law.likeliest_sigma(law(residuals.T))
-    n_samples = N_SAMPLES if len(sigma) == 1 else len(sigma)
-    return np.asarray(sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, n_samples)))
+    return np.asarray(sigma * np.sqrt(law.n_kept / rng.chisquare(law.n_kept, len(sigma))))
 
 
 def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray:

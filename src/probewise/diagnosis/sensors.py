@@ -63,7 +63,7 @@ class CalibratedSensor:
     has_exchangeable_gaussians: bool = True
     is_free_form: bool = False
     calibrated_height_mm: float | None = None
-    predicts_in_bulk = predicts_cheaply_nearby = may_be_far_off = False
+    predicts_in_bulk = predicts_dearly = may_be_far_off = False
     nuisance_names: ClassVar[tuple[str, ...]] = ()
     least_readings: ClassVar[int] = LEAST_READINGS
 

@@ -188,7 +188,7 @@ def draw_by_importance(
             return draws, True
         before = now
         progress("sampling the posterior", note=f"{draws.n_effective:.0f} effective draws")
-        if not k and sensor.predicts_in_bulk and not sensor.predicts_cheaply_nearby:
+        if not k and sensor.predicts_in_bulk and not sensor.predicts_dearly:
             anchors = rng.permutation(ridge.follow(fits, rng=rng))
             spread, anchors = np.cov(anchors.T), anchors[:n_kernels]
         else:

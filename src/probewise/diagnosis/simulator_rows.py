@@ -202,7 +202,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     DriftingNoise,
 )
 _ALONG_ROWS = (CorrelatedNoise, RandomWalk, DriftingNoise)
-CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
+CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 10,000 in a diagnosis
 # Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
 # table as of a short one.
 _EVALUATIONS_PER_ROW = 6_000

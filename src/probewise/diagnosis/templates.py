@@ -10,10 +10,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -28,109 +28,157 @@ from probewise.diagnosis.evidence import (
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
 _ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error
-_REMEMBERED = 5  # most recent noise models in the cache, up to `_MOST_BYTES`
+_REMEMBERED = 5  # most recent noise models of which whitened templates are cached, up to `_MOST_BYTES`
 _MOST_BYTES = 2**28
+_MOST_GRAMS = 64  # noise models of which the Gram matrices are
+_MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
+_LONG = 2**13  # rows from which templates are kept in single precision: rounding is far below the noise of a score
 
 
 @dataclass(eq=False)
 class TemplateBank:
-    """Labelled templates, concatenated by columns, with their Bayes factors about any fit.
+    """Templates, (n_points, k) each, with their Bayes factors about any fit.
 
-    `columns`: columns of all templates, (n_points, n_columns); `widths`: number of columns of each template,
-    (n_templates,); `labels`: label of each template; several may have the same, such as the name of their effect.
+    `labels`: label of each entry; several may have the same, such as the name of their effect; `which`: the number of
+    each entry's template, since entries may share one, (n_entries,).
     """
 
-    columns: FloatArray
-    widths: IntArray
+    templates: tuple[FloatArray, ...]
     labels: tuple[str, ...]
-    _whitened: dict[tuple[bytes, ...], _WhitenedTemplatesAndGrams] = field(default_factory=dict, repr=False)
+    which: IntArray
+    _whitened: dict[tuple[bytes, ...], list[_Whitened | None]] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> TemplateBank:
-        """Concatenate templates, each (n_points, k), with one label each."""
-        widths = np.array([t.shape[1] for t in templates], dtype=np.int64)
-        return cls(np.concatenate([np.zeros((n_points, 0)), *templates], axis=1), widths, tuple(labels))
+    def of(cls, templates: Sequence[FloatArray], labels: Sequence[str]) -> TemplateBank:
+        """Build a bank of entries, with one template and one label each; the same array is kept once."""
+        unique = {id(template): template for template in templates}
+        numbers = {key: number for number, key in enumerate(unique)}
+        which = np.array([numbers[id(template)] for template in templates], dtype=np.int64)
+        return cls(tuple(unique.values()), tuple(labels), which)
 
     def __getitem__(self, at: int) -> FloatArray:
-        """Return template number `at`, (n_points, k)."""
-        first = int(self._first_columns[at])
-        return self.columns[:, first : first + int(self.widths[at])]
+        """Return the template of entry number `at`, (n_points, k)."""
+        return self.templates[self.which[at]]
+
+    @property
+    def _precision(self) -> np.dtype[Any]:
+        return self.templates[0].dtype if self.templates else np.dtype(np.float64)
 
     @cached_property
-    def _first_columns(self) -> IntArray:
-        return np.cumsum(self.widths) - self.widths
+    def widths(self) -> IntArray:
+        """Number of columns of each template, (n_templates,)."""
+        return np.array([template.shape[1] for template in self.templates], dtype=np.int64)
 
     @cached_property
     def indices_by_label(self) -> dict[str, IntArray]:
-        """Indices of the templates of each label."""
+        """Indices of the entries of each label."""
         labels = np.array(self.labels)
         return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
 
-    def take_templates(self, members: IntArray) -> TemplateBank:
-        """Return a bank of the templates with these indices, in this order."""
-        at = [self._first_columns[k] + np.arange(self.widths[k]) for k in members]
-        columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
-        return TemplateBank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
+    def take_entries(self, members: IntArray) -> TemplateBank:
+        """Return a bank of the entries with these indices, in this order."""
+        return TemplateBank.of([self[k] for k in members], [self.labels[k] for k in members])
+
+    @cached_property
+    def groups(self) -> list[slice]:
+        """Successive templates that are whitened together: all, or parts of those of a long table."""
+        if not self.templates:
+            return []
+        ends = np.cumsum(self.widths) * len(self.templates[0])
+        part = ends // (_MOST_AT_ONCE // 8) if ends[-1] > _MOST_AT_ONCE else np.zeros_like(ends)
+        bounds = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
+        return [slice(first, end) for first, end in itertools.pairwise(bounds)]
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
-        """Return the log Bayes factor of adding each template to a fit, as `block_log_bayes_factors` does.
+        """Return the log Bayes factor of adding each entry to a fit, as `block_log_bayes_factors` does.
 
         `residuals`: projected residuals, (n_rows, n_draws); the fit's own by default. Returns log Bayes factors,
-        (n_templates, n_draws).
+        (n_entries, n_draws).
         """
         own = problem.residual[:, None] if residuals is None else residuals
         n, n_kept = problem.n_points, problem.n_kept
-        whitened = self._whitened_under(problem.law)
-        taken = problem.basis[:n].T @ whitened.templates  # the part that the fit absorbs, (n_params, n_columns)
-        along = whitened.templates.T @ own[:n]
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
-        out = np.empty((len(self.widths), own.shape[1]))
-        for width, products in whitened.products.items():  # all templates of one width at a time
-            members = np.flatnonzero(self.widths == width)
-            at = self._first_columns[members, None] + np.arange(width)
-            absorbed = taken[:, at].transpose(1, 0, 2)
-            left = products - absorbed.transpose(0, 2, 1) @ absorbed
-            gain, axes = _gram_eigensystems(left)
-            gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
-            turned = axes.transpose(0, 2, 1) @ along[at]
-            explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
-            out[members] = average_over_amplitude_scales(explained, gain, n_kept)
-        return out
+        out = np.empty((len(self.templates), own.shape[1]))
+        basis, rows = (a[:n].astype(self._precision, copy=False) for a in (problem.basis, own))
+        for group, whitened in self._whitened_under(problem.law):
+            taken = np.asarray(basis.T @ whitened.templates, dtype=np.float64)  # what the fit absorbs
+            along = np.asarray(whitened.templates.T @ rows, dtype=np.float64)
+            widths = self.widths[group]
+            for width, products in whitened.products.items():  # all templates of one width at a time
+                members = np.flatnonzero(widths == width)
+                at = (np.cumsum(widths) - widths)[members, None] + np.arange(width)
+                absorbed = taken[:, at].transpose(1, 0, 2)
+                left = products - absorbed.transpose(0, 2, 1) @ absorbed
+                gain, axes = _gram_eigensystems(left)
+                gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
+                turned = axes.transpose(0, 2, 1) @ along[at]
+                explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
+                out[group.start + members] = average_over_amplitude_scales(explained, gain, n_kept)
+        return out[self.which]
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
-        """Return the share of each template's norm that a fit does not absorb, (n_templates,)."""
-        templates = self._whitened_under(problem.law).templates
-        taken = problem.basis[: problem.n_points].T @ templates
-        whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))
-        return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
+        """Return the share of each entry's norm that a fit does not absorb, (n_entries,)."""
+        out, basis = [np.zeros(0)], problem.basis[: problem.n_points].astype(self._precision, copy=False)
+        for group, whitened in self._whitened_under(problem.law):
+            taken = basis.T @ whitened.templates
+            starts = np.cumsum(self.widths[group]) - self.widths[group]
+            whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), starts) for a in (whitened.templates, taken))
+            out.append(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
+        return np.concatenate(out)[self.which]
 
-    def _whitened_under(self, law: NoiseLaw) -> _WhitenedTemplatesAndGrams:
-        """Whiten all templates, scaled to unit rms each, with Gram matrices; cached for the last few noise models."""
-        key = law.whitening_key
-        if key in self._whitened:
-            self._whitened[key] = self._whitened.pop(key)
-        else:
-            room = min(max(_MOST_BYTES // max(self.columns.nbytes, 1), 1), _REMEMBERED)
-            while len(self._whitened) >= room:
-                self._whitened.pop(next(iter(self._whitened)))
-            whitened = law(self.columns)
-            norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-            per_column = np.repeat(self.widths, self.widths)
-            whitened *= np.sqrt(law.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
-            ends = np.append(np.flatnonzero(np.diff(self.widths)) + 1, len(self.widths))
-            products: dict[int, list[FloatArray]] = {}
-            for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
-                width, begin = int(self.widths[first]), int(self._first_columns[first])
-                columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
-                products.setdefault(width, []).append(_gram_matrices(columns))
-            grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
-            self._whitened[key] = _WhitenedTemplatesAndGrams(whitened, grams)
-        return self._whitened[key]
+    def _whitened_under(self, law: NoiseLaw) -> Iterator[tuple[slice, _Whitened]]:
+        """Yield all groups of templates, whitened and scaled to unit rms each, with Gram matrices.
+
+        They are cached for the last few noise models, but those of a long table without the templates.
+        """
+        key, n_numbers = law.whitening_key, sum(template.size for template in self.templates)
+        known = self._whitened.pop(key, [None] * len(self.groups))
+        kept_whole = len(self.groups) == 1
+        room = min(max(_MOST_BYTES // max(8 * n_numbers, 1), 1), _REMEMBERED) if kept_whole else _MOST_GRAMS
+        while len(self._whitened) >= room:
+            self._whitened.pop(next(iter(self._whitened)))
+        self._whitened[key] = known
+        for number, group in enumerate(self.groups):
+            whitened = known[number]
+            if whitened is None:
+                whitened = _Whitened.of(self.templates[group], law)
+                known[number] = whitened if kept_whole else replace(whitened, templates=np.zeros((0, 0)))
+            elif not kept_whole:
+                again = law(np.concatenate(self.templates[group], axis=1))
+                again *= whitened.scale
+                whitened = replace(whitened, templates=again.astype(self._precision, copy=False))
+            yield group, whitened
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """Templates, whitened, (n_points, n_columns), the scale of each, and by width Gram matrices, (n, width, width)."""
+
+    templates: FloatArray
+    scale: FloatArray
+    products: dict[int, FloatArray]
+
+    @classmethod
+    def of(cls, templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
+        widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
+        firsts = np.cumsum(widths) - widths
+        whitened = law(np.concatenate([np.zeros((len(templates[0]), 0), templates[0].dtype), *templates], axis=1))
+        norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+        scale = np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+        whitened *= scale
+        ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
+        products: dict[int, list[FloatArray]] = {}
+        for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
+            width, begin = int(widths[first]), int(firsts[first])
+            columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
+            products.setdefault(width, []).append(_gram_matrices(columns))
+        grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
+        return cls(whitened.astype(templates[0].dtype, copy=False), scale, grams)
 
 
 def _gram_matrices(columns: FloatArray) -> FloatArray:
@@ -158,14 +206,6 @@ def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
         [first * c * c + second * s * s + 2 * both * c * s, first * s * s + second * c * c - 2 * both * c * s]
     )
     return values.T, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
-
-
-@dataclass(frozen=True, eq=False)
-class _WhitenedTemplatesAndGrams:
-    """All templates, whitened, (n_points, n_columns), and by width their Gram matrices, (n, width, width)."""
-
-    templates: FloatArray
-    products: dict[int, FloatArray]
 
 
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
@@ -214,16 +254,34 @@ class TemplateCache:
         """Return one bank of the templates of several effects about a fit, of fewer variants, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
-            own = [(e.name, t) for e in effects for t in self.templates_of(found, e.with_fewer_variants()).columns]
-            self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
+            own = [
+                (effect.name, t)
+                for effect in effects
+                for t in self.templates_of(found, effect.with_fewer_variants()).columns
+            ]
+            self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own])
         return self.banks[key]
 
     def templates_of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
         """Return the templates of one effect about one fit."""
         key = found, effect
         if key not in self.known:
-            self.known[key] = templates_of_effect(found, effect, self.usable)
+            own = self._shared_with_first_copy(found, effect)
+            self.known[key] = own or templates_of_effect(found, effect, self.usable)
         return self.known[key]
+
+    def _shared_with_first_copy(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates | None:
+        """Return the templates of a second copy of an effect where those of the first are known and hold them all."""
+        name = name_of_first_copy(effect.name)
+        first = next((own for (fit, e), own in self.known.items() if fit is found and e.name == name), None)
+        if first is None or len(first.variants) > 1 or len(effect.variants()) > 1:
+            return None
+        numbers = {setting.tobytes(): k for k, setting in enumerate(first.settings)}
+        at = [numbers.get(setting.tobytes()) for setting in effect.variants()[0].bank()]
+        if None in at:
+            return None
+        columns, settings = (tuple(every[k] for k in cast(list[int], at)) for every in (first.columns, first.settings))
+        return EffectTemplates(columns, settings, effect.variants(), np.zeros(len(at), dtype=np.int64))
 
 
 def templates_of_effect(
@@ -243,7 +301,7 @@ def templates_of_effect(
     gates = effect.variant_masks(found.model.plan)
     if gates is not None:
         (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
-        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
+        columns = [everywhere * gates.opened[k][usable, None].astype(everywhere.dtype) for k in choice]
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
@@ -270,7 +328,9 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     at = np.searchsorted(inside, usable[kept])
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
-    change = np.zeros((n_rows, len(usable)))  # of all rows of a long plan it may be gigabytes
+    largest = np.abs(found.predicted).max(initial=0.0)
+    none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
+    change = np.zeros((n_rows, len(usable)), dtype=np.float32 if len(usable) > _LONG else np.float64)
     step = max(AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
         rows = slice(first, min(first + step, n_rows))

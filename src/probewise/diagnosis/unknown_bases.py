@@ -89,7 +89,7 @@ def bank_of_unknown_effects(
         found += [(MEMORY, template[back]) for template in _memory_bases(signal[order], starts)]
         found += [(SCAN_ENDS, template[back]) for template in _scan_end_bases(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
-    return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
+    return TemplateBank.of([t for _, t in kept], [name for name, _ in kept])
 
 
 def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linearised) -> TemplateBank:
@@ -98,27 +98,29 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
     A basis of one column with a cosine of 0.9 or more with a template's span is left out. One of several columns that
     has its span becomes zero: it explains nothing, and its share of the prior is not given to the others.
     """
-    if bases.widths.size == 0 or named.widths.size == 0:
+    if not bases.templates:
         return bases
-    blocks, own = _orthonormal_blocks(named, problem), _orthonormal_blocks(bases, problem)
+    own = OrthonormalBlocks.of(problem, bases.templates)
     single = np.flatnonzero(bases.widths == 1)
-    kept = np.setdiff1d(np.arange(len(bases.widths)), single[_are_held(own.u[:, own.starts[single]], blocks)])
-    twins = np.repeat(_have_span_of_some(own, blocks), bases.widths)
-    return replace(bases, columns=np.where(twins, 0.0, bases.columns)).take_templates(kept)
+    held, twins = np.zeros(len(single), dtype=np.bool_), np.zeros(len(bases.widths), dtype=np.bool_)
+    for group in named.groups:
+        blocks = OrthonormalBlocks.of(problem, named.templates[group])
+        held |= _are_held(own.u[:, own.starts[single]], blocks)
+        twins |= _have_span_of_some(own, blocks)
+    kept = np.setdiff1d(np.arange(len(bases.widths)), single[held])
+    templates = [0.0 * template if twin else template for template, twin in zip(bases.templates, twins, strict=True)]
+    return replace(bases, templates=tuple(templates)).take_entries(kept)
 
 
 def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: Linearised) -> TemplateBank:
     """Return the bases without the products that a template of a formula holds, the fit's parameters projected out."""
     products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
-    if products.size == 0 or formulas.widths.size == 0:
+    if products.size == 0 or not formulas.templates:
         return bases
-    own = _orthonormal_blocks(bases.take_templates(products), problem)
-    held = _are_held(own.u, _orthonormal_blocks(formulas, problem))
-    return bases.take_templates(np.setdiff1d(np.arange(len(bases.widths)), products[held]))
-
-
-def _orthonormal_blocks(bank: TemplateBank, problem: Linearised) -> OrthonormalBlocks:
-    return OrthonormalBlocks.of(problem, [bank[k] for k in range(len(bank.widths))])
+    own, held = OrthonormalBlocks.of(problem, [bases[k] for k in products]), np.zeros(len(products), dtype=np.bool_)
+    for group in formulas.groups:
+        held |= _are_held(own.u, OrthonormalBlocks.of(problem, formulas.templates[group]))
+    return bases.take_entries(np.setdiff1d(np.arange(len(bases.labels)), products[held]))
 
 
 def _are_held(columns: FloatArray, blocks: OrthonormalBlocks) -> BoolArray:

@@ -34,7 +34,7 @@ class SensorAndShape:
     sensor: CalibratedSensor
     shape: Shape
     starts: FloatArray
-    predicts_in_bulk = predicts_cheaply_nearby = False
+    predicts_in_bulk = predicts_dearly = False
     may_be_far_off = True  # without a missing effect the shape may be found at another place
 
     def coordinates(self, theta: FloatArray) -> None:

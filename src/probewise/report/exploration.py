@@ -23,7 +23,7 @@ from probewise.experiment import (
 from probewise.experiment.result import stop_reason_with_checks
 from probewise.inquiry import UtilityMap
 from probewise.report import html
-from probewise.report.plots.canvas import grid_of_axes, png
+from probewise.report.plots.canvas import axes_of_frame, grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
@@ -82,7 +82,8 @@ def robot_view_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
-    ax = draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
+    ax = axes_of_frame((8.2, 4.7), (0.75, 1.1, 0.95, 0.35))
+    draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
     return png(ax, dpi=90, tight=False)
 

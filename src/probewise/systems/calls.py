@@ -70,7 +70,7 @@ def _copied(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-MOST_CALLS = 20_000
+MOST_CALLS = 10_000
 """Expected limit of calls in a diagnosis, for a `simulate` that takes one sample at a time; it is not enforced."""
 
 

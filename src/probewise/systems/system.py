@@ -230,9 +230,9 @@ class System:
         return self.caller is None or self.caller.broadcasts
 
     @property
-    def predicts_cheaply_nearby(self) -> bool:
-        """Whether predictions near a point cost little once it was predicted itself: for a law."""
-        return self.caller is None
+    def predicts_dearly(self) -> bool:
+        """Whether predictions are worth sparing: of a law, and of a `simulate` that is called for each sample."""
+        return self.caller is None or not self.caller.broadcasts
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Return whether an effect acts at a stage of this system: False for one on rates without a law."""

@@ -417,7 +417,7 @@ class Refits:
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)
-        own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
+        own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
 
         def log_bayes_factors_about(problem: Linearised) -> FloatArray:
             return log_bayes_factors_by_label(problem, own)[effect.name]
@@ -474,7 +474,7 @@ class Refits:
         )
 
     def _hopeless_above(self, model: Model) -> float:
-        if not model.sensor.predicts_cheaply_nearby:
+        if not model.sensor.predicts_dearly:
             return math.inf
         return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + _HOPELESS
 

@@ -83,6 +83,16 @@ def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], *
     )
 
 
+def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
+    """Open a figure with one pair of axes within fixed margins: left, bottom, right, top.
+
+    To find the margins takes longer than to draw a frame of many.
+    """
+    (width, height), (left, bottom, right, top) = size_in, margins_in
+    within = (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
+    return new_figure(size_in).add_axes(within)
+
+
 def axes_or_grid(
     axes: AxesGrid | None, n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any
 ) -> AxesGrid:

@@ -27,12 +27,13 @@ _N_SIMULATIONS = 200
 _SIMULATED_AT_A_TIME = 100_000
 _MOST_WINDOWS, _LEAST_LAG = 32, 4  # of lineages
 _MOST_MEMORY = 10.0  # lineage variance above which a run descends from too few lineages to estimate its error
+_FAR = 4.0  # posterior sds: what lies farther has next to no weight
 _FEWEST_STEPS = 30.0  # between floating-point numbers, from quartile to quartile
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """log Z, the information (nats), normalised log weights, (n_dead,), and Kish's effective sample size.
+    """log Z, the information (nats) and normalised log weights, (n_dead,).
 
     `spread`: sd of log Z from the random shrinkage alone; `log_start_error`: standard error of the log of the share of
     the prior with a likelihood above zero.
@@ -43,7 +44,6 @@ class Evidence:
     log_start_error: float
     information: float
     log_weight: FloatArray
-    n_eff: float
 
     def log_z_error(self, memory: float) -> float:
         """Return the standard error of log Z.
@@ -94,7 +94,7 @@ def integrate(
         edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
         simulated[first : first + n] = logsumexp(_log_shell_volumes(edges) + log_likelihood, axis=1)
     spread = float(np.std(simulated, ddof=1))
-    return Evidence(best + log_z, spread, log_start_error, information, log_weight, float(1.0 / (weight @ weight)))
+    return Evidence(best + log_z, spread, log_start_error, information, log_weight)
 
 
 def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
@@ -151,6 +151,34 @@ def _uniform_p_value(position: FloatArray) -> float:
     distance = max(float((steps[1:] - place).max()), float((place - steps[:-1]).max()))
     root = math.sqrt(n)
     return float(kolmogorov((root + 0.12 + 0.11 / root) * distance))
+
+
+def n_independent(theta: FloatArray, weight: FloatArray, parent: IntArray) -> float:
+    """Return how many independent draws would tell the posterior means as precisely: the least of the parameters.
+
+    A chain that starts at its parent remembers it. If a parameter's correlation with the parent is rho, the weighted
+    mean is a sum of independent parts, one a point, each with the point's weight and rho times that of its children's
+    parts. `theta`: (n_dead, n_params); `weight`, summing to one, and `parent`, -1 for draws from the prior: (n_dead,).
+    """
+    started = np.flatnonzero(parent >= 0)
+    apart = theta - weight @ theta
+    sd = np.sqrt(weight @ apart**2)
+    apart = np.clip(np.divide(apart, sd, out=np.zeros_like(apart), where=sd > 0), -_FAR, _FAR)
+    now, before, share = apart[started], apart[parent[started]], weight[started, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        now, before = (x - (share * x).sum(0) / share.sum() for x in (now, before))
+        rho = (share * now * before).sum(0) / np.sqrt((share * now**2).sum(0) * (share * before**2).sum(0))
+    rho = np.clip(np.nan_to_num(rho), 0.0, 1.0)
+    generation, ancestor = np.zeros(len(parent), dtype=np.int64), parent
+    while (later := ancestor >= 0).any():
+        generation[later] += 1
+        ancestor = np.where(later, parent[ancestor], -1)
+    part = np.repeat(weight[:, None], theta.shape[1], axis=1)
+    for k in range(int(generation.max()), 0, -1):
+        rows = np.flatnonzero(generation == k)
+        np.add.at(part, parent[rows], rho * part[rows])
+    drawn = np.where(parent[:, None] < 0, 1.0, 1.0 - rho**2)
+    return float(1.0 / (drawn * part**2).sum(axis=0).max(initial=float(weight @ weight)))
 
 
 def relative_lineage_variance(

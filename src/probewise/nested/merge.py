@@ -14,7 +14,7 @@ from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import DISAGREE, weighted_mean_and_error
-from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate
+from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate, n_independent
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
 
 # p value below which runs disagree: one false alarm in 1000 merges.
@@ -102,7 +102,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         log_z_error=widened,
         memory=remembered,
         information=evidence.information,
-        n_eff=evidence.n_eff,
+        n_eff=n_independent(joined["theta"], np.exp(evidence.log_weight), parent),
         n_calls=sum(r.n_calls for r in parts),
         n_live=sum(r.n_live for r in parts),
         stop_reason=f"merged {len(parts)} runs: " + "; ".join(dict.fromkeys(r.stop_reason for r in parts)),

@@ -39,8 +39,8 @@ class Samples(ShowsItself):
     """Weighted samples of a posterior: base of results with `names`, `theta` and weights that sum to one.
 
     `theta` (n, n_params) are the parameters of each sample; `log_likelihood` and `log_weight`, (n,), its own; `log_z`
-    and `log_z_error` the natural log of the evidence and its standard error; `n_eff` is Kish's effective sample size,
-    `n_calls` the number of likelihood evaluations.
+    and `log_z_error` the natural log of the evidence and its standard error; `n_eff` is the effective sample size, of a
+    nested run that of the parameter whose mean is least certain; `n_calls` the number of likelihood evaluations.
     """
 
     names: tuple[str, ...]

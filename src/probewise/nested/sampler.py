@@ -40,6 +40,7 @@ from probewise.nested.evidence import (
     birth_rows,
     insertion_p_value,
     integrate,
+    n_independent,
     relative_lineage_variance,
     warning_of_coarse_coordinates,
     warning_of_few_lineages,
@@ -49,13 +50,14 @@ from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError, Points, Samplable, as_problem
 from probewise.nested.result import NestedResult, as_json, software_versions
 from probewise.nested.save import CheckpointFile, DeadPoints, LivePoints, RunState, settings_of_run
+from probewise.nested.weights import n_effective
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
 
 # Draw from the whole prior while a point costs fewer evaluations than a chain would.
 _PRIOR_VOLUME = 0.05
-_FEW_EFFECTIVE = 30.0
+_FEW_EFFECTIVE = 30.0  # by the weights alone
 _STUCK_SHARE = 0.02
 # Chains of each first live point where some began at others: after three, ln Z of a prior of which one in 5,000 is
 # possible was still 0.7 too low.
@@ -548,8 +550,8 @@ def _final_result(
     doubts.append(warning_of_few_lineages(remembered))
     if not evaluate.names:
         pass  # the evidence is exact
-    elif evidence.n_eff < _FEW_EFFECTIVE:
-        doubts.append(f"only {evidence.n_eff:.0f} effective samples: use more n_live")
+    elif (n_of_weight := n_effective(evidence.log_weight)) < _FEW_EFFECTIVE:
+        doubts.append(f"only {n_of_weight:.0f} effective samples: use more n_live")
     else:
         doubts.append(warning_of_coarse_coordinates(evaluate.names, points.u, np.exp(evidence.log_weight)))
     return NestedResult(
@@ -568,7 +570,7 @@ def _final_result(
         log_z_error=evidence.log_z_error(remembered),
         memory=remembered,
         information=evidence.information,
-        n_eff=evidence.n_eff,
+        n_eff=n_independent(points.theta, np.exp(evidence.log_weight), parent),
         n_calls=evaluate.n_calls,
         n_live=n_live,
         stop_reason=reason,

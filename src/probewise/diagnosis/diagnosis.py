@@ -189,7 +189,7 @@ def locate_effects_and_residuals(
         if shows_in is not None:
             size = sizes.get(effect.name, 0.0)
             named += places_of_effect(
-                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size, sd=problem.sd
+                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size
             )
     scan_names = prepared.recording.plan.scan_names
     scanned = significant_places(problem, covariates, scan_names, residuals, test.draws)

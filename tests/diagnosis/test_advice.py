@@ -326,7 +326,6 @@ def test_the_next_readings_of_an_unknown_effect_go_where_its_residuals_lie():
         9.0,
         np.array([0.0, 999.0]),
         np.full(2, 0.8),
-        np.full(2, 0.1),
         values=np.where(inside, x, np.nan),
     )
     null = refit("lag", [0.0], plan)

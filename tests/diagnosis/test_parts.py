@@ -67,7 +67,7 @@ def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
 def placed(effect, change, without, plan, covariates):
     shows_in = covariate_of_effect(effect, change, without, plan, covariates)
     scans = next((c for c in covariates if c.name == "scan"), None)
-    return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0, sd=0.5)
+    return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0)
 
 
 def test_an_effect_of_scans_of_which_one_has_no_usable_reading_is_located_in_the_others():

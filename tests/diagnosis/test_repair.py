@@ -109,7 +109,7 @@ def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_re
 
 
 def place(covariate, values, start, end):
-    return Place(covariate, None, start, end, 0.001, 5.0, *[np.zeros(0)] * 3, values=values)
+    return Place(covariate, None, start, end, 0.001, 5.0, *[np.zeros(0)] * 2, values=values)
 
 
 def test_a_control_comes_before_time_where_both_hold_the_same_rows():

@@ -187,7 +187,7 @@ def test_a_place_and_a_family_of_unknown_effects_have_the_name_that_results_have
     draws = problem.draw_null_residuals(199, rng=np.random.default_rng(0))
     (place,) = significant_places(problem, [covariate], ("all",), residual, draws)
     effect, plan = bind_forms(prepared.apparatus.about)[f"sensitivity:{name}"], prepared.recording.plan
-    (of_effect,) = places_of_effect(effect, bump, covariate, None, plan, residual, p_value=0.001, size=8.0, sd=1.0)
+    (of_effect,) = places_of_effect(effect, bump, covariate, None, plan, residual, p_value=0.001, size=8.0)
     assert place.covariate == of_effect.covariate == published
     bank = bank_of_unknown_effects([covariate], _X - _X.min(), _X, np.zeros(_N, dtype=int))
     assert set(bank.labels) <= {published, f"{published}, locally", "what was seen before", "ends of scans"}

@@ -50,7 +50,7 @@ def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, v
     at = np.array(values)
     start, end = (None, None) if covariate == "scan" else (np.nanmin(at), np.nanmax(at))
     scan = "one" if covariate == "scan" else None
-    place = Place(covariate, scan, start, end, 0.001, 5.0, np.zeros(2), np.zeros(2), np.ones(2), values=at)
+    place = Place(covariate, scan, start, end, 0.001, 5.0, np.zeros(2), np.zeros(2), values=at)
     rows = np.arange(len(at))
     scans = ["one", *["two"] * (len(at) - 1)]
     taken = Recording.from_arrays(x_mm=rows, y_mm=0, readings=rows, patterns=Uniform(0.5), unit="V", scan=scans)
@@ -63,7 +63,7 @@ def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, v
 
 def test_an_unknown_effect_that_depends_on_the_run_is_found_by_its_run():
     """A whole run of a table is a place without "within scans", as a whole scan is."""
-    place = Place("run", "third", None, None, 0.001, 5.0, np.zeros(2), np.zeros(2), np.ones(2))
+    place = Place("run", "third", None, None, 0.001, 5.0, np.zeros(2), np.zeros(2))
     diagnosis = SimpleNamespace(
         verdict="unknown",
         judged=SimpleNamespace(unknown_shares={"run, by group": 0.7, "time, smooth": 0.2}),

@@ -208,7 +208,7 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
 
 
 def place_of(covariate, start):
-    return Place(covariate, None, start, start + 1.0, 0.004, 4.0, *[np.zeros(0)] * 3, values=np.arange(3.0))
+    return Place(covariate, None, start, start + 1.0, 0.004, 4.0, *[np.zeros(0)] * 2, values=np.arange(3.0))
 
 
 def test_a_columns_values_are_no_categories_though_it_is_called_as_those_of_a_light_sensor():

@@ -189,7 +189,7 @@ def locate_effects_and_residuals(
         if shows_in is not None:
             size = sizes.get(effect.name, 0.0)
             named += places_of_effect(
-                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size, sd=problem.sd
+                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size
             )
     scan_names = prepared.recording.plan.scan_names
     scanned = significant_places(problem, covariates, scan_names, residuals, test.draws)
@@ -353,11 +353,6 @@ class Diagnosis(ShowsItself):
         return "\n".join(lines)
 
 
-def require_diagnosis(diagnosis: object) -> None:
-    """Raise ParameterError unless `diagnosis` is a Diagnosis."""
-    require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")
-
-
 NEXT_PLAN = "next_plan.csv"
 
 
@@ -373,7 +368,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
     Figures of places (`where`) and the next plan are given by file name; the report and the command line write them.
     """
-    require_diagnosis(diagnosis)
+    require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")
     gain, plan = diagnosis.improvement, diagnosis.next_measurement
     document: dict[str, Any] = {
         "format": "diagnosis/1",

@@ -215,7 +215,12 @@ def fit_simulator(
     first = cast(FloatArray, cast(System, prepared.null).first)
     modes, n_even = modes_of(system, recording, law, first)
     fits = _distinct(fit_each_start(Model(system, (), recording.plan), recording, [first, *modes], law), law)
-    noise = laplace_evidence(fits[0], _noise_model(recording, fits[0].sd))
+    step, least = (
+        recording.plan.instrumentation.step or 0.0,
+        _ROUNDING * float(np.abs(recording.readings[usable]).max()),
+    )
+    rounding = step if fits[0].sd < HIDDEN * step else 0.0
+    noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding, least))
     problem = ProblemInBlocks(fits[0].model, recording, noise)
     progress("sampling the posterior")
     draws, is_settled = draw_by_importance(problem, fits, law, rng=rng, progress=progress)
@@ -245,12 +250,6 @@ def fit_simulator(
     evidence = Evidence(draws.log_z, draws.log_z_error, "importance sampling")
     beside = _nested_sampling(problem, z, rng=rng, progress=progress) if thorough else None
     return SystemFit(recording, fitted, evidence, mean, sd, beside)
-
-
-def _noise_model(recording: Recording, sd: float) -> NoiseModel:
-    step = recording.plan.instrumentation.step or 0.0
-    least = _ROUNDING * float(np.abs(recording.readings[recording.usable]).max())
-    return NoiseModel((), recording, {}, step if sd < HIDDEN * step else 0.0, least)
 
 
 def _distinct(fits: Sequence[Fit], law: NoiseLaw) -> list[Fit]:

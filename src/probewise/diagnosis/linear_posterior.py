@@ -118,14 +118,6 @@ class LinearAmplitudes:
             drawn[:, list(group.at)] = group.coordinates(drawn[:, list(group.at)])
         return drawn
 
-    def log_density(self, z: FloatArray) -> FloatArray:
-        """Return the log density of coordinates, unnormalised, (n_samples, n_params) -> (n_samples,)."""
-        x = z.copy()
-        for group in self.groups:
-            x[:, list(group.at)] = group.values(z[:, list(group.at)])
-        likelihood = x @ self.downhill - 0.5 * np.einsum("ni,ij,nj->n", x, self.curvature, x)
-        return np.asarray(likelihood - 0.5 * np.sum(z**2, axis=1))
-
 
 def two_sided_amplitude_groups(found: Fit) -> Iterator[AmplitudeGroup]:
     """List the amplitudes of a fit's effects that may have either sign, values with one scale together."""

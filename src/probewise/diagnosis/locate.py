@@ -65,7 +65,7 @@ class Place:
     """A window of a covariate in which residuals, or an effect, are significant, with the curve of mean residuals.
 
     `start`, `end` in the covariate's unit; None for a whole `scan`. `z`: the statistic of the window in noise sds; for
-    an effect, its lambda. The curve is the mean residual in bins of the covariate, with the noise sd of that mean.
+    an effect, its lambda. The curve is the mean residual in bins of the covariate.
     `values` (n_usable,): the covariate at each usable reading, NaN if undefined. `without_effect`: whether the values
     are readings predicted without the effect.
     """
@@ -78,14 +78,13 @@ class Place:
     z: float
     curve_at: FloatArray
     curve_mean: FloatArray
-    curve_sd: FloatArray
     values: FloatArray | None = None
     without_effect: bool = False
 
     def __post_init__(self) -> None:
         if self.values is not None:
             object.__setattr__(self, "values", read_only_floats(self.values))
-        for name in ("curve_at", "curve_mean", "curve_sd"):
+        for name in ("curve_at", "curve_mean"):
             object.__setattr__(self, name, read_only_floats(getattr(self, name)))
 
     @property
@@ -214,7 +213,7 @@ def significant_places(
         window: tuple[str | None, float | None, float | None] = (covariate.scan, *kept[best])
         if covariate.name in _RUNS:
             window = scan_names[int(kept[best][0])], None, None
-        curve = _mean_curve_fields(covariate, residuals, problem.sd)
+        curve = _mean_curve_fields(covariate, residuals)
         out.append(Place(covariate.published_name, *window, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
 
@@ -229,7 +228,6 @@ def places_of_effect(
     *,
     p_value: float,
     size: float,
-    sd: float,
 ) -> list[Place]:
     """Locate a named effect: the interval of a covariate in which it is at least half its maximum.
 
@@ -243,9 +241,9 @@ def places_of_effect(
     name = covariate.name
     if name == "run":
         strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
-        return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals, sd))]
+        return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals))]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
-        curve = _mean_curve_fields(scans, residuals, sd)
+        curve = _mean_curve_fields(scans, residuals)
         # A scan without usable readings is not in the plan, and a name may return.
         rows = {scan: np.array([own == scan for own in plan.scan_names])[plan.scan] for scan in effect.scans}
         largest = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
@@ -258,12 +256,12 @@ def places_of_effect(
     # An effect with a threshold in level begins where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]
-    curve = _mean_curve_fields(covariate, residuals, sd)
+    curve = _mean_curve_fields(covariate, residuals)
     start, end = float(values.min()), float(values.max())
     return [Place(covariate.published_name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
 
 
-def _mean_curve_fields(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
+def _mean_curve_fields(covariate: Covariate, residuals: FloatArray) -> dict[str, Any]:
     """Return fields of a `Place`: the covariate at each reading, and the curve of mean residuals in bins of it."""
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:
@@ -276,5 +274,4 @@ def _mean_curve_fields(covariate: Covariate, residuals: FloatArray, sd: float) -
         "values": by_row,
         "curve_at": np.array([values[p].mean() for p in parts]),
         "curve_mean": np.array([mine[p].mean() for p in parts]),
-        "curve_sd": np.array([sd / math.sqrt(len(p)) for p in parts]),
     }

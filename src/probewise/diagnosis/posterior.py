@@ -271,8 +271,8 @@ def posterior_draws(
     """
     laplace = _Laplace.of(found, noise, recording)
     if not annealed:
-        linear = laplace.linear_amplitudes
-        return laplace.draw(n_samples, rng=rng) if linear is None else linear.draw(n_samples, rng=rng)
+        linear = LinearAmplitudes.of(found, laplace.slopes, laplace.residual) or laplace
+        return linear.draw(n_samples, rng=rng)
     steps = rng.standard_normal((_N_NEAR, len(found.z)))
     problem = HypothesisProblem(found.model, recording, noise.with_likeliest_node_alone)
 
@@ -337,11 +337,6 @@ class _Laplace:
         if np.isfinite(found.model.predict(center[None, :])[0, self.recording.usable]).all():
             return center
         return found.z  # the step left the domain of the formula
-
-    @cached_property
-    def linear_amplitudes(self) -> LinearAmplitudes | None:
-        """The same with amplitudes that are linear in their value; None if all are as good as linear already."""
-        return LinearAmplitudes.of(self.found, self.slopes, self.residual)
 
     def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""

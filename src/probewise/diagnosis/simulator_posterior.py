@@ -188,10 +188,11 @@ def draw_by_importance(
             return draws, True
         before = now
         progress("sampling the posterior", note=f"{draws.n_effective:.0f} effective draws")
-        if not k and sensor.predicts_in_bulk and not sensor.predicts_dearly:
-            anchors = rng.permutation(ridge.follow(fits, rng=rng))
+        along = not k and sensor.predicts_in_bulk and not sensor.predicts_dearly
+        anchors = rng.permutation(ridge.follow(fits, rng=rng)) if along else z[:0]
+        if len(anchors) > n_params:
             spread, anchors = np.cov(anchors.T), anchors[:n_kernels]
-        else:
+        else:  # readings that are met exactly leave a mode from which no stride is likely enough
             weight = draws.tempered_weight(_TEMPERED * n_params)
             anchors = z[np.unique(resampled_rows(weight, n_kernels, rng))]
             middle, spread = np.average(z, axis=0, weights=weight), np.cov(z.T, aweights=weight)

@@ -393,7 +393,8 @@ def log_bayes_factors_of_pairs(
     turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
     own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
     asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
-    both = [_joined_templates(own[first], own[second]) for first, second in asked]
+    parts = [(own[first], own[second]) for first, second in asked]
+    both = [np.hstack([t * math.sqrt(t.shape[1] / (a.shape[1] + b.shape[1])) for t in (a, b)]) for a, b in parts]
     blocks = OrthonormalBlocks.of_projected_templates(np.concatenate(both, axis=1), [c.shape[1] for c in both])
     together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_kept)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
@@ -401,9 +402,3 @@ def log_bayes_factors_of_pairs(
     gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)
     alone = {name: log_mean_exp(scores) for name, scores in singles.items()}
     return {(a, b): alone[a] + alone[b] + float(own) for (a, b), own in zip(pairs, gained, strict=True)}
-
-
-def _joined_templates(first: FloatArray, second: FloatArray) -> FloatArray:
-    widths = first.shape[1], second.shape[1]
-    scaled = [t * math.sqrt(w / sum(widths)) for t, w in zip((first, second), widths, strict=True)]
-    return np.concatenate(scaled, axis=1)

@@ -263,12 +263,11 @@ def hypotheses_with_verdict(
     posterior, shares = searched.posterior, searched.evidences.reported_shares
     unknown = {mean: p * shares(mean).get(("unknown",), 0.0) for mean, p in posterior.marginal_over_noise.items()}
     rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
-
-    def shares_with_rare_named(mean: Names) -> Mapping[Names, float]:
-        return {mean: 1.0} if effects_out_of_vocabulary(mean) == rare else shares(mean)
-
     if rare:
-        hypotheses = ranked_hypotheses(posterior.probabilities, shares_with_rare_named)
+        hypotheses = ranked_hypotheses(
+            posterior.probabilities,
+            lambda mean: {mean: 1.0} if effects_out_of_vocabulary(mean) == rare else shares(mean),
+        )
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
             return hypotheses, rare, (verdict, combination)

@@ -18,7 +18,7 @@ from probewise.world.world import World
 
 def place(covariate, start=None, end=None, scan=None):
     none = np.zeros(0)
-    return Place(covariate, scan, start, end, 0.01, 4.0, none, none, none)
+    return Place(covariate, scan, start, end, 0.01, 4.0, none, none)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_a_scan_overlaps_with_the_scans_of_its_mounting():
     assert place_overlap(region, [place("scan", scan="c")]) == 0.0
     both = [place("scan", scan="a"), place("scan", scan="b"), place("time", 0.0, 1.0)]
     assert place_overlap(region, both) == 1.0
-    weaker = Place("scan", "c", None, None, 0.01, 3.0, *[np.zeros(0)] * 3)
+    weaker = Place("scan", "c", None, None, 0.01, 3.0, *[np.zeros(0)] * 2)
     assert place_overlap(region, [*both, weaker]) == 1.0
 
 

@@ -511,7 +511,6 @@ class NoiseEffect(NamedEffect[NoiseParameters]):
     """
 
     stage = Stage.NOISE
-    units = ("1",)
 
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""

@@ -180,7 +180,9 @@ class Course:
 
     def mapped(self, chosen: Callable[[Any], Any]) -> Course:
         """Return it with a function applied to every array."""
-        held = read_only_views({name: chosen(values) for name, values in self.held.items()})
+        held = {name: chosen(values) for name, values in self.held.items()}
+        for values in held.values():
+            values.setflags(False)
         return Course(held, {name: (chosen(low), chosen(rise)) for name, (low, rise) in self.lines.items()})
 
 

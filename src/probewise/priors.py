@@ -404,10 +404,10 @@ class HeavyTailedPrior:
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
         value = np.asarray(value, dtype=np.float64)
-        tail = 0.5 * erfc(np.abs(value)[..., None] / (self.component_sds * math.sqrt(2))).mean(axis=-1)
+        tail = np.asarray(0.5 * erfc(np.abs(value)[..., None] / (self.component_sds * math.sqrt(2))).mean(axis=-1))
         if self.positive:
             return np.where(value > 0, 1.0 - 2.0 * tail, 0.0)
-        return np.where(value < 0, tail, 1.0 - tail)
+        return np.asarray(np.where(value < 0, tail, 1.0 - tail))
 
     def __str__(self) -> str:
         kind = "positive heavy-tailed" if self.positive else "heavy-tailed about 0"

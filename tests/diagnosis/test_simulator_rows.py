@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 import pytest
-from heater import runs
+from heater import ABOUT, runs
 
 from probewise.diagnosis.advice import Rival, measurement_separating_rivals
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
@@ -31,6 +32,7 @@ from probewise.systems import (
     RunTable,
     Simulator,
     System,
+    as_recording,
     concatenate_tables,
     predict_system,
     table_for,
@@ -343,3 +345,13 @@ def test_a_stored_model_of_an_earlier_version_depends_linearly():
     mean = predict_system(old, about.table, rng=np.random.default_rng(0)).mean
     rate = samples[:, 1:2] + samples[:, 2:] * (_TEMP - _TEMP.mean())
     np.testing.assert_allclose(mean, (samples[:, :1] * np.exp(-rate * _HOURS)).mean(axis=0), atol=0.02)
+
+
+def test_what_comes_next_is_the_last_fifth_of_the_readings_of_each_run():
+    recording = as_recording(ABOUT.system.simulator, TABLE)
+    recording = recording.with_readings(np.where(np.arange(36) < 2, np.nan, recording.readings))
+    part, names = SimulatorApparatus(ABOUT).what_comes_next(recording)
+    assert (np.flatnonzero(part == 0) + 2).tolist() == [10, 11, 22, 23, 34, 35]
+    assert (names, set(part)) == (("the last fifth",), {-1, 0})
+    timeless = replace(recording, plan=replace(TABLE, time=None))
+    assert SimulatorApparatus(ABOUT).what_comes_next(timeless) is None

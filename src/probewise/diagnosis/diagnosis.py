@@ -407,7 +407,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for place in diagnosis.where
         ],
-        "improvement": {key: value for key, value in asdict(gain).items() if key != "heldout_by_scan"},
+        "improvement": {k: v for k, v in asdict(gain).items() if k not in ("heldout_by_scan", "comes_next")},
         "aliases": [asdict(a) | {"effects": list(a.effects)} for a in diagnosis.judged.aliases],
         "noise": {
             "model": diagnosis.report.noise.model,

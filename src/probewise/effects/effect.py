@@ -316,10 +316,17 @@ class StepEffect(Effect):
 
         What is added to readings or poses, or to the gain, is nothing before it and the same everywhere after it.
         """
-        return self.change_points.masks(self.entries[0], plan) if self.stage in _ROW_BY_ROW else None
+        if self.stage not in _ROW_BY_ROW:
+            return None
+        always, along = self.entries[0].copy(), self.change_points.variable_at_rows(plan)
+        always[:, -1] = -np.inf
+        return VariantMasks(always, np.array([along > 0.5 * (a + b) for a, b in self.change_points.intervals]))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        return self.change_points.redrawn(theta, weights, rng=rng)
+        low, high = np.transpose(self.change_points.intervals)
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        drawn = low[chosen] + (high - low)[chosen] * rng.random(len(theta))
+        return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
 
 
 _ROW_BY_ROW = (Stage.OFFSET, Stage.GAIN, Stage.POSE)
@@ -511,7 +518,6 @@ class NoiseEffect(NamedEffect[NoiseParameters]):
     """
 
     stage = Stage.NOISE
-    units = ("1",)
 
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""
@@ -638,19 +644,6 @@ class ChangePoints:
         if self.column:
             return np.asarray(plan.covariates[self.column])
         return np.asarray(plan.row_number if self.by_row else plan.time_s)
-
-    def masks(self, entry: FloatArray, plan: Any) -> VariantMasks:
-        """Return the masks of the rows after the middle of each interval, and a bank entry that acts on all rows."""
-        always, along = entry.copy(), self.variable_at_rows(plan)
-        always[:, -1] = -np.inf
-        return VariantMasks(always, np.array([along > 0.5 * (low + high) for low, high in self.intervals]))
-
-    def redrawn(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw theta's last column: for each sample an interval by `weights`, (n_intervals,), uniform within it."""
-        low, high = np.transpose(self.intervals)
-        chosen = rng.choice(len(weights), len(theta), p=weights)
-        drawn = low[chosen] + (high - low)[chosen] * rng.random(len(theta))
-        return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
 
 
 def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:

@@ -30,6 +30,7 @@ class CorrelatedNoise(NoiseEffect):
     """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
 
     name, words, covariates = "correlated_noise", "noise that neighbouring readings share", ("scan",)
+    units = ("1",)
     prior = Product({"rho": Uniform(-0.5, 0.95)})
     n_nodes = 28  # dense enough to integrate the posterior of a thousand readings
 
@@ -47,6 +48,7 @@ class SignalDependentNoise(NoiseEffect):
     """Noise that grows with the light: variance x (1 + ratio u), u the seen white fraction."""
 
     name, words, covariates = "signal_dependent_noise", "noise that grows with the signal", ("level",)
+    units = ("1",)
     prior = Product({"ratio": LogUniform(0.05, 50.0)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
@@ -68,6 +70,7 @@ class DriftingNoise(NoiseEffect):
     """
 
     name, words, covariates = "drifting_noise", "noise that changes in time", ("time",)
+    units = ("1",)
     prior = Product({"growth": LogUniform(0.2, 5.0)})
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -277,7 +278,7 @@ class Stepper:
         if n_columns > _MANY_COLUMNS and 2 * len(some) <= n_columns:
             few = replace(
                 self,
-                between=self.between.mapped(lambda values: of_columns(values, some)),
+                between=self.between.mapped(partial(of_columns, columns=some)),
                 gap=of_columns(self.gap, some),
             )
             s, own, ends_of = ({name: v[:, some] for name, v in each.items()} for each in (s, after, ways))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -180,7 +181,9 @@ class Course:
 
     def mapped(self, chosen: Callable[[Any], Any]) -> Course:
         """Return it with a function applied to every array."""
-        held = read_only_views({name: chosen(values) for name, values in self.held.items()})
+        held = {name: chosen(values) for name, values in self.held.items()}
+        for values in held.values():
+            values.setflags(False)
         return Course(held, {name: (chosen(low), chosen(rise)) for name, (low, rise) in self.lines.items()})
 
 
@@ -313,7 +316,7 @@ class LawInputs:
                 some = np.flatnonzero(going)
                 columns, run = columns[some], run[some]
                 start, gap_s, end, share = start[some], gap_s[some], end[some], share[:, some]
-                inputs = inputs.mapped(lambda values, some=some: of_columns(values, some))
+                inputs = inputs.mapped(partial(of_columns, columns=some))
 
     def _next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
         """Return the time of the next jump or bend of an input after `now`, of that shape; infinite if none is left."""

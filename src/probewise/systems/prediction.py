@@ -223,20 +223,12 @@ def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
         np.stack([np.where(np.isfinite(readings), readings, np.inf), *(own.covariates[name] for name in inputs)])
         for own, readings in ((table, recording.readings), (recorded, recorded.columns[reading]))
     )
-    at = _first_column_of_block(now[:, : len(recorded)], then)
-    return len(recorded) if at is None else at
-
-
-def _first_column_of_block(block: FloatArray, within: FloatArray) -> int | None:
-    """Return the first column from which `within` (n, n_columns) holds `block` (n, n_block); None if it does not.
-
-    A NaN in the block fits anything: an input that the recording lacked was interpolated for the fit.
-    """
-    starts = np.arange(within.shape[1] - block.shape[1] + 1)
-    for k, column in enumerate(block.T):
-        starts = starts[((within[:, starts + k] == column[:, None]) | np.isnan(column[:, None])).all(axis=0)]
+    block = now[:, : len(recorded)]
+    starts = np.arange(then.shape[1] - block.shape[1] + 1)
+    for k, column in enumerate(block.T[:, :, None]):  # a NaN, which was interpolated for the fit, fits anything
+        starts = starts[((then[:, starts + k] == column) | np.isnan(column)).all(axis=0)]
         if not starts.size:
-            return None
+            return len(recorded)
     return int(starts[0])
 
 
@@ -277,8 +269,8 @@ def _table_with_interpolated_inputs(simulator: Simulator, table: RunTable) -> Ru
 
 def _incomplete_input_columns(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
     """Return, by name, the columns of numbers with missing cells, except readings and their sd."""
-    columns = {k: v for k, v in table.covariates.items() if k not in (simulator.reading, simulator.noise.sd)}
-    return {name: values for name, values in columns.items() if not np.isfinite(values).all()}
+    others = simulator.reading, simulator.noise.sd
+    return {k: v for k, v in table.covariates.items() if k not in others and not np.isfinite(v).all()}
 
 
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:

@@ -368,12 +368,11 @@ class SystemChain:
                 system.tally.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
 
-        of_all = parameters, columns, of_rates
-        each = (
-            self._integrated_readings(*(take_samples(values, k) for values in of_all), theta[k], plan)
-            for k in (slice(k, k + 1) for k in range(len(theta)))
-        )
-        return np.concatenate([*each])
+        out = np.empty((len(theta), len(plan)))
+        for at in (slice(k, k + 1) for k in range(len(theta))):
+            own, table, inputs = (take_samples(values, at) for values in (parameters, columns, of_rates))
+            out[at] = self._integrated_readings(own, table, inputs, theta[at], plan)
+        return out
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
@@ -421,7 +420,8 @@ class SystemChain:
 
 def _act_between_rows(effect: AnyEffect) -> Callable[[BetweenRows, FloatArray], BetweenRows] | None:
     """Return what an effect does between the rows, if it does anything there that its act at the rows does not say."""
-    return cast(Any, getattr(getattr(effect, "act", None), "between_rows", None))
+    act: Any = getattr(effect, "act", None)
+    return getattr(act, "between_rows", None)
 
 
 STANDS_STILL = 0.02

@@ -1,6 +1,7 @@
 """In a rate that is another state by definition hardly anything is missing: its effects have a tenth of the prior."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from probewise.systems.forms.rates import names_in_definitions
 _T = 0.2 * np.arange(60)
 
 
+@cache
 def _prepared(rates):
     law = Law({"angle": 1.0, "speed": 0.0}, rates, max_step_s=0.1)
     simulator = Simulator("y", "rad", {"stiff": (0.5, 2), "loss": (0.01, 0.5)}, law=law, time="t_s")

@@ -43,7 +43,7 @@ _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
-_Parameters = dict[str, tuple[Marginal, str]]
+_Parameters = Mapping[str, tuple[Marginal, str]]
 """Prior and unit of each parameter, by name."""
 
 
@@ -380,8 +380,8 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
     pairs = [(taus[i], taus[j]) for i in range(_N_SETTLING) for j in range(i + _APART, _N_SETTLING)]
     bank = np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs])
-    sizes: _Parameters = {"a": (AMPLITUDE, unit), "b": (AMPLITUDE, unit)}
-    priors = sizes | dict.fromkeys(("tau1", "tau2"), (between, about.time_unit))
+    size, tau = (AMPLITUDE, unit), (between, about.time_unit)
+    priors: _Parameters = {"a": size, "b": size, "tau1": tau, "tau2": tau}
     text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
     yield from _proposal(about, text, priors, bank, change, ("time", "run"), 1.0, expression=text)
 

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
-from probewise.priors import LogUniform
+from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
 from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActInTime, Form, WaveForm, says_value
 from probewise.systems.forms.modulations import (
@@ -168,7 +168,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
             f"{name} has a periodic error with an amplitude of {size} and a period of {period}, both in units of {name}"
         )
 
-    priors = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
+    priors: dict[str, Marginal] = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
     bank, along = sine_and_cosine_entries(1.0, 1 / frequencies), (covariate_of_column(name),)
     own = (f"periodic_error:{name}", Stage.INPUT, priors, (name, name, "rad"), along, act, bank, says)
     form = WaveForm(*own, counted_from=origin_in_words(name, origin))

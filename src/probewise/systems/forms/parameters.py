@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import unit_of_name
-from probewise.priors import LogUniform
+from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, ActInTime, Form, flag, says_value
 from probewise.systems.forms.modulations import (
@@ -83,7 +83,8 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
 
     def variant(as_factor: bool) -> Form:
         value, prior = flag(as_factor)
-        priors, bank = {**form.marginals, _AS_FACTOR: prior}, np.insert(form.entries, 1, value, axis=2)
+        priors: dict[str, Marginal] = {**form.marginals, _AS_FACTOR: prior}
+        bank = np.insert(form.entries, 1, value, axis=2)
         return replace(form, parameters=priors, units=(*form.units, "1"), act=act, entries=bank, says=says)
 
     linear = variant(False)

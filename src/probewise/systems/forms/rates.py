@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
 from probewise.effects.effect import PHASE, sine_and_cosine_entries, single_column_bank
-from probewise.priors import Uniform
+from probewise.priors import Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Fixed, Form, WaveForm, period_with_sd
 from probewise.systems.forms.modulations import (
@@ -121,7 +121,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         lacks = f"the rate of {state} lacks a sinusoidal term"
         return f"{lacks} with an amplitude of {size} per {per} and a period of {period}"
 
-    priors = {"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE}
+    priors: dict[str, Marginal] = {"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE}
     units, bank = (unit, f"1/{about.time_unit}", "rad"), sine_and_cosine_entries(1.0, frequencies)
     own = (f"periodic_forcing:{state}", Stage.RATE, priors, units, ("time",), act, bank, says)
     form = WaveForm(*own, counted_from=origin_in_words(time, origin, about.time_unit))

@@ -69,7 +69,8 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
         sizes, variants = np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES), []
         for is_smooth in (False, True):
             value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
-            priors, bank = {"tau_s": prior, _SMOOTH: of_flag}, np.stack([sizes, np.full(N_SIZES, value)], axis=1)
+            priors: dict[str, Marginal] = {"tau_s": prior, _SMOOTH: of_flag}
+            bank = np.stack([sizes, np.full(N_SIZES, value)], axis=1)
             own = (name, Stage.LAG, priors, (unit, "1"), ("previous",), act, bank[:, None, :])
             sentence = says_value(f"{says} {{value}}", unit)
             variants.append(Form(*own, sentence, amplitudes=(), absent={0: 0.0}, needs_rising_time=True))

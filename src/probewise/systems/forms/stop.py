@@ -87,7 +87,7 @@ def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading")
 
     def is_stop(rows: _RowsInTurn, stands: BoolArray) -> bool:
         elsewhere = rows.steps[~stands[1:][rows.in_turn]]
-        return np.mean(elsewhere == 0) <= _OFTEN and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN
+        return bool(np.mean(elsewhere == 0) <= _OFTEN) and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN
 
     return next(_stops_and_masks(recording, reading, is_stop), None)
 

@@ -46,39 +46,15 @@ class Instants:
 class Form:
     """The formula of an effect, in the vocabulary or outside, bound to a target.
 
-    Parameters
-    ----------
-    name
-        `name` or `name:target`.
-    side
-        What it changes: "input", "parameter", "rate" (of a state) or "reading".
-    act
-        Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
-        add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.
-    first, limit
-        First amplitude tried, and the largest.
-    covariates
-        Covariates along which its residual is visible.
-    of_amplitude
-        Function of the amplitude and the values from `draw`; returns all parameters by name.
-    draw
-        Draws all parameters except the amplitude and its sign.
-    signed
-        Whether the amplitude may be negative.
-    target
-        Parameter or state on which it acts, if any.
-    order
-        Forms of side "reading" act in ascending order.
-    uses
-        Columns that it uses.
-    breaks
-        Function of the parameters that returns the time of a discontinuity.
-    late
-        Column that it delays.
-    sticks, stops
-        Whether it is dry friction, or an upper bound, of the target.
-    outside
-        Whether it is outside the vocabulary of a diagnosis.
+    It is called `name` or `name:target`, and changes a `side`: `act`, of an input, is a function of columns, rows and
+    parameters that returns columns; of a parameter, of now and parameters, that returns a term to add; of the rate of a
+    state, of states, now and parameters, that returns a term to add; of the reading, of readings, rows and parameters,
+    that returns readings. `first` and `limit` are the first amplitude tried and the largest, `covariates` those along
+    which its residual is visible. `draw` draws all parameters except the amplitude and its sign (negative ones too if
+    `signed`), and `of_amplitude` returns all by name. `target` is the parameter or state on which it acts; forms of
+    readings act in ascending `order`; `uses` are the columns that it uses; `breaks` is a function of the parameters
+    that returns the time of a discontinuity; `late` is the column that it delays. `sticks` and `stops`: it is dry
+    friction, or an upper bound, of the target; `outside`: of the vocabulary of a diagnosis.
     """
 
     name: str

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(parser, "--seed S", "with --concealed: circles, noise and robot of another seed", type=parse_seed)
     add(parser, "--size", "with --concealed: only this one of the three sizes", choices=_SIZES)
+    add(parser, "--varied", "with --concealed: over each circle a noise, a pace, a rounding and a sensor of its own")
     add(parser, "--clean N", "with --concealed: circles of the row without a concealed effect", type=circles)
     add(
         parser,
@@ -69,8 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
     out = checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
     if arguments.concealed:
         return _run_concealed(arguments, out)
-    for name in ("seed", "size", "clean"):
-        if getattr(arguments, name) is not None:
+    for name in ("seed", "size", "clean", "varied"):
+        if getattr(arguments, name) not in (None, False):
             raise ParameterError(f"--{name}", getattr(arguments, name), "only with --concealed")
     rows = _configuration_rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)

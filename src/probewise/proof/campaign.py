@@ -48,30 +48,14 @@ def run_campaign(
     noun: str = "tasks",
     misfit: Misfit = lambda result: None,
 ) -> dict[str, Result]:
-    """Run the tasks whose results are not yet in the file; return the results of all.
+    """Run the tasks whose results are not yet in the file; return the results of all by key, in the order of `tasks`.
 
-    Parameters
-    ----------
-    work
-        Function from a task to its result, a dict for JSON; defined at module level if workers are processes.
-    tasks
-        Tasks by key. Each carries its own seed, so that the order and the worker do not matter.
-    path
-        The campaign's file; created if missing, continued if present.
-    settings
-        Everything that determines the results, a dict for JSON; a file with other settings is refused.
-    executor
-        Any `concurrent.futures.Executor`, also of other machines; None runs the tasks here, one by one.
-    progress
-        Called with the number of finished tasks, earlier runs included, and the key of the last.
-    noun
-        Name of the tasks in progress messages.
-    misfit
-        Function of a result in the file: what of it cannot be, and what is allowed; None if it can.
-
-    Returns
-    -------
-    Results by key, in the order of `tasks`.
+    `work`: function from a task to its result, a dict for JSON, defined at module level if workers are processes;
+    `tasks`: by key, each with its own seed, so that order and worker do not matter; `path`: the campaign's file,
+    created or continued; `settings`: everything that determines the results, a dict for JSON: a file with others is
+    refused; `executor`: any `concurrent.futures.Executor`, also of other machines, None for here, one by one;
+    `progress`: called with `noun`, the number of finished tasks, earlier runs included, and the key of the last;
+    `misfit`: function of a result in the file: what of it cannot be, and what is allowed, or None.
 
     Raises
     ------
@@ -79,13 +63,13 @@ def run_campaign(
         If the file belongs to another campaign, is damaged before its last line, or is being written to, or if a
         result in it is a misfit.
     NotConvergedError
-        If a worker dies; finished results are kept.
+        If a worker dies.
     LinkError
-        If the executor drops its tasks, as where a scheduler is killed; finished results are kept.
+        If the executor drops its tasks, as where a scheduler is killed.
     ParameterError
         If a result is not a JSON object of finite numbers.
     Exception
-        Whatever `work` raises ends the campaign; finished results are kept, and the same call continues from there.
+        Whatever `work` raises ends the campaign. Finished results are kept, and the same call continues from there.
     """
     path = Path(path)
     wanted = json.loads(json.dumps(dict(settings)))

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, Self, TypeAlias, cast
+from typing import Any, Self, TypeAlias, cast
 
 import numpy as np
 
@@ -47,9 +47,6 @@ from probewise.sensor import Chain
 from probewise.world import Blob, Concealed, World
 from probewise.world import concealed as known
 from probewise.world import unlisted as strange
-
-Form: TypeAlias = Literal["in the list", "another form", "in no list", "two at once"]
-"""Whether the robot's rivals have an effect as it is concealed, in another form, or not; or whether there are two."""
 
 _MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)
 _MOVE_S = 0.8  # of a reading: what a move takes, about
@@ -84,31 +81,15 @@ class Conditions:
 
 
 Make: TypeAlias = Callable[[float, Conditions, np.random.Generator], Concealed | tuple[Concealed, ...]]
-
-
-@dataclass(frozen=True)
-class HiddenForm:
-    """A form of an effect to conceal.
-
-    `make`: function of the size, the conditions and a generator; `sizes`: barely detectable, clear, gross; `right`: the
-    right answers, if not its name; `in_arm_frame`: function of size and true circle that returns the circle that the
-    robot can find, where an effect is equivalent to another one; `remembers`: a reading depends on earlier ones.
-    """
-
-    make: Make
-    sizes: tuple[float, float, float]
-    form: Form = "in the list"
-    right: tuple[str, ...] = ()
-    in_arm_frame: Callable[[float, FloatArray], FloatArray] = lambda size, circle: circle
-    remembers: bool = False
+Row: TypeAlias = tuple[Make, tuple[float, float, float]]
+"""What is concealed, as a function of its size; and three sizes: barely detectable, clear, gross."""
 
 
 def _of(kind: Callable[..., Concealed], *more: float) -> Make:
-    """Return the maker of an effect whose first parameter is the size."""
     return lambda size, now, rng: kind(size, *more)
 
 
-def _four_and_ten_times(least: float) -> tuple[float, float, float]:
+def _and_tenfold(least: float) -> tuple[float, float, float]:
     return least, 4 * least, 10 * least
 
 
@@ -116,104 +97,101 @@ def _at_any_moment(now: Conditions, rng: np.random.Generator) -> float:
     return float(now.each_s * rng.uniform(1, 20))
 
 
-def _scale_of_one_axis(share: float, circle: FloatArray) -> FloatArray:
-    return circle / [1.0 + share, 1.0, 1.0]
+def _wandering_gain(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
+    return strange.ThermalGain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10)))
 
 
-_W = FIELD.width_mm
-CONCEALED: Mapping[str, HiddenForm] = {
-    "backlash": HiddenForm(_of(known.Backlash), (1.5, 6.0, 12.0)),
-    "saturation": HiddenForm(_of(known.Saturation), (55.0, 40.0, 25.0)),
-    "nonlinearity": HiddenForm(_of(known.Nonlinearity), (1.1, 1.5, 2.2)),
-    "albedo_gradient": HiddenForm(lambda a, now, rng: known.AlbedoGradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
-    "ambient_gradient": HiddenForm(lambda a, now, rng: known.AmbientGradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
-    "ambient_step": HiddenForm(lambda a, now, rng: known.AmbientStep(a, 6 * now.each_s), (2.0, 8.0, 16.0)),
-    "offset_drift": HiddenForm(lambda a, now, rng: known.OffsetDrift(a * 3600 / (30 * now.each_s)), (2.0, 8.0, 16.0)),
-    "gain_drift": HiddenForm(lambda a, now, rng: known.GainDrift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
-    "edge_blur": HiddenForm(_of(known.EdgeBlur), (3.0, 11.0, 20.0)),
-    "halo": HiddenForm(_of(known.Halo, 25.0), (0.05, 0.2, 0.4)),
-    "dropouts": HiddenForm(_of(known.Dropouts, DARK), (0.03, 0.1, 0.2)),
-    "outliers": HiddenForm(_of(known.Outliers, 12.0), (0.03, 0.1, 0.2)),
-    "gain_loss": HiddenForm(
-        lambda a, now, rng: strange.FadingLamp(a, now.each_s), (0.001, 0.005, 0.01), right=("gain_drift",)
-    ),
-    "hysteresis": HiddenForm(_of(known.Hysteresis), (1.0, 4.0, 10.0)),
-    "lag": HiddenForm(_of(known.Lag), (2.0, 4.0, 8.0), remembers=True),
-    "flicker": HiddenForm(_of(known.Flicker, 0.37, 1.0), (1.5, 4.0, 8.0)),
-    "edge_shadow": HiddenForm(_of(known.EdgeShadow, 8.0), (0.05, 0.2, 0.4)),
-    "correlated_noise": HiddenForm(_of(known.CorrelatedNoise), (0.3, 0.6, 0.9), remembers=True),
-    "signal_dependent_noise": HiddenForm(_of(known.SignalDependentNoise), (1.0, 8.0, 30.0)),
-    "quantisation": HiddenForm(_of(known.Quantisation), (2.0, 5.0, 10.0)),
-    "periodic_position_error": HiddenForm(_of(known.PeriodicPositionError, 60.0, 0.0), (1.0, 4.0, 10.0)),
-    "height_gradient": HiddenForm(lambda a, now, rng: known.HeightGradient(a / _W), (0.5, 2.0, 5.0)),
-    "albedo_patch": HiddenForm(_of(known.AlbedoPatch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
-    "glint": HiddenForm(_of(known.Glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
-    # An effect equivalent to another circle cannot be detected.
-    "sensor_tilt": HiddenForm(
-        _of(known.SensorTilt, 0.0),
-        (2.0, 6.0, 12.0),
-        right=(CLEAN,),
-        in_arm_frame=lambda mm, circle: circle - [mm, 0.0, 0.0],
-    ),
-    "position_scale": HiddenForm(
-        lambda a, now, rng: known.PositionScale(a, a),
-        (0.005, 0.02, 0.05),
-        right=(CLEAN,),
-        in_arm_frame=lambda share, circle: circle / (1.0 + share),
-    ),
-    "dark_level": HiddenForm(_of(known.AmbientStep, -math.inf), _four_and_ten_times(2.0)),
-    "gain": HiddenForm(_of(known.GainDrift, math.inf), _four_and_ten_times(0.05)),
-    "noise_sd": HiddenForm(lambda a, now, rng: known.RisingNoiseSd(1 + a, 1e-9), _four_and_ten_times(0.5)),
-    "play_of_axes": HiddenForm(lambda a, now, rng: strange.PlayOfAxes(a, a / 2), (1.5, 6.0, 12.0), right=("backlash",)),
-    "scale_of_x": HiddenForm(
-        _of(known.PositionScale, 0.0), (0.005, 0.02, 0.05), right=("position_scale",), in_arm_frame=_scale_of_one_axis
-    ),
-    "step_at_any_moment": HiddenForm(
-        lambda a, now, rng: known.AmbientStep(a, _at_any_moment(now, rng)), (2.0, 8.0, 16.0), right=("ambient_step",)
-    ),
-    "thermal_gain": HiddenForm(
-        lambda a, now, rng: strange.ThermalGain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10))),
-        _four_and_ten_times(0.02),
-        "another form",
-        ("gain_drift",),
-    ),
-    "soft_saturation": HiddenForm(_of(known.Saturation, 10.0), (55.0, 40.0, 25.0), "another form", ("saturation",)),
-    "dead_zone": HiddenForm(_of(strange.DeadZone), _four_and_ten_times(0.05), "another form", ("nonlinearity",)),
-    "ghost": HiddenForm(_of(strange.Ghost, 25.0, 0.0), (0.05, 0.2, 0.4), "another form", ("halo",)),
-    "stick_slip": HiddenForm(
-        _of(strange.StickSlip, 60.0, 0.0), (1.0, 4.0, 10.0), "another form", ("periodic_position_error",)
-    ),
-    "bent_rail": HiddenForm(
-        lambda a, now, rng: strange.QuadraticPositionError(a * (10 / _W) ** 2), _four_and_ten_times(2.0), "in no list"
-    ),
-    "place_step": HiddenForm(_of(strange.PlaceStep, _MIDDLE_MM[0]), _four_and_ten_times(1.0), "in no list"),
-    "chirp": HiddenForm(
-        lambda a, now, rng: strange.Chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0),
-        (1.5, 4.0, 8.0),
-        "another form",
-        ("flicker",),
-    ),
-    "after_glow": HiddenForm(
-        lambda a, now, rng: strange.AfterGlow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)),
-        (1.5, 4.0, 8.0),
-        "in no list",
-        remembers=True,
-    ),
-    "peak_memory": HiddenForm(_of(strange.PeakMemory), (0.05, 0.2, 0.4), "in no list", remembers=True),
-    "backlash_and_step": HiddenForm(
-        lambda a, now, rng: (known.Backlash(a), known.AmbientStep(a, _at_any_moment(now, rng))),
-        (1.5, 6.0, 12.0),
-        "two at once",
-        ("backlash", "ambient_step"),
-    ),
-    "gain_and_dark_level": HiddenForm(
-        lambda a, now, rng: (known.GainDrift(a / 100, math.inf), known.AmbientStep(a / 2, -math.inf)),
-        _four_and_ten_times(4.0),
-        "two at once",
-        ("gain", "dark_level"),
-    ),
+def _gain_and_dark_level(a: float, now: Conditions, rng: np.random.Generator) -> tuple[Concealed, ...]:
+    return known.GainDrift(a / 50, math.inf), known.AmbientStep(a, -math.inf)
+
+
+_W, _UNITS, _PLACES, _SHARES = FIELD.width_mm, (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4)
+
+CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
+    "in the list": {
+        "backlash": (_of(known.Backlash), _PLACES),
+        "saturation": (_of(known.Saturation), (55.0, 40.0, 25.0)),
+        "nonlinearity": (_of(known.Nonlinearity), (1.1, 1.5, 2.2)),
+        "albedo_gradient": (lambda a, now, rng: known.AlbedoGradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
+        "ambient_gradient": (lambda a, now, rng: known.AmbientGradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
+        "ambient_step": (lambda a, now, rng: known.AmbientStep(a, 6 * now.each_s), (2.0, 8.0, 16.0)),
+        "offset_drift": (lambda a, now, rng: known.OffsetDrift(a * 3600 / (30 * now.each_s)), (2.0, 8.0, 16.0)),
+        "gain_drift": (lambda a, now, rng: known.GainDrift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
+        "edge_blur": (_of(known.EdgeBlur), (3.0, 11.0, 20.0)),
+        "halo": (_of(known.Halo, 25.0), _SHARES),
+        "dropouts": (_of(known.Dropouts, DARK), (0.03, 0.1, 0.2)),
+        "outliers": (_of(known.Outliers, 12.0), (0.03, 0.1, 0.2)),
+        "gain_loss": (lambda a, now, rng: strange.FadingLamp(a, now.each_s), (0.001, 0.005, 0.01)),
+        "hysteresis": (_of(known.Hysteresis), _and_tenfold(1.0)),
+        "lag": (_of(known.Lag), (2.0, 4.0, 8.0)),
+        "flicker": (_of(known.Flicker, 0.37, 1.0), _UNITS),
+        "edge_shadow": (_of(known.EdgeShadow, 8.0), _SHARES),
+        "correlated_noise": (_of(known.CorrelatedNoise), (0.3, 0.6, 0.9)),
+        "signal_dependent_noise": (_of(known.SignalDependentNoise), (1.0, 8.0, 30.0)),
+        "quantisation": (_of(known.Quantisation), (2.0, 5.0, 10.0)),
+        "periodic_position_error": (_of(known.PeriodicPositionError, 60.0, 0.0), _and_tenfold(1.0)),
+        "height_gradient": (lambda a, now, rng: known.HeightGradient(a / _W), (0.5, 2.0, 5.0)),
+        "albedo_patch": (_of(known.AlbedoPatch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
+        "glint": (_of(known.Glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
+        "sensor_tilt": (_of(known.SensorTilt, 0.0), (2.0, 6.0, 12.0)),
+        "position_scale": (lambda a, now, rng: known.PositionScale(a, a), (0.005, 0.02, 0.05)),
+        "dark_level": (_of(known.AmbientStep, -math.inf), _and_tenfold(2.0)),
+        "gain": (_of(known.GainDrift, math.inf), _and_tenfold(0.05)),
+        "noise_sd": (lambda a, now, rng: known.RisingNoiseSd(1 + a, 1e-9), _and_tenfold(0.5)),
+        "play_of_axes": (lambda a, now, rng: strange.PlayOfAxes(a, a / 2), _PLACES),
+        "scale_of_x": (_of(known.PositionScale, 0.0), (0.005, 0.02, 0.05)),
+        "step_at_any_moment": (lambda a, now, rng: known.AmbientStep(a, _at_any_moment(now, rng)), (2.0, 8.0, 16.0)),
+    },
+    "another form": {
+        "thermal_gain": (_wandering_gain, _and_tenfold(0.02)),
+        "soft_saturation": (_of(known.Saturation, 10.0), (55.0, 40.0, 25.0)),
+        "dead_zone": (_of(strange.DeadZone), _and_tenfold(0.05)),
+        "ghost": (_of(strange.Ghost, 25.0, 0.0), _SHARES),
+        "stick_slip": (_of(strange.StickSlip, 60.0, 0.0), _and_tenfold(1.0)),
+        "chirp": (lambda a, now, rng: strange.Chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0), _UNITS),
+    },
+    "in no list": {
+        "bent_rail": (lambda a, now, rng: strange.QuadraticPositionError(a * (10 / _W) ** 2), _and_tenfold(2.0)),
+        "place_step": (_of(strange.PlaceStep, _MIDDLE_MM[0]), _and_tenfold(1.0)),
+        "after_glow": (lambda a, now, rng: strange.AfterGlow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)), _UNITS),
+        "peak_memory": (_of(strange.PeakMemory), _SHARES),
+    },
+    "two at once": {
+        "backlash_and_step": (
+            lambda a, now, rng: (known.Backlash(a), known.AmbientStep(a, _at_any_moment(now, rng))),
+            _PLACES,
+        ),
+        "gain_and_dark_level": (_gain_and_dark_level, _and_tenfold(2.0)),
+    },
 }
-"""What is concealed in each row, by name; the robot's rivals have the first in the form in which they are concealed."""
+"""What is concealed in each row: as a rival of the robot has it, in another form than its, or in no list of rivals."""
+
+CONCEALED: Mapping[str, Row] = {name: row for rows in CONCEALED_BY_FORM.values() for name, row in rows.items()}
+
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "": (CLEAN,),
+    **dict.fromkeys(("sensor_tilt", "position_scale"), (CLEAN,)),
+    **dict.fromkeys(("gain_loss", "thermal_gain"), ("gain_drift",)),
+    "play_of_axes": ("backlash",),
+    "scale_of_x": ("position_scale",),
+    "step_at_any_moment": ("ambient_step",),
+    "soft_saturation": ("saturation",),
+    "dead_zone": ("nonlinearity",),
+    "ghost": ("halo",),
+    "stick_slip": ("periodic_position_error",),
+    "chirp": ("flicker",),
+    "backlash_and_step": ("backlash", "ambient_step"),
+    "gain_and_dark_level": ("gain", "dark_level"),
+    **dict.fromkeys(CONCEALED_BY_FORM["in no list"], ()),
+}
+"""The right answers of a row, if not its name: an effect equivalent to another circle cannot be detected."""
+
+_IN_ARM_FRAME: Mapping[str, Callable[[float, FloatArray], FloatArray]] = {
+    "sensor_tilt": lambda mm, circle: circle - np.array([mm, 0.0, 0.0]),
+    "position_scale": lambda share, circle: circle / (1.0 + share),
+    "scale_of_x": lambda share, circle: circle / np.array([1.0 + share, 1.0, 1.0]),
+}
+_REMEMBERING = frozenset({"lag", "correlated_noise", "after_glow", "peak_memory"})  # readings depend on earlier ones
 
 
 @dataclass(frozen=True)
@@ -239,8 +217,8 @@ class ConcealedTrial:
     @property
     def true_circle_in_arm_frame(self) -> FloatArray:
         """The circle that the robot can find, (3,): the true one, but as changed by a tilt or an error of scale."""
-        hidden = CONCEALED.get(self.effect)
-        return self.circle_mm if hidden is None else hidden.in_arm_frame(hidden.sizes[self.size], self.circle_mm)
+        frame = _IN_ARM_FRAME.get(self.effect)
+        return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
 
     @property
     def conditions(self) -> Conditions:
@@ -250,10 +228,7 @@ class ConcealedTrial:
     @property
     def right_answers(self) -> tuple[str, ...]:
         """The names that a run may give: of the concealed effect or an equivalent one, or "clean"; none in no list."""
-        hidden = CONCEALED.get(self.effect)
-        if hidden is None:
-            return (CLEAN,)
-        return () if hidden.form == "in no list" else hidden.right or (self.effect,)
+        return NAMES.get(self.effect, (self.effect,))
 
     @property
     def key(self) -> str:
@@ -290,10 +265,10 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
 
 def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     """Return an arm in the world with the concealed effect; seed, circle and reading number determine its noise."""
-    now, hidden, made = trial.conditions, CONCEALED.get(trial.effect), ()
-    if hidden is not None:
-        rng = np.random.default_rng([trial.seed, trial.circle, trial.size, 2])
-        made = hidden.make(hidden.sizes[trial.size], now, rng)
+    now, made = trial.conditions, ()
+    if trial.effect:
+        make, sizes = CONCEALED[trial.effect]
+        made = make(sizes[trial.size], now, np.random.default_rng([trial.seed, trial.circle, trial.size, 2]))
     world = World(
         footprint_pixels(now.blobs),
         black=DARK,
@@ -311,7 +286,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         if came and (away := math.hypot(pose.x_mm - came[-1][0].x_mm, pose.y_mm - came[-1][0].y_mm)) > 0:
             direction = ((pose.x_mm - came[-1][0].x_mm) / away, (pose.y_mm - came[-1][0].y_mm) / away)
         came.append((pose, time_s, direction))
-        if hidden is not None and hidden.remembers:
+        if trial.effect in _REMEMBERING:
             so_far = recording_of([Reading(0.0, was, at_s) for was, at_s, _ in came], patterns={"field": disc}).plan
             return float(world.simulate(so_far, rng=np.random.default_rng([trial.seed, trial.circle])).readings[-1])
         rng = np.random.default_rng([trial.seed, trial.circle, len(came) - 1])
@@ -398,16 +373,15 @@ _COLUMNS = tuple(column.name for column in fields(ConcealedRow))
 def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
     """Summarise the runs of each row (effect, size and trust), in the order of `results`."""
     return _summaries(
-        results, lambda t: (t.effect or "nothing", CONCEALED[t.effect].sizes[t.size] if t.effect else None, t.trust)
+        results, lambda t: (t.effect or "nothing", CONCEALED[t.effect][1][t.size] if t.effect else None, t.trust)
     )
 
 
 def concealed_forms(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
     """Summarise the runs with effects of each form, at each trust, in the order of `results`."""
-    return _summaries(
-        {trial: result for trial, result in results.items() if trial.effect},
-        lambda t: (CONCEALED[t.effect].form, None, t.trust),
-    )
+    form = {name: form for form, rows in CONCEALED_BY_FORM.items() for name in rows}
+    hidden = {trial: result for trial, result in results.items() if trial.effect}
+    return _summaries(hidden, lambda t: (form[t.effect], None, t.trust))
 
 
 def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -29,19 +29,15 @@ class Population:
     shape: Circle
 
     def circles(self, n: int, *, seed: int = _SEED) -> FloatArray:
-        """Return the first `n` circles of a seed: rows (x_mm, y_mm, radius_mm), (n, 3). ParameterError if n < 1."""
-        if n < 1:
-            raise ParameterError("n", n, "1 or more")
+        """Return the first `n` circles of a seed: rows (x_mm, y_mm, radius_mm), (n, 3)."""
         return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(seed).random((n, 3))))
 
 
-POPULATIONS: Mapping[str, Population] = {
-    p.name: p
-    for p in (
-        Population("anywhere", Circle(FIELD, (20.0, 150.0))),
-        Population("inside", Circle(FIELD, (50.0, 150.0), inside=True)),
-    )
-}
+_POPULATIONS = (
+    Population("anywhere", Circle(FIELD, (20.0, 150.0))),
+    Population("inside", Circle(FIELD, (50.0, 150.0), inside=True)),
+)
+POPULATIONS: Mapping[str, Population] = {p.name: p for p in _POPULATIONS}
 
 
 def noise_of_run_in_sds(circle: int, n: int) -> FloatArray:
@@ -56,28 +52,13 @@ _IN_BATCHES = ("finishing", "information")
 class SearchConfiguration:
     """One configuration of the search.
 
-    Parameters
-    ----------
-    population
-        Distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50 to
-        150 mm, entirely in the field).
-    model
-        The robot's sensor model: "ssf" or "naive" (a point without SSF). The true sensor always has the SSF.
-    utility
-        Acquisition function by name (see `inquiry.utility_named`).
-    noise_sd
-        Sd of the simulated noise, which the robot knows, LEGO units.
-    width
-        Width of the robot's SSF over the true one; 1 if right.
-    learn_sensor
-        Whether it learns the sensor along with the shape.
-    batch
-        Readings chosen together.
-    method
-        Method of inference and choice: "particles", or "paper" with the utility "entropy" (see
-        `experiment.paper`).
-    nested_stop
-        Stopping rule of nested sampling with the method "paper": "change" or "remaining".
+    `population`: distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50
+    to 150 mm, entirely in the field); `model`: the robot's sensor model, "ssf" or "naive" (a point without SSF), while
+    the true sensor always has the SSF; `utility`: acquisition function by name (`inquiry.utility_named`); `noise_sd`:
+    sd of the simulated noise, which the robot knows, LEGO units; `width`: of the robot's SSF over the true one;
+    `learn_sensor`: whether it learns the sensor along with the shape; `batch`: readings chosen together; `method`: of
+    inference and choice, "particles", or "paper" with the utility "entropy" (`experiment.paper`); `nested_stop`: when
+    its nested sampling stops, "change" or "remaining".
     """
 
     population: str = "inside"
@@ -91,10 +72,15 @@ class SearchConfiguration:
     nested_stop: NestedStop = "change"
 
     def __post_init__(self) -> None:
-        if self.population not in POPULATIONS:
-            raise ParameterError("population", self.population, " or ".join(POPULATIONS))
-        if self.model not in ("ssf", "naive"):
-            raise ParameterError("model", self.model, "ssf or naive")
+        choices = {
+            "population": POPULATIONS,
+            "model": ("ssf", "naive"),
+            "method": get_args(MethodName),
+            "nested_stop": NESTED_STOP,
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise ParameterError(name, getattr(self, name), " or ".join(allowed))
         utility_named(self.utility)
         for name in ("noise_sd", "width"):
             if not 1e-3 <= getattr(self, name) <= 1e3:
@@ -105,16 +91,9 @@ class SearchConfiguration:
                     raise ParameterError(name, getattr(self, name), f'{plain} with the model "naive", which has no SSF')
         if self.batch > 1 and self.utility not in _IN_BATCHES:
             raise ParameterError("batch", self.batch, f"1, or more with the utility {' or '.join(_IN_BATCHES)}")
-        if self.method not in get_args(MethodName):
-            raise ParameterError("method", self.method, " or ".join(get_args(MethodName)))
-        if self.nested_stop not in NESTED_STOP:
-            raise ParameterError("nested_stop", self.nested_stop, " or ".join(NESTED_STOP))
-        if self.method == "paper" and (self.utility, self.learn_sensor, self.batch) != ("entropy", False, 1):
-            raise ParameterError(
-                "utility, learn_sensor, batch",
-                (self.utility, self.learn_sensor, self.batch),
-                '("entropy", False, 1) with the method "paper"',
-            )
+        ways = (self.utility, self.learn_sensor, self.batch)
+        if self.method == "paper" and ways != ("entropy", False, 1):
+            raise ParameterError("utility, learn_sensor, batch", ways, '("entropy", False, 1) with the method "paper"')
         if self.method != "paper" and self.nested_stop != "change":
             raise ParameterError("nested_stop", self.nested_stop, '"change", but with the method "paper"')
 
@@ -138,10 +117,6 @@ class SearchConfiguration:
         if self.batch != REFERENCE.batch:
             words.append(f"{self.batch} at once")
         return ", ".join(words)
-
-    def settings(self) -> dict[str, Any]:
-        """Return the fields by name, as JSON values."""
-        return asdict(self)
 
 
 def _exact_number_text(value: float) -> str:

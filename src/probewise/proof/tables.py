@@ -6,7 +6,7 @@ A case that failed counts in the last row alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, TypeAlias
@@ -38,8 +38,6 @@ from probewise.proof.scoring import (
     readings_to_separate_alias,
     right_names_of_each_effect,
 )
-
-__all__ = ["Decision", "ScoreRow", "score", "score_rounds", "score_systems"]
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
 
@@ -93,7 +91,17 @@ def _of_kind(results: Iterable[Result], *kinds: str) -> list[Result]:
 
 
 def _with_one_effect(results: Iterable[Result], size: float) -> list[Result]:
-    return [r for r in results if r["kind"] == "single" and r["size"] == size]
+    return [r for r in _of_kind(results, "single") if r["size"] == size]
+
+
+def _clean_with_white_and_other_noise(done: list[Result]) -> tuple[list[Result], list[Result]]:
+    clean = _of_kind(done, "clean")
+    return [r for r in clean if not r["other_noise"]], [r for r in clean if r["other_noise"]]
+
+
+def _alarms_by_noise(other: list[Result], most: float = math.inf) -> Iterator[ScoreRow]:
+    for model in sorted({r["noise_model"] for r in other}):
+        yield _share(f"  {model}", _rejected([r for r in other if r["noise_model"] == model], 0.05), most=most)
 
 
 def _first_covariate_is_right(result: Result) -> bool:
@@ -108,28 +116,27 @@ def _set_sizes(results: Iterable[Result]) -> list[float]:
     return [float(len(r["credible_set"])) for r in results]
 
 
-def _failed(results: Iterable[Result]) -> ScoreRow:
-    return _share("cases that failed", ["failed" in r for r in results])
+def _unknown(results: Iterable[Result]) -> list[bool]:
+    return [r["verdict"] == "unknown" for r in results]
+
+
+def _rows(results: Sequence[Result], *parts: Callable[[list[Result]], Iterator[ScoreRow]]) -> tuple[ScoreRow, ...]:
+    """Return the rows of these parts of a table, and that of the cases that failed."""
+    done = [r for r in results if "failed" not in r]
+    failed = _share("cases that failed", ["failed" in r for r in results])
+    return (*(row for part in parts for row in part(done)), failed)
 
 
 def score(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
     """Return the rows of a challenge of the light sensor, from results of `run_case`."""
-    done = [r for r in results if "failed" not in r]
-    return (
-        *_alarms_and_detection(done),
-        *_names(done),
-        *_probabilities(done),
-        *_places_and_intervals(done),
-        *_held_out_scans(done),
-        *_pairs_aliases_and_unlisted(done),
-        _mean("processor time of a diagnosis, paper plan (s)", _seconds(done, "paper"), most=5.0),
-        _mean("processor time of a diagnosis, two_way plan (s)", _seconds(done, "two_way")),
-        _failed(results),
-    )
+    parts = _alarms_and_detection, _names, _probabilities, _places_and_intervals, _held_out_scans
+    return _rows(results, *parts, _pairs_aliases_and_unlisted, _seconds_by_plan)
 
 
-def _seconds(done: list[Result], plan: str) -> list[float]:
-    return [r["cpu_s"] for r in done if r["plan"] == plan]
+def _seconds_by_plan(done: list[Result]) -> Iterator[ScoreRow]:
+    for plan, most in (("paper", 5.0), ("two_way", math.inf)):
+        seconds = [r["cpu_s"] for r in done if r["plan"] == plan]
+        yield _mean(f"processor time of a diagnosis, {plan} plan (s)", seconds, most=most)
 
 
 def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
@@ -143,41 +150,36 @@ def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -
     }
 
 
-def _alarms_and_detection(done: list[Result]) -> list[ScoreRow]:
-    clean = _of_kind(done, "clean")
-    white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
+def _alarms_and_detection(done: list[Result]) -> Iterator[ScoreRow]:
+    white, other = _clean_with_white_and_other_noise(done)
+    yield _share("false alarms, clean, alpha .05", _rejected(white, 0.05), 0.04, 0.06)
+    yield _share("false alarms, clean, alpha .01", _rejected(white, 0.01), 0.006, 0.015)
+    yield _share("false alarms, other noise, alpha .05", _rejected(other, 0.05), most=0.06)
+    yield from _alarms_by_noise(other, most=0.06)
+    yield _share("physics named, clean", map(names_effect_on_mean, _of_kind(done, "clean")), most=0.005)
+    more = _of_kind(done, "ssf_order")
+    yield _share("physics named, one Gaussian more", map(names_effect_on_mean, more), most=0.01)
     # The p-value does not test the noise, and one more Gaussian in the SSF imitates some effects.
     visible = [r for r in done if acts_on_mean(r) and is_distinguishable_from_ssf(r)]
+    for size, least in ((5.0, 0.8), (6.0, 0.93), (8.0, 0.995)):
+        found = _rejected(_with_one_effect(visible, size), 0.01)
+        yield _share(f"detection, alpha .01, lambda {size:g}", found, least)
     each = [detected for detected, _ in detected_and_named_by_effect(visible).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=estimated_share([]))
-    return [
-        _share("false alarms, clean, alpha .05", _rejected(white, 0.05), 0.04, 0.06),
-        _share("false alarms, clean, alpha .01", _rejected(white, 0.01), 0.006, 0.015),
-        _share("false alarms, other noise, alpha .05", _rejected(other, 0.05), most=0.06),
-        *(
-            _share(f"  {m}", _rejected([r for r in other if r["noise_model"] == m], 0.05), most=0.06)
-            for m in sorted({r["noise_model"] for r in other})
-        ),
-        _share("physics named, clean", map(names_effect_on_mean, clean), most=0.005),
-        _share("physics named, one Gaussian more", map(names_effect_on_mean, _of_kind(done, "ssf_order")), most=0.01),
-        *(
-            _share(f"detection, alpha .01, lambda {size:g}", _rejected(_with_one_effect(visible, size), 0.01), least)
-            for size, least in ((5.0, 0.8), (6.0, 0.93), (8.0, 0.995))
-        ),
-        ScoreRow("detection, lambda 8, least of all effects", worst, 0.9),
-    ]
+    yield ScoreRow("detection, lambda 8, least of all effects", worst, 0.9)
 
 
-def _names(done: list[Result]) -> list[ScoreRow]:
-    rows = []
+def _names(done: list[Result]) -> Iterator[ScoreRow]:
+    shares = []
     for size, least in ((6.0, 0.9), (8.0, 0.97), (12.0, 0.99), (20.0, 0.995)):
         singles = _with_one_effect(done, size)
-        rows.append(_share(f"right name first, lambda {size:g}", map(is_leading_name_right, singles), least))
+        yield (row := _share(f"right name first, lambda {size:g}", map(is_leading_name_right, singles), least))
         oracle = [oracle_name_rate(r["hidden"][0]) for r in singles]
-        rows.append(_mean(f"  oracle against the hardest rival, lambda {size:g}", oracle))
-    falls = [_difference_of_shares(a.found, b.found) for a, b in pairwise(rows[::2]) if a.found.n and b.found.n]
+        yield _mean(f"  oracle against the hardest rival, lambda {size:g}", oracle)
+        shares.append(row.found)
+    falls = [_difference_of_shares(a, b) for a, b in pairwise(shares) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=estimated_share([]))
-    return [*rows, ScoreRow("right name first, largest fall as lambda grows", worst, most=0.0)]
+    yield ScoreRow("right name first, largest fall as lambda grows", worst, most=0.0)
 
 
 def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
@@ -188,28 +190,26 @@ def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
     return Estimate(fall, fall - down, fall + up, before.n + after.n)
 
 
-def _probabilities(done: list[Result]) -> list[ScoreRow]:
-    rows = []
+def _probabilities(done: list[Result]) -> Iterator[ScoreRow]:
+    yield _share("95 % credible set holds the truth", [credible_set_holds_truth(r, merged=False) for r in done], 0.95)
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
         singles = _with_one_effect(done, size)
         merged = map(credible_set_size_with_aliases_merged, singles)
         oracle = [oracle_credible_set_size(r["hidden"][0]) for r in singles]
-        rows += [
-            _mean(f"size of the credible set, lambda {size:g}", _set_sizes(singles), most=most),
-            _mean(f"  the truth and its aliases as one, lambda {size:g}", merged),
-            _mean(f"  oracle, aliases as one, lambda {size:g}", oracle),
-        ]
-    holds = [credible_set_holds_truth(r, merged=False) for r in done]
-    return [
-        _share("95 % credible set holds the truth", holds, 0.95),
-        *rows,
-        ScoreRow("expected calibration error", calibration_error(done), most=0.02),
-        _share("wrong name stated above .9", map(is_confidently_wrong, done), most=0.005),
-    ]
+        yield _mean(f"size of the credible set, lambda {size:g}", _set_sizes(singles), most=most)
+        yield _mean(f"  the truth and its aliases as one, lambda {size:g}", merged)
+        yield _mean(f"  oracle, aliases as one, lambda {size:g}", oracle)
+    yield ScoreRow("expected calibration error", calibration_error(done), most=0.02)
+    yield _share("wrong name stated above .9", map(is_confidently_wrong, done), most=0.005)
 
 
-def _places_and_intervals(done: list[Result]) -> list[ScoreRow]:
+def _places_and_intervals(done: list[Result]) -> Iterator[ScoreRow]:
+    for size, least in ((12.0, 0.8), (20.0, 0.9)):
+        overlaps = [r["overlap"] for r in _with_one_effect(done, size) if r["overlap"] is not None]
+        yield _mean(f"overlap of the place, lambda {size:g}", overlaps, least)
     shown = [r for r in _with_one_effect(done, 8.0) if acts_on_mean(r)]
+    yield _share("right covariate first, lambda 8", map(_first_covariate_is_right, shown), 0.98)
+    yield _mean("  oracle against the hardest rival", [oracle_covariate_rate(r["hidden"][0]) for r in shown])
     right = [
         r
         for r in done
@@ -218,40 +218,28 @@ def _places_and_intervals(done: list[Result]) -> list[ScoreRow]:
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
     of_effects = (interval for r in right for effect in r["parameters"].values() for interval in effect.values())
     of_sensors = (interval for r in gaussian for interval in r["sensor"].values())
-    return [
-        *(
-            _mean(
-                f"overlap of the place, lambda {size:g}",
-                [r["overlap"] for r in _with_one_effect(done, size) if r["overlap"] is not None],
-                least,
-            )
-            for size, least in ((12.0, 0.8), (20.0, 0.9))
-        ),
-        _share("right covariate first, lambda 8", map(_first_covariate_is_right, shown), 0.98),
-        _mean("  oracle against the hardest rival", [oracle_covariate_rate(r["hidden"][0]) for r in shown]),
-        _share("95 % intervals of effect parameters cover", _covered(of_effects), 0.93, 0.97),
-        _share("95 % intervals of SSF and levels cover", _covered(of_sensors), 0.93),
-    ]
+    yield _share("95 % intervals of effect parameters cover", _covered(of_effects), 0.93, 0.97)
+    yield _share("95 % intervals of SSF and levels cover", _covered(of_sensors), 0.93)
 
 
-def _held_out_scans(done: list[Result]) -> list[ScoreRow]:
+def _held_out_scans(done: list[Result]) -> Iterator[ScoreRow]:
     inside = [r for r in _of_kind(done, "single", "pair") if acts_on_mean(r)]
-    white = [r for r in inside if r["noise_model"] == "white"]
-    outside = [r for r in _of_kind(done, "outside") if r["noise_model"] == "white"]
     gains = _gains_by_scan([r for r in inside if all("right" in s for s in r["held_out"].values())], "right")
-    worse = [_summed_gains(r, _SCANS, "true")[0] < -1.0 for r in done]
+    yield ScoreRow("held-out gain, share of the right model's", estimated_statistic(gains, _ratio_of_gains), 0.98)
+    for k, scan in enumerate(_SCANS):
+        yield ScoreRow(f"  a new {scan}", estimated_statistic(gains[:, k], _ratio_of_gains))
     shares = {
-        "  share of what the truth itself would gain": _gains_by_scan(white, "true"),
-        "  the same, outside the vocabulary": _gains_by_scan(outside, "true"),
+        "  share of what the truth itself would gain": inside,
+        "  the same, outside the vocabulary": _of_kind(done, "outside"),
     }
-    return [
-        ScoreRow("held-out gain, share of the right model's", estimated_statistic(gains, _ratio_of_gains), 0.98),
-        *(ScoreRow(f"  a new {s}", estimated_statistic(gains[:, k], _ratio_of_gains)) for k, s in enumerate(_SCANS)),
-        *(ScoreRow(name, estimated_statistic(of_truth, _ratio_of_gains)) for name, of_truth in shares.items()),
-        _share("held-out worse than the null by over 1 nat", worse, most=0.01),
-        # The scatter that noise alone causes in the best gain possible with these readings.
-        _share("  of the right model, fitted to the same", [bool(g < -1.0) for g in gains[:, :, 1].sum(axis=1)]),
-    ]
+    for name, cases in shares.items():
+        of_truth = _gains_by_scan([r for r in cases if r["noise_model"] == "white"], "true")
+        yield ScoreRow(name, estimated_statistic(of_truth, _ratio_of_gains))
+    worse = [_summed_gains(r, _SCANS, "true")[0] < -1.0 for r in done]
+    yield _share("held-out worse than the null by over 1 nat", worse, most=0.01)
+    # The scatter that noise alone causes in the best gain possible with these readings.
+    by_chance = [bool(g < -1.0) for g in gains[:, :, 1].sum(axis=1)]
+    yield _share("  of the right model, fitted to the same", by_chance)
 
 
 def _gains_by_scan(results: Sequence[Result], best: str) -> FloatArray:
@@ -270,75 +258,56 @@ def _ratio_of_gains(gains: FloatArray) -> float:
     return float(repaired / true)
 
 
-def _pairs_aliases_and_unlisted(done: list[Result]) -> list[ScoreRow]:
+def _pairs_aliases_and_unlisted(done: list[Result]) -> Iterator[ScoreRow]:
     pairs, aliased = _of_kind(done, "pair"), _of_kind(done, "alias")
-    outside = [r for r in done if is_out_of_vocabulary(r)]
-    inside = [r for r in done if r["kind"] != "outside"]
     # Each effect keeps most of its size when the other is in the model.
-    shown = [
-        r
-        for r in pairs
-        if all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in r["hidden"])
-    ]
-    settled = [r for r in aliased if r["settled"]]
+    shown = [r for r in pairs if all(h.get("size_beside", 0) >= _BESIDE * h["size_lambda"] for h in r["hidden"])]
+    yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.95)
+    yield _share("  where neither hides the other", map(is_leading_name_right, shown))
+    yield _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03)
+    for size, least in ((12.0, 0.9), (20.0, 0.97)):
+        outside = [r for r in done if is_out_of_vocabulary(r) and r["size"] == size]
+        name = f"outside the vocabulary: unknown, or a rare effect named right, lambda {size:g}"
+        yield _share(name, map(is_recognised_as_out_of_vocabulary, outside), least)
+    yield _share("false unknown", _unknown(r for r in done if r["kind"] != "outside"), most=0.02)
+    yield _share("aliased pair: cannot tell", [r["verdict"] == "cannot_tell" for r in aliased], 0.98)
+    yield _share("aliased pair: sure of the wrong name", map(is_confidently_wrong, aliased), most=0.01)
     right_at_last = [leading_probability_and_correctness({**r, **(r["settled"] or {})})[1] for r in aliased]
-    return [
-        _share("two effects: both named", map(is_leading_name_right, pairs), 0.95),
-        _share("  where neither hides the other", map(is_leading_name_right, shown)),
-        _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03),
-        *(
-            _share(
-                f"outside the vocabulary: unknown, or a rare effect named right, lambda {size:g}",
-                [is_recognised_as_out_of_vocabulary(r) for r in outside if r["size"] == size],
-                least,
-            )
-            for size, least in ((12.0, 0.9), (20.0, 0.97))
-        ),
-        _share("false unknown", [r["verdict"] == "unknown" for r in inside], most=0.02),
-        _share("aliased pair: cannot tell", [r["verdict"] == "cannot_tell" for r in aliased], 0.98),
-        _share("aliased pair: sure of the wrong name", map(is_confidently_wrong, aliased), most=0.01),
-        _share("right name after the advised readings", right_at_last, 0.95),
-        _mean(
-            "  readings advised, of those that repeating the plan needs",
-            [r["settled"]["readings"] / readings_to_separate_alias(r) for r in settled],
-            most=0.25,
-        ),
-    ]
+    yield _share("right name after the advised readings", right_at_last, 0.95)
+    needed = [r["settled"]["readings"] / readings_to_separate_alias(r) for r in aliased if r["settled"]]
+    yield _mean("  readings advised, of those that repeating the plan needs", needed, most=0.25)
 
 
 def score_rounds(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
     """Return the rows of a challenge in rounds: each target after the last round and the first, then costs."""
-    last = [r for r in results if "failed" not in r]
+    return _rows(results, _rounds)
+
+
+def _rounds(last: list[Result]) -> Iterator[ScoreRow]:
     first = [r | r["rounds"][0] for r in last]
-    rows = []
-    for after_last, after_first in zip(_rows_of_round(last), _rows_of_round(first), strict=True):
-        rows += [after_last, ScoreRow(f"  after one round: {after_first.name}", after_first.found)]
+    for after_last, after_first in zip(_of_round(last), _of_round(first), strict=True):
+        yield after_last
+        yield ScoreRow(f"  after one round: {after_first.name}", after_first.found)
     further = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in last], dtype=np.float64)
     extra = _bootstrapped_median(further[further > 0])
-    return (
-        *rows,
-        ScoreRow("extra readings, median of those not settled at once", extra, most=80.0),
-        _share("settled at last", [r["rounds"][-1]["settled"] for r in last]),
-        _mean("processor time of an investigation (s)", [r["cpu_s"] for r in last]),
-        _failed(results),
-    )
+    yield ScoreRow("extra readings, median of those not settled at once", extra, most=80.0)
+    yield _share("settled at last", [r["rounds"][-1]["settled"] for r in last])
+    yield _mean("processor time of an investigation (s)", [r["cpu_s"] for r in last])
 
 
-def _rows_of_round(results: list[Result]) -> list[ScoreRow]:
+def _of_round(results: list[Result]) -> Iterator[ScoreRow]:
     small, large = _with_one_effect(results, 8.0), _with_one_effect(results, 12.0)
     pairs, on_mean = _of_kind(results, "pair"), filter(acts_on_mean, small)
     holds = [credible_set_holds_truth(r, merged=False) for r in results]
-    return [
-        _share("right name first, lambda 8", map(is_leading_name_right, small), 0.985),
-        _share("right name first, lambda 12", map(is_leading_name_right, large), 0.995),
-        _mean("size of the credible set, lambda 8", _set_sizes(small), most=1.15),
-        _mean("size of the credible set, lambda 12", _set_sizes(large), most=1.05),
-        _share("95 % credible set holds the truth", holds, 0.95),
-        _share("detection, alpha .01, lambda 8", _rejected(on_mean, 0.01), 0.995),
-        _share("two effects: both named", map(is_leading_name_right, pairs), 0.96),
-        _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03),
-        _share("physics named, clean", map(names_effect_on_mean, _of_kind(results, "clean")), most=0.005),
-    ]
+    yield _share("right name first, lambda 8", map(is_leading_name_right, small), 0.985)
+    yield _share("right name first, lambda 12", map(is_leading_name_right, large), 0.995)
+    yield _mean("size of the credible set, lambda 8", _set_sizes(small), most=1.15)
+    yield _mean("size of the credible set, lambda 12", _set_sizes(large), most=1.05)
+    yield _share("95 % credible set holds the truth", holds, 0.95)
+    yield _share("detection, alpha .01, lambda 8", _rejected(on_mean, 0.01), 0.995)
+    yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.96)
+    yield _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03)
+    yield _share("physics named, clean", map(names_effect_on_mean, _of_kind(results, "clean")), most=0.005)
 
 
 def _bootstrapped_median(values: FloatArray) -> Estimate:
@@ -351,20 +320,14 @@ def _bootstrapped_median(values: FloatArray) -> Estimate:
 
 def score_systems(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
     """Return the rows of a challenge of systems, from results of `run_system_case`."""
-    done = [r for r in results if "failed" not in r]
-    return (
-        *_alarms_and_names_of_systems(done),
-        *_probabilities_and_intervals_of_systems(done),
-        *_held_out_runs(done),
-        *_unlisted_laws(done),
-        _mean("processor time of a diagnosis, closed form (s)", [r["cpu_s"] for r in done if not r["law"]], most=5.0),
-        _mean(
-            "processor time of a diagnosis, differential equations (s)",
-            [r["cpu_s"] for r in done if r["law"]],
-            most=20.0,
-        ),
-        _failed(results),
-    )
+    parts = _alarms_and_names_of_systems, _probabilities_and_intervals_of_systems, _held_out_runs
+    return _rows(results, *parts, _unlisted_laws, _seconds_by_law)
+
+
+def _seconds_by_law(done: list[Result]) -> Iterator[ScoreRow]:
+    for kind, law, most in (("closed form", False, 5.0), ("differential equations", True, 20.0)):
+        seconds = [r["cpu_s"] for r in done if r["law"] is law]
+        yield _mean(f"processor time of a diagnosis, {kind} (s)", seconds, most=most)
 
 
 def name_without_target(name: str) -> str:
@@ -372,31 +335,23 @@ def name_without_target(name: str) -> str:
     return "+".join(part.split(":")[0] for part in name.split("+"))
 
 
-def _alarms_and_names_of_systems(done: list[Result]) -> list[ScoreRow]:
-    white, other = ([r for r in _of_kind(done, "clean") if r["other_noise"] is o] for o in (False, True))
+def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
+    white, other = _clean_with_white_and_other_noise(done)
+    yield _share("false alarms, no effect, white noise, alpha .05", _rejected(white, 0.05), 0.03, 0.06)
+    yield _share("false alarms, no effect, other noise, alpha .05", _rejected(other, 0.05), most=0.06)
+    yield from _alarms_by_noise(other)
+    yield _share("physics named, no effect, white noise", map(names_effect_on_mean, white), most=0.005)
+    yield _share("physics named, no effect, other noise", map(names_effect_on_mean, other), most=0.005)
     noise_is_right = [leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]
-    rows = [
-        _share("false alarms, no effect, white noise, alpha .05", _rejected(white, 0.05), 0.03, 0.06),
-        _share("false alarms, no effect, other noise, alpha .05", _rejected(other, 0.05), most=0.06),
-        *(
-            _share(f"  {m}", _rejected([r for r in other if r["noise_model"] == m], 0.05))
-            for m in sorted({r["noise_model"] for r in other})
-        ),
-        _share("physics named, no effect, white noise", map(names_effect_on_mean, white), most=0.005),
-        _share("physics named, no effect, other noise", map(names_effect_on_mean, other), most=0.005),
-        _share("noise named right, no effect, other noise", noise_is_right),
-    ]
+    yield _share("noise named right, no effect, other noise", noise_is_right)
     for size, least in ((6.0, -math.inf), (8.0, 0.9), (12.0, 0.95), (20.0, 0.98)):
         singles = _with_one_effect(done, size)
-        rows.append(_share(f"right name and target first, lambda {size:g}", map(is_leading_name_right, singles), least))
-        oracle = [oracle_name_rate(hidden) for hidden in _effects_with_rivals(singles)]
-        rows += [_mean(f"  oracle against the hardest rival, lambda {size:g}", oracle)] if oracle else []
+        yield _share(f"right name and target first, lambda {size:g}", map(is_leading_name_right, singles), least)
+        if oracle := [oracle_name_rate(hidden) for hidden in _effects_with_rivals(singles)]:
+            yield _mean(f"  oracle against the hardest rival, lambda {size:g}", oracle)
     shown, pairs = _with_one_effect(done, 12.0), _of_kind(done, "pair")
-    return [
-        *rows,
-        _share("right covariate first, lambda 12", map(_first_covariate_is_right, shown), 0.95),
-        _share("two effects, lambda 12 each: both named", map(is_leading_name_right, pairs), 0.85),
-    ]
+    yield _share("right covariate first, lambda 12", map(_first_covariate_is_right, shown), 0.95)
+    yield _share("two effects, lambda 12 each: both named", map(is_leading_name_right, pairs), 0.85)
 
 
 def _effects_with_rivals(singles: Sequence[Result]) -> list[Result]:
@@ -404,27 +359,23 @@ def _effects_with_rivals(singles: Sequence[Result]) -> list[Result]:
     return [r["hidden"][0] for r in singles if "rival_nats" in r["hidden"][0]]
 
 
-def _probabilities_and_intervals_of_systems(done: list[Result]) -> list[ScoreRow]:
+def _probabilities_and_intervals_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
     singles = _with_one_effect(done, 12.0)
     holds, holds_in_all = ([credible_set_holds_truth(r, merged=True) for r in rs] for rs in (singles, done))
-    oracle = [oracle_credible_set_size(hidden) for hidden in _effects_with_rivals(singles)]
+    yield _share("95 % credible set holds the truth or its alias, lambda 12", holds, 0.95)
+    yield _share("  the same, all cases", holds_in_all)
+    sizes = map(credible_set_size_with_aliases_merged, singles)
+    yield _mean("size of the credible set, the truth and its aliases as one, lambda 12", sizes, most=1.4)
+    if oracle := [oracle_credible_set_size(hidden) for hidden in _effects_with_rivals(singles)]:
+        yield _mean("  oracle, so counted, lambda 12", oracle)
     wrong = [is_confidently_wrong(r) and not are_names_right(r, leading_hypothesis(r, clean=True)[0]) for r in done]
+    yield _share("wrong name stated above .9", wrong, most=0.01)
+    yield ScoreRow("expected calibration error", calibration_error(done))
     stated = [item for r in done for effect in r["parameters"].values() for item in effect.items()]
     others, per_run = ([i for name, i in stated if name.startswith("values[") is of_runs] for of_runs in (False, True))
-    return [
-        _share("95 % credible set holds the truth or its alias, lambda 12", holds, 0.95),
-        _share("  the same, all cases", holds_in_all),
-        _mean(
-            "size of the credible set, the truth and its aliases as one, lambda 12",
-            map(credible_set_size_with_aliases_merged, singles),
-            most=1.4,
-        ),
-        *([_mean("  oracle, so counted, lambda 12", oracle)] if oracle else []),
-        _share("wrong name stated above .9", wrong, most=0.01),
-        ScoreRow("expected calibration error", calibration_error(done)),
-        _share("95 % intervals of effect parameters cover", _covered(others), 0.92, 0.98),
-        *([_share("  of values per run", _covered(per_run))] if per_run else []),
-    ]
+    yield _share("95 % intervals of effect parameters cover", _covered(others), 0.92, 0.98)
+    if per_run:
+        yield _share("  of values per run", _covered(per_run))
 
 
 def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:
@@ -442,32 +393,25 @@ def _all_gains(results: Iterable[Result], best: str) -> list[tuple[float, float]
     return [g for g in (gains_on_held_out_runs(r, best) for r in results) if g is not None]
 
 
-def _held_out_runs(done: list[Result]) -> list[ScoreRow]:
+def _held_out_runs(done: list[Result]) -> Iterator[ScoreRow]:
     named = _all_gains(_of_kind(done, "single", "pair"), "right")
-    shares = np.array([[repaired / right] for repaired, right in named if right >= _LEAST_NATS]).reshape(-1, 1)
+    shares = np.array([repaired / right for repaired, right in named if right >= _LEAST_NATS])
+    found = estimated_statistic(shares, lambda values: float(np.median(values)))
+    yield ScoreRow("held-out runs: median share of the right model's gain", found, 0.95)
     every, clean = _all_gains(done, "true"), _all_gains(_of_kind(done, "clean"), "true")
-    return [
-        ScoreRow("held-out runs: median share of the right model's gain", estimated_statistic(shares, _median), 0.95),
-        _share("held-out worse than the null by over 3 nats", [bool(g < -3.0) for g, _ in every]),
-        _share("  of those without an effect on the mean", [bool(g < -3.0) for g, _ in clean]),
-    ]
+    yield _share("held-out worse than the null by over 3 nats", [bool(g < -3.0) for g, _ in every])
+    yield _share("  of those without an effect on the mean", [bool(g < -3.0) for g, _ in clean])
 
 
-def _median(values: FloatArray) -> float:
-    return float(np.median(values))
-
-
-def _unlisted_laws(done: list[Result]) -> list[ScoreRow]:
+def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:
     outside = _of_kind(done, "outside")
-    inside = [r for r in done if r["kind"] != "outside" and not is_out_of_vocabulary(r)]
     good = [_gains_as_much_as_true_law(r) for r in outside]
-    recognised = [g or r["verdict"] == "unknown" for g, r in zip(good, outside, strict=True)]
-    return [
-        _share("out of vocabulary, lambda 20: unknown, a right name, or 0.8 of the held-out gain", recognised, 0.9),
-        _share("  the same without unknown", good, 0.6),
-        _share("  a formula found", [bool(r["formula"]) for r in outside]),
-        _share("false unknown", [r["verdict"] == "unknown" for r in inside]),
-    ]
+    recognised = [g or unknown for g, unknown in zip(good, _unknown(outside), strict=True)]
+    name = "out of vocabulary, lambda 20: unknown, a right name, or 0.8 of the held-out gain"
+    yield _share(name, recognised, 0.9)
+    yield _share("  the same without unknown", good, 0.6)
+    yield _share("  a formula found", [bool(r["formula"]) for r in outside])
+    yield _share("false unknown", _unknown(r for r in done if r["kind"] != "outside" and not is_out_of_vocabulary(r)))
 
 
 def _gains_as_much_as_true_law(result: Result) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -46,39 +46,15 @@ class Instants:
 class Form:
     """The formula of an effect, in the vocabulary or outside, bound to a target.
 
-    Parameters
-    ----------
-    name
-        `name` or `name:target`.
-    side
-        What it changes: "input", "parameter", "rate" (of a state) or "reading".
-    act
-        Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
-        add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.
-    first, limit
-        First amplitude tried, and the largest.
-    covariates
-        Covariates along which its residual is visible.
-    of_amplitude
-        Function of the amplitude and the values from `draw`; returns all parameters by name.
-    draw
-        Draws all parameters except the amplitude and its sign.
-    signed
-        Whether the amplitude may be negative.
-    target
-        Parameter or state on which it acts, if any.
-    order
-        Forms of side "reading" act in ascending order.
-    uses
-        Columns that it uses.
-    breaks
-        Function of the parameters that returns the time of a discontinuity.
-    late
-        Column that it delays.
-    sticks, stops
-        Whether it is dry friction, or an upper bound, of the target.
-    outside
-        Whether it is outside the vocabulary of a diagnosis.
+    It is called `name` or `name:target`, and changes a `side`: `act`, of an input, is a function of columns, rows and
+    parameters that returns columns; of a parameter, of now and parameters, that returns a term to add; of the rate of a
+    state, of states, now and parameters, that returns a term to add; of the reading, of readings, rows and parameters,
+    that returns readings. `first` and `limit` are the first amplitude tried and the largest, `covariates` those along
+    which its residual is visible. `draw` draws all parameters except the amplitude and its sign (negative ones too if
+    `signed`), and `of_amplitude` returns all by name. `target` is the parameter or state on which it acts; forms of
+    readings act in ascending `order`; `uses` are the columns that it uses; `breaks` is a function of the parameters
+    that returns the time of a discontinuity; `late` is the column that it delays. `sticks` and `stops`: it is dry
+    friction, or an upper bound, of the target; `outside`: of the vocabulary of a diagnosis.
     """
 
     name: str
@@ -164,83 +140,63 @@ def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-@dataclass(frozen=True, eq=False)
-class Modulation:
-    """A variation in proportion to an amplitude; attributes as of `Form`.
+def modulation(value_at: Callable[[Instants, Numbers], Any], *covariates: str, reach: float = 1.0, **more: Any) -> Form:
+    """Return a variation in proportion to an amplitude, of which forms are made by `modulated`.
 
-    `value_at` is a function of instants and parameters, `reach` its typical magnitude at amplitude 1.
+    `value_at` is a function of instants and parameters, `reach` its typical magnitude at amplitude 1; `more` as of
+    `Form`.
     """
-
-    value_at: Callable[[Instants, Numbers], Any]
-    covariates: tuple[str, ...]
-    reach: float = 1.0
-    of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
-    draw: Draw = lambda rng: {}
-    uses: tuple[str, ...] = ()
-    breaks: Callable[[Numbers], float] | None = None
-    signed: bool = True
-
-    def form(
-        self, name: str, side: Side, first: float, *, limit: float, act: Callable[..., Any] | None = None, **more: Any
-    ) -> Form:
-        """Return the form that varies so, by default a term added; `limit` is in the first amplitude."""
-        return Form(
-            name,
-            side,
-            act or self.value_at,
-            first,
-            limit * first,
-            self.covariates,
-            self.of_amplitude,
-            self.draw,
-            self.signed,
-            uses=self.uses,
-            breaks=self.breaks,
-            **more,
-        )
+    return Form("", "parameter", value_at, 1 / reach, math.inf, covariates, **more)
 
 
-def linear_drift(true: TrueSystem) -> Modulation:
+def modulated(how: Form, name: str, side: Side, size: float, *, limit: float, **more: Any) -> Form:
+    """Return the form that varies so, by default a term added; `size` of its first amplitude, `limit` in that."""
+    first = size * how.first
+    return replace(how, name=name, side=side, first=first, limit=limit * first, **more)
+
+
+def linear_drift(true: TrueSystem) -> Form:
     """Return the modulation a t, t the recorded time."""
-    names = tuple(dict.fromkeys(("time", true.table.time or "time")))
-    return Modulation(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
+    names = dict.fromkeys(("time", true.table.time or "time"))
+    return modulation(lambda now, v: v["a"] * now.t, *names, reach=float(np.abs(true.table.t).max()))
 
 
-def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
+def proportional_to_column(true: TrueSystem, column: str) -> Form:
     """Return the modulation a (column - its mean over the recording)."""
     middle, sd = true.deviation(column)
-    return Modulation(lambda now, v: v["a"] * (now.u[column] - middle), (column,), sd, uses=(column,))
+    return modulation(lambda now, v: v["a"] * (now.u[column] - middle), column, reach=sd, uses=(column,))
 
 
-def step_at_change_point(true: TrueSystem) -> Modulation:
+def step_at_change_point(true: TrueSystem) -> Form:
     """Return the modulation 0, then a after a time "at_s", or after a row "at_row" if the table has no time."""
     timed = true.table.time is not None
     at = "at_s" if timed else "at_row"
-    return Modulation(
+    return modulation(
         lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at]),
-        ("time", str(true.table.time)) if timed else ("row",),
+        *(("time", str(true.table.time)) if timed else ("row",)),
         draw=lambda rng: {at: true.random_time(rng)},
         breaks=(lambda v: v[at]) if timed else None,
     )
 
 
-def value_per_run(true: TrueSystem) -> Modulation:
+def value_per_run(true: TrueSystem) -> Form:
     """Return a modulation with one normal random value per run, held-out runs included, times the amplitude."""
     names = [f"values[{k}]" for k in range(true.table.n_runs)]
-    return Modulation(
+    return modulation(
         lambda now, v: np.array([v[name] for name in names])[now.run],
-        ("run",),
+        "run",
         of_amplitude=lambda a, drawn: {name: a * drawn[name] for name in names},
         draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
     )
 
 
-def sinusoid_in_time(true: TrueSystem) -> Modulation:
+def sinusoid_in_time(true: TrueSystem) -> Form:
     """Return a sinusoid in time, its period from four rows to two thirds of the recording."""
     rows = true.table
-    return Modulation(
+    return modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
-        ("time", str(rows.time)),
+        "time",
+        str(rows.time),
         draw=lambda rng: {
             "hz": draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap),
             "phase": float(rng.uniform(0, 2 * np.pi)),
@@ -249,11 +205,11 @@ def sinusoid_in_time(true: TrueSystem) -> Modulation:
     )
 
 
-def settling(true: TrueSystem) -> Modulation:
+def settling(true: TrueSystem) -> Form:
     """Return the modulation a exp(-t / tau_s), t the time since the start of the run."""
     longest = float(true.table.time_since_start.max())
-    return Modulation(
+    return modulation(
         lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"]),
-        ("time", "run", str(true.table.time)),
+        *("time", "run", str(true.table.time)),
         draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
     )

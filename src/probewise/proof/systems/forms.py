@@ -12,12 +12,12 @@ from probewise._arrays import FloatArray
 from probewise.proof.systems.form import (
     Form,
     Instants,
-    Modulation,
     Numbers,
     Side,
     TrueSystem,
     draw_log_uniform,
     linear_drift,
+    modulated,
     proportional_to_column,
     settling,
     sinusoid_in_time,
@@ -65,16 +65,16 @@ def forms_of(true: TrueSystem) -> list[Form]:
     return out
 
 
-def modulated_reading_form(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
+def modulated_reading_form(true: TrueSystem, name: str, how: Form, *, gain: bool = False) -> Form:
     """Return the form that adds a modulation to the reading or, with `gain`, multiplies by 1 + modulation."""
 
     def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        change = how.value_at(Instants.at_rows(rows), v)
+        change = how.act(Instants.at_rows(rows), v)
         return np.asarray(y * (1 + change) if gain else y + change)
 
     typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
-    first = true.noise_sd / typical / how.reach
-    return how.form(name, "reading", first, limit=_MANY, act=act, order=GAIN if gain else OFFSET)
+    order = GAIN if gain else OFFSET
+    return modulated(how, name, "reading", true.noise_sd / typical, limit=_MANY, act=act, order=order)
 
 
 def added_form(
@@ -320,8 +320,8 @@ def _varying_parameter_forms(true: TrueSystem) -> Iterator[Form]:
             own[f"differs:{name}"] = value_per_run(true)
         own |= {f"depends:{name}:{column}": proportional_to_column(true, column) for column in true.varying_columns}
         for called, how in own.items():
-            first = 0.003 * float(np.abs(values).mean()) / how.reach
-            yield how.form(called, "parameter", first, limit=200, target=name)
+            size = 0.003 * float(np.abs(values).mean())
+            yield modulated(how, called, "parameter", size, limit=200, target=name)
 
 
 def rate_term_form(
@@ -351,14 +351,8 @@ def _forms_of_rate(true: TrueSystem, state: str) -> Iterator[Form]:
         if other != state:
             yield term(f"coupling:{state}:{other}", other, lambda r: -r, most, seen)
     waves = sinusoid_in_time(true)
-    yield waves.form(
-        f"periodic_forcing:{state}",
-        "rate",
-        0.02 * speed,
-        limit=100,
-        act=lambda s, now, v: waves.value_at(now, v),
-        target=state,
-    )
+    act, name = (lambda s, now, v: waves.act(now, v)), f"periodic_forcing:{state}"
+    yield modulated(waves, name, "rate", 0.02 * speed, limit=100, act=act, target=state)
     held: dict[str, Any] = {"covariates": (f"state:{state}", "level"), "signed": False, "target": state}
     yield Form(f"friction:{state}", "rate", lambda s, now, v: 0.0, 0.02 * speed, 2 * speed, sticks=True, **held)
     high, span = float(values.max()), float(np.ptp(values))

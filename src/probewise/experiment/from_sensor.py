@@ -15,7 +15,8 @@ from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
-from probewise.experiment.paper import NestedSampling, least_sd, student_t_likelihood
+from probewise.experiment.method import NestedSampling
+from probewise.experiment.paper import least_sd, student_t_likelihood
 from probewise.experiment.rivals import OF_MOTION, DescribedEffect, FromRest
 from probewise.experiment.setup import Experiment
 from probewise.experiment.simulated import Model, scale_of

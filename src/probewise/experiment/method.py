@@ -38,13 +38,7 @@ class Method(Protocol):
         ...
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Update the posterior with the last reading of a recording.
-
-        Raises
-        ------
-        NotConvergedError
-            If no hypothesis of any kind could have given the readings.
-        """
+        """Update the posterior with the last reading of a recording; NotConvergedError if no hypothesis allows it."""
         ...
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
@@ -65,12 +59,7 @@ class Method(Protocol):
 class SequentialMonteCarlo:
     """Sequential Monte Carlo with weighted samples; nested sampling takes over if no sample predicts a reading.
 
-    Parameters
-    ----------
-    n_particles
-        Samples of a probable kind of hypotheses.
-    n_live
-        Live points of nested sampling.
+    A probable kind of hypotheses has `n_particles` samples, nested sampling `n_live` live points.
     """
 
     n_particles: int
@@ -128,16 +117,8 @@ class SequentialMonteCarlo:
 class NestedSampling:
     """Nested sampling on all readings after each one, with diversified samples (paper, machine learning system).
 
-    Parameters
-    ----------
-    n_live
-        Live points; the paper has 300.
-    stop
-        Stopping rule of nested sampling; in the paper a change of ln Z below 1e-8.
-    n_steps
-        Metropolis-Hastings steps of each drawn sample; the paper takes about 1000.
-    move
-        Move that draws new points.
+    The paper has 300 live points, stops nested sampling at a change of ln Z below 1e-8, and moves each drawn sample by
+    about 1000 Metropolis-Hastings steps.
     """
 
     n_live: int = N_LIVE

@@ -1,9 +1,10 @@
 """The evidence of kinds of hypotheses, from the prior.
 
 Samples that are carried from reading to reading keep only the modes that they have, and their evidence accumulates
-errors. One rule sets that right: at every doubt, and before a run ends, the kinds that could matter are solved from the
-prior, whatever their samples say, those that were ruled out among them. A quick run of nested sampling finds the modes;
-importance sampling about its samples and the carried ones gives evidence and samples.
+errors. One rule sets that right: at a doubt, a few at a time, and before a run ends the kinds whose samples had
+difficulties are solved from the prior, whatever these say, those that were ruled out among them. A quick run of nested
+sampling finds the modes; importance sampling about its samples and the carried ones gives evidence and samples. A kind
+that is so far behind that perfect predictions of all readings since could not bring it back sleeps until they could.
 """
 
 from __future__ import annotations

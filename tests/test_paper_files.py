@@ -38,8 +38,6 @@ BESIDE = {
     "inquiry.grid",
     "inquiry.forecast",
     "experiment.journal",
-    "experiment.kinds",
-    "inquiry.smc",
 }
 """What the eight may import beside each other, NumPy and SciPy."""
 

@@ -22,8 +22,8 @@ from probewise.experiment.journal import (
     value_digest,
 )
 from probewise.experiment.loop import ExplorationState, begin, explore, run_from_place, shadow_run, step
-from probewise.experiment.method import Method, SequentialMonteCarlo
-from probewise.experiment.paper import NestedSampling, OneScan, find_shape, student_t_likelihood
+from probewise.experiment.method import Method, NestedSampling, SequentialMonteCarlo
+from probewise.experiment.paper import OneScan, find_shape, student_t_likelihood
 from probewise.experiment.result import (
     CLEAN,
     OFF_MM,

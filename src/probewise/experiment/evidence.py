@@ -1,9 +1,10 @@
 """The evidence of kinds of hypotheses, from the prior.
 
 Samples that are carried from reading to reading keep only the modes that they have, and their evidence accumulates
-errors. One rule sets that right: at every doubt, and before a run ends, the kinds that could matter are solved from the
-prior, whatever their samples say, those that were ruled out among them. A quick run of nested sampling finds the modes;
-importance sampling about its samples and the carried ones gives evidence and samples.
+errors. One rule sets that right: at a doubt, a few at a time, and before a run ends the kinds whose samples had
+difficulties are solved from the prior, whatever these say, those that were ruled out among them. A quick run of nested
+sampling finds the modes; importance sampling about its samples and the carried ones gives evidence and samples. A kind
+that is so far behind that perfect predictions of all readings since could not bring it back sleeps until they could.
 """
 
 from __future__ import annotations
@@ -75,12 +76,16 @@ def with_evidence_from_prior(
         likely, old = np.lexsort((-raised, ~unsure)), np.lexsort((-raised, searched_at, ~unsure))
         due = np.unique(np.concatenate([likely[:_EACH], old[:_EACH]]))
         due = due[unsure[due]]
-    particles = list(now.particles)
+    particles, leader = list(now.particles), now.most_probable_kind_index
+    leading = now.particles[leader].weighted
     for k in due.tolist():
         own, kind, problem = particles[k], now.kinds[k], problems[k]
         n = max(len(own.ancestor), n_samples_of_kind(kind, float(raised[k]), n_particles))
         carried = own.with_zero_evidence() if own.asleep else own
-        found = posterior_from_prior(carried.weighted, problem, n, n_live, rng)
+        shapes = None
+        if kind.effect is None and kind.shape == now.kinds[leader].shape and k != leader:
+            shapes = leading.samples(n // 2, rng=rng)[:, : len(kind.prior.names)]
+        found = posterior_from_prior(carried.weighted, problem, n, n_live, rng, others=shapes)
         keep = not own.is_doubtful and not now.doubts_sensor and not (found and _has_lost_mode(own.weighted, found))
         if found is None:
             none = own.with_zero_evidence()
@@ -94,12 +99,19 @@ def with_evidence_from_prior(
 
 
 def posterior_from_prior(
-    own: Weighted, problem: KindProblem, n: int, n_live: int, rng: np.random.Generator
+    own: Weighted,
+    problem: KindProblem,
+    n: int,
+    n_live: int,
+    rng: np.random.Generator,
+    *,
+    others: FloatArray | None = None,
 ) -> Weighted | None:
     """Return samples and evidence of a problem by a search of the prior; None if nothing could give the readings.
 
-    `own` are samples that were carried, for modes that the search may miss. Where importance sampling has few effective
-    draws (modes too many or too bent), the better of search and carried samples counts as it is.
+    `own` are samples that were carried, `others` those of the leading kind, for modes that the search may miss, as it
+    does where noise excuses any reading. Where importance sampling has few effective draws (modes too many or too
+    bent), the better of search and carried samples counts as it is.
     """
     try:
         with warnings.catch_warnings():
@@ -114,6 +126,8 @@ def posterior_from_prior(
     if own.log_z > result.log_z - _BEHIND:
         best = max(best, own, key=lambda found: found.log_z)
         points = np.concatenate([points, own.samples(n // 2, rng=rng)])
+    if others is not None:
+        points = np.concatenate([points, others])
     for _ in range(_ROUNDS):
         drawn = sampled_about_points(points, problem, 2 * n, rng)
         if drawn is None:

@@ -15,7 +15,8 @@ from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
-from probewise.experiment.paper import NestedSampling, least_sd, student_t_likelihood
+from probewise.experiment.method import NestedSampling
+from probewise.experiment.paper import least_sd, student_t_likelihood
 from probewise.experiment.rivals import OF_MOTION, DescribedEffect, FromRest
 from probewise.experiment.setup import Experiment
 from probewise.experiment.simulated import Model, scale_of
@@ -317,12 +318,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
     """Estimate the naive model's levels and sds from a recording's readings over black and over white.
 
     Readings count if at most a thousandth of the footprint is on the other colour: over uniform sheets, and at the far
-    ends of scans across an edge.
-
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two readings over either colour.
+    ends of scans across an edge. ParameterError if there are fewer than two over either colour.
     """
     require_recording(recording)
     require_fitted_sensor(sensor)

@@ -275,8 +275,12 @@ def _yield_steps(
     doubt = _doubt_about_height(experiment, getattr(instrument, "read_height_mm", None))
     if doubt is not None:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
-    new = contextlib.nullcontext() if path is None else JournalWriter.begin(path, settings)
-    with new if before is None else JournalWriter.resume(before) as writer:
+    opened: contextlib.AbstractContextManager[JournalWriter | None] = contextlib.nullcontext()
+    if before is not None:
+        opened = JournalWriter.resume(before)
+    elif path is not None:
+        opened = JournalWriter.begin(path, settings)
+    with opened as writer:
         stopped = False
         while not stopped:
             number = len(state.readings) + 1

@@ -1,8 +1,9 @@
-"""Methods of sequential inference: one Protocol, and sequential Monte Carlo, the default."""
+"""Methods of sequential inference: one Protocol; sequential Monte Carlo, the default; and the paper's."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
 
@@ -11,10 +12,20 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import can_sleep_mask, with_evidence_from_prior
-from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, Posterior, n_samples_of_kind
+from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, HypothesisKind, Posterior, n_samples_of_kind
+from probewise.experiment.paper import N_LIVE, N_STEPS
 from probewise.experiment.rivals import Pace
-from probewise.inquiry.smc import BRIEF, STEADY, THOROUGH, nested_sampling_from_scratch, resample_and_move, update
-from probewise.nested import Weighted
+from probewise.inquiry.smc import (
+    BRIEF,
+    STEADY,
+    THOROUGH,
+    Particles,
+    nested_sampling_from_scratch,
+    resample_and_move,
+    update,
+)
+from probewise.nested import EvidenceChange, KernelMove, Move, StopRule, Weighted, diversify, run
+from probewise.nested.weights import resampled_rows
 from probewise.recordings.plan import Recording
 
 
@@ -27,13 +38,7 @@ class Method(Protocol):
         ...
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Update the posterior with the last reading of a recording.
-
-        Raises
-        ------
-        NotConvergedError
-            If no hypothesis of any kind could have given the readings.
-        """
+        """Update the posterior with the last reading of a recording; NotConvergedError if no hypothesis allows it."""
         ...
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
@@ -54,12 +59,7 @@ class Method(Protocol):
 class SequentialMonteCarlo:
     """Sequential Monte Carlo with weighted samples; nested sampling takes over if no sample predicts a reading.
 
-    Parameters
-    ----------
-    n_particles
-        Samples of a probable kind of hypotheses.
-    n_live
-        Live points of nested sampling.
+    A probable kind of hypotheses has `n_particles` samples, nested sampling `n_live` live points.
     """
 
     n_particles: int
@@ -111,3 +111,72 @@ class SequentialMonteCarlo:
     ) -> FloatArray:
         """Resample `n` hypotheses from the joined posterior, (n, n_params)."""
         return joined.samples(n, rng=rng)
+
+
+@dataclass(frozen=True)
+class NestedSampling:
+    """Nested sampling on all readings after each one, with diversified samples (paper, machine learning system).
+
+    The paper has 300 live points, stops nested sampling at a change of ln Z below 1e-8, and moves each drawn sample by
+    about 1000 Metropolis-Hastings steps.
+    """
+
+    n_live: int = N_LIVE
+    stop: StopRule = field(default_factory=EvidenceChange)
+    n_steps: int = N_STEPS
+    move: Move = field(default_factory=KernelMove)
+
+    @property
+    def label(self) -> str:
+        """Short name for reports."""
+        return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
+
+    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """Infer from all readings by a new nested sampling run for each kind of hypotheses."""
+        found = tuple(
+            self._nested_samples(had, kind, recording, rng)
+            for kind, had in zip(previous.kinds, previous.particles, strict=True)
+        )
+        now = replace(previous, particles=found)
+        if not np.isfinite(now.log_odds).any():
+            raise NotConvergedError("no hypothesis of any kind could have given these readings")
+        return now
+
+    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """Return the posterior as it is: nested sampling starts again at every reading, so no samples lose a mode."""
+        return posterior
+
+    def drawn(
+        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw `n` hypotheses, (n, n_params), each moved by `n_steps` steps, since a run's samples may be copies."""
+        which = resampled_rows(posterior.probability, n, rng)
+        drawn = []
+        for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
+            if n_own := int((which == k).sum()):
+                start = particles.weighted.samples(n_own, rng=rng)
+                moved, _ = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
+                drawn.append(kind.to_whole_theta(moved, rng))
+        return np.concatenate(drawn)
+
+    def _nested_samples(
+        self, had: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
+    ) -> Particles:
+        """Sample one kind by nested sampling; its evidence is zero if none of its hypotheses is possible."""
+        try:
+            result = run(
+                kind.problem(recording),
+                rng=rng,
+                n_live=self.n_live,
+                stop=self.stop,
+                move=self.move,
+                max_cost=1.0,  # the robot waits
+                return_interrupted=False,
+            )
+        except NotConvergedError:  # no hypothesis of this kind could have given the readings
+            return had.with_zero_evidence()
+        names = ("names", "theta", "log_likelihood", "log_weight", "log_z", "log_z_error", "n_eff")
+        same = {name: getattr(result, name) for name in names}
+        n_calls = had.weighted.n_calls + result.n_calls
+        found = Weighted(**same, n_calls=n_calls, pareto_k=-math.inf, run=result)
+        return Particles(found, np.arange(len(found.theta)))

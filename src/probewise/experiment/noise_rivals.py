@@ -33,6 +33,7 @@ _PHASES = 7
 _PER_PHASE = 0.16  # of the amplitude: width of each phase's component, about the spacing of neighbouring phases
 _COARSE = 0.3  # noise sds from which rounding of the readings matters
 _STEPS = (1.0, 2.0, 4.0, 8.0)  # noise sds: possible steps of a lattice of which one value has been seen
+_SMOOTH = 4.0  # steps: of wider noise, the density in a cell is that at its middle, to .1 nats at 25 sds
 _LEAST = -1e300  # log of a probability of zero, for differences
 _FREE = 2  # readings that determine the lattice
 
@@ -80,9 +81,9 @@ class DeclaredNoise:
         sd, step = self.sd if sd is None else sd, self.step if step is None else step
         if step == 0:
             within = log_gaussian_density(readings, predicted, sd)
-        elif np.min(sd) < step:
+        elif np.min(sd) < _SMOOTH * step:
             within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
-        else:  # the density at the cell's middle, of the noise and a uniform cell: within 1 % at three sds
+        else:  # the density at the cell's middle, of the noise and a uniform cell
             within = log_gaussian_density(readings, predicted, np.hypot(sd, step / math.sqrt(12.0))) + math.log(step)
         return self._with_probability_at_ends(readings, predicted, sd, within)
 
@@ -141,12 +142,18 @@ def _outliers(
     noise: DeclaredNoise, shares_and_sizes: FloatArray, readings: FloatArray, predicted: FloatArray
 ) -> FloatArray:
     """Outliers; a node is their share and their size, sds over the noise's sd, (n_nodes, 2)."""
-    narrow = noise.log_density(readings, predicted)
-    nodes = []
-    for share, size in shares_and_sizes:
+    narrow, nodes = noise.log_density(readings, predicted), []
+    for size in np.unique(shares_and_sizes[:, 1]):
         wide = noise.log_density(readings, predicted, sd=noise.sd * size)
-        nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
+        nodes += _log_mixtures(narrow, wide, shares_and_sizes[shares_and_sizes[:, 1] == size, 0])
     return _log_mean_over_nodes(nodes)
+
+
+def _log_mixtures(usual: FloatArray, rare: FloatArray, shares: FloatArray) -> list[FloatArray]:
+    """Return log likelihoods, (n_samples,), for each share of rare readings, from log densities of both kinds."""
+    most = np.maximum(np.maximum(usual, rare), _LEAST)
+    usual, rare, whole = np.exp(usual - most), np.exp(rare - most), most.sum(axis=1)
+    return [whole + np.log((1.0 - share) * usual + share * rare).sum(axis=1) for share in shares.tolist()]
 
 
 def _lost_readings(
@@ -164,9 +171,7 @@ def _lost_readings(
     low, high = min(min(levels) - _REACH * noise.sd, 0.0), max(levels) + _REACH * noise.sd
     anywhere = noise.log_uniform_density(readings, low, high)
     lost = logsumexp(np.broadcast_arrays(exactly, to_black, anywhere), axis=0) - math.log(3.0)
-    return _log_mean_over_nodes(
-        [np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()]
-    )
+    return _log_mean_over_nodes(_log_mixtures(kept, lost, _SHARES))
 
 
 def _correlated(noise: DeclaredNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:

@@ -1,30 +1,27 @@
 """The paper's robot: a nested sampling run after every reading, fifty samples, entropy of their predictions.
 
-Paper, "The Machine Learning System". `find_shape` is its loop; `NestedSampling` is its inference, as one method of
-`explore`. Ambiguities and errors of the paper are resolved as in the rest of the package (docs/explanation/errata.md):
-the Student-t's sigma has proper bounds, the SSF is the mean of the sampled fields in closed form.
+Paper, "The Machine Learning System". `find_shape` is its loop; its inference, as one method of `explore`, is
+`method.NestedSampling`. Ambiguities and errors of the paper are resolved as in the rest of the package
+(docs/explanation/errata.md): the Student-t's sigma has proper bounds, the SSF is the mean of the sampled fields in
+closed form.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Instrument, Pose, Reading
-from probewise.errors import NotConvergedError, ParameterError
+from probewise.errors import ParameterError
 from probewise.experiment.journal import PATTERN, recording_of
-from probewise.experiment.kinds import HypothesisKind, Posterior
 from probewise.inference.likelihoods import StudentT
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import Grid, choose, entropy_map
-from probewise.inquiry.smc import Particles
-from probewise.nested import EvidenceChange, KernelMove, Move, NestedResult, StopRule, Weighted, diversify, run
-from probewise.nested.weights import resampled_rows
-from probewise.recordings import Recording
+from probewise.nested import EvidenceChange, KernelMove, NestedResult, diversify, run
 from probewise.scene import Shape
 from probewise.sensor import FixedLevels
 from probewise.sensor.stages import SensorModel
@@ -121,80 +118,3 @@ def student_t_likelihood(levels: FixedLevels, step: float | None) -> OneScan:
 def least_sd(span: float, step: float | None) -> float:
     """Return the least plausible sd: that of rounding to `step` or a thousandth of `span`, whichever is larger."""
     return max((step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span)
-
-
-@dataclass(frozen=True)
-class NestedSampling:
-    """Nested sampling on all readings after each one, with diversified samples (paper, machine learning system).
-
-    Parameters
-    ----------
-    n_live
-        Live points; the paper has 300.
-    stop
-        Stopping rule of nested sampling; in the paper a change of ln Z below 1e-8.
-    n_steps
-        Metropolis-Hastings steps of each drawn sample; the paper takes about 1000.
-    move
-        Move that draws new points.
-    """
-
-    n_live: int = N_LIVE
-    stop: StopRule = field(default_factory=EvidenceChange)
-    n_steps: int = N_STEPS
-    move: Move = field(default_factory=KernelMove)
-
-    @property
-    def label(self) -> str:
-        """Short name for reports."""
-        return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
-
-    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Infer from all readings by a new nested sampling run for each kind of hypotheses."""
-        found = tuple(
-            self._nested_samples(had, kind, recording, rng)
-            for kind, had in zip(previous.kinds, previous.particles, strict=True)
-        )
-        now = replace(previous, particles=found)
-        if not np.isfinite(now.log_odds).any():
-            raise NotConvergedError("no hypothesis of any kind could have given these readings")
-        return now
-
-    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Return the posterior as it is: nested sampling starts again at every reading, so no samples lose a mode."""
-        return posterior
-
-    def drawn(
-        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
-    ) -> FloatArray:
-        """Draw `n` hypotheses, (n, n_params), each moved by `n_steps` steps, since a run's samples may be copies."""
-        which = resampled_rows(posterior.probability, n, rng)
-        drawn = []
-        for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
-            if n_own := int((which == k).sum()):
-                start = particles.weighted.samples(n_own, rng=rng)
-                moved, _ = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
-                drawn.append(kind.to_whole_theta(moved, rng))
-        return np.concatenate(drawn)
-
-    def _nested_samples(
-        self, had: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
-    ) -> Particles:
-        """Sample one kind by nested sampling; its evidence is zero if none of its hypotheses is possible."""
-        try:
-            result = run(
-                kind.problem(recording),
-                rng=rng,
-                n_live=self.n_live,
-                stop=self.stop,
-                move=self.move,
-                max_cost=1.0,  # the robot waits
-                return_interrupted=False,
-            )
-        except NotConvergedError:  # no hypothesis of this kind could have given the readings
-            return had.with_zero_evidence()
-        names = ("names", "theta", "log_likelihood", "log_weight", "log_z", "log_z_error", "n_eff")
-        same = {name: getattr(result, name) for name in names}
-        n_calls = had.weighted.n_calls + result.n_calls
-        found = Weighted(**same, n_calls=n_calls, pareto_k=-math.inf, run=result)
-        return Particles(found, np.arange(len(found.theta)))

@@ -70,13 +70,7 @@ def geometry_entry(geometry: Geometry | None) -> dict[str, str]:
 
 
 def as_shape(shape: str | Sequence[str] | Shape, field: Field) -> Shape:
-    """Return a shape, or build it from its name, or the set of possible shapes from several names.
-
-    Raises
-    ------
-    ParameterError
-        If `shape` is neither a shape nor a name in `SHAPES`, or several.
-    """
+    """Return a shape, or build it from its name, or the set of possible shapes from several names of `SHAPES`."""
     if not isinstance(shape, Sequence) or not shape:
         require_shape(shape)
         return cast(Shape, shape)
@@ -170,10 +164,7 @@ class HiddenShape:
     def from_parameters(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> HiddenShape:
         """Build from parameters, (n_params,); `called` is the name of these in messages.
 
-        Raises
-        ------
-        ParameterError
-            If the number of parameters is wrong, or the shape's prior excludes one, given the others.
+        ParameterError if the number of parameters is wrong, or the shape's prior excludes one, given the others.
         """
         prior = shape.prior
         values = floats(theta, called)
@@ -207,12 +198,8 @@ class HiddenShape:
     ) -> HiddenShape:
         """Build from parameters, of a possible shape or as {shape: parameters}; None: draw shape and parameters.
 
-        Parameters without the name of a shape are those of the first of a set of possible shapes.
-
-        Raises
-        ------
-        ParameterError
-            If the shape's name is unknown, or its prior excludes the numbers.
+        Parameters without the name of a shape are those of the first of a set of possible shapes. ParameterError if the
+        shape's name is unknown, or its prior excludes the numbers.
         """
         members = dict(shape.shapes) if isinstance(shape, AnyOf) else {type(shape).__name__.lower(): shape}
         if truth is None:

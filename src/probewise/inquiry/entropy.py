@@ -74,27 +74,11 @@ def entropy_map(
 ) -> UtilityMap:
     """Compute the entropy of the predicted reading at every reachable place (paper, figures 2 and 8).
 
-    Parameters
-    ----------
-    model
-        The sensor over the hypothesised scene.
-    theta
-        Equally weighted hypotheses drawn from the posterior, (n_samples, n_params); the paper has 50.
-    grid, plan
-        The places, and the same places as rows of a plan (see `Grid.plan`).
-    reachable
-        Mask of reachable places, shape (n_places,).
-    bin_width
-        Width of the bins, in the unit of readings: one LEGO unit rounds as the sensor does. For the naive model there
-        are two readings, so the map is the paper's partition: at most one bit, where half of the circles contain the
-        place.
-
-    Raises
-    ------
-    ReachError
-        If no place is reachable.
-    ParameterError
-        If a prediction is not finite.
+    `theta` are equally weighted hypotheses drawn from the posterior, (n_samples, n_params), 50 in the paper; `plan` has
+    the places of the grid as rows (see `Grid.plan`), `reachable` marks them, (n_places,). Bins are `bin_width` wide, in
+    the unit of readings: one LEGO unit rounds as the sensor does. For the naive model there are two readings, so the
+    map is the paper's partition: at most one bit, where half of the circles contain the place. ReachError if no place
+    is reachable, ParameterError if a prediction is not finite.
     """
     rows = reachable_rows(reachable, grid.n_places)
     predicted = predict_where_visible(model, theta, plan.take(rows))
@@ -152,14 +136,8 @@ def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1)
 def best_places_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
     """Mark the reachable places within `TIE` (1e-9) of the highest reachable utility; a mask, all arrays (n_places,).
 
-    Raises
-    ------
-    ReachError
-        If no place is reachable.
-    ShapeError
-        If the arrays differ in shape.
-    ParameterError
-        If the utility of a reachable place is not finite.
+    ReachError if no place is reachable, ShapeError if the arrays differ in shape, ParameterError if the utility of a
+    reachable place is not finite.
     """
     if utility.shape != reachable.shape or utility.ndim != 1:
         raise ShapeError(f"utility has shape {utility.shape}, reachable {reachable.shape}; allowed: (n_places,) both")

@@ -60,18 +60,9 @@ class Forecast(Protocol):
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """Return the predictive distribution at designs.
+        """Return the predictive distribution at the designs `rows`, (n,), of which `plan` holds all as rows.
 
-        Parameters
-        ----------
-        theta, weight
-            Hypotheses, (n_samples, n_params), and their weights, (n_samples,), used if only some can be predicted.
-        designs, plan
-            The designs, and the same as rows of a plan.
-        rows
-            Indices of the designs to predict, (n,).
-        noise_sd
-            Sd of a reading's noise, which sets the spacing of levels.
+        `weight`, (n_samples,), serves if only some hypotheses can be predicted; `noise_sd` sets the spacing of levels.
         """
         ...
 

@@ -134,19 +134,10 @@ def entropy_bits(probability: FloatArray) -> FloatArray:
 def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, prior_entropy_bits: float) -> float:
     """Convert nested sampling's information to prior minus posterior differential entropy.
 
-    With p the prior and P the posterior, h(P) = -H - E_P[ln p], so h(p) - h(P) = H + E_P[ln p] + h(p).
-    For a uniform prior the last two cancel and the bits are H / ln 2.
-
-    Parameters
-    ----------
-    information
-        H, relative entropy of posterior to prior, nats.
-    log_prior
-        Natural log of the prior density of posterior samples, shape (n_samples,).
-    weight
-        Their weights, shape (n_samples,), summing to one.
-    prior_entropy_bits
-        h(p) in bits, see `prior_entropy`.
+    With p the prior and P the posterior, h(P) = -H - E_P[ln p], so h(p) - h(P) = H + E_P[ln p] + h(p). For a uniform
+    prior the last two cancel and the bits are H / ln 2. `information` is H, the relative entropy of posterior to prior,
+    nats; `log_prior` the natural log of the prior density of posterior samples, and `weight` their weights, summing to
+    one, (n_samples,) each.
     """
     return (information + float(weight @ log_prior)) / math.log(2) + prior_entropy_bits
 
@@ -196,16 +187,10 @@ def fewest_readings(
 ) -> Bound:
     """Bound the mean number of readings of any strategy.
 
-    Parameters
-    ----------
-    prior_bits, met_bits, target_bits
-        Differential entropy of the parameters: under the prior, at the first reading on the shape (on average), and at
-        the target (`target_entropy`), in descending order; else ParameterError.
-    most_covered
-        Probability that the best first place lies on the shape, above 0 and below 1, else ParameterError. A search
-        reading answers yes or no, with at most this probability of yes as long as no better place arises.
-    capacity
-        Capacity of the sensor, bits per reading (`capacity_bits`).
+    `prior_bits`, `met_bits` and `target_bits` are differential entropies of the parameters: under the prior, at the
+    first reading on the shape (on average), and at the target (`target_entropy`), in descending order. `most_covered`
+    is the probability, above 0 and below 1, that the best first place lies on the shape: a search reading answers yes
+    or no, with at most this probability of yes as long as no better place arises. ParameterError for other numbers.
     """
     if not 0 < most_covered < 1:
         raise ParameterError("most_covered", most_covered, "greater than 0, less than 1")

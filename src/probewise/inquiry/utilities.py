@@ -452,17 +452,8 @@ def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
     of the information; "about:PARAMETER": `InformationAbout` that parameter; "which-shape": `InformationAbout` the
     shape.
 
-    Parameters
-    ----------
-    text
-        The name.
-    bin_width
-        Width of the bins of "entropy", in the unit of readings: the step of the instrument.
-
-    Raises
-    ------
-    ParameterError
-        If no utility has the name, or `bin_width` is not above 0.
+    `bin_width` is the width of the bins of "entropy", in the unit of readings: the step of the instrument.
+    ParameterError if no utility has the name, or `bin_width` is not above 0.
     """
     name, _, parameter = text.partition(":")
     if name == "about" and parameter:
@@ -482,14 +473,8 @@ def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
 def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
     """Compute the utility of every available design (paper, the machine learning system).
 
-    Raises
-    ------
-    ShapeError
-        If the utility returns a wrong number of values.
-    ParameterError
-        If one of its values is not finite.
-    ReachError
-        If no design is available.
+    ShapeError if the utility returns a wrong number of values, ParameterError if one of them is not finite, ReachError
+    if no design is available.
     """
     if isinstance(utility, Finishing):  # the utility with two measures reports which one these values are
         values, label = utility.utility_and_label(utility_input)
@@ -508,21 +493,8 @@ def choose_several(
     information is averaged over simulated outcomes: each is a draw from the predictive distribution, with its own
     posterior.
 
-    Parameters
-    ----------
-    utility_input
-        Posterior, designs and sensor.
-    n
-        Number of readings, 1 or more; else ParameterError.
-    rng
-        Source of randomness.
-    chance
-        Probability that a reading at each of `utility_input.rows` returns a value, (n,), by which its information
-        counts; None: all do.
-
-    Returns
-    -------
-    Indices of designs, from `utility_input.rows`, in the order in which they were chosen; two may be the same.
+    Return indices of designs, from `utility_input.rows`, in the order in which they were chosen; two may be the same.
+    `chance` is the probability that a reading at each of these returns a value, (n,), by which its information counts.
     """
     if n < 1:
         raise ParameterError("n", n, "1 or more")

@@ -239,11 +239,12 @@ def test_the_papers_robot_goes_on_bit_for_bit_from_its_journal(explore, tmp_path
     assert whole[0]["likelihood"].startswith("Naive(mu_black=")
 
 
-def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, capsys):
+def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     given = ["explore", "--out", str(out), "--trust", "1", "--quiet", "--max-readings"]
     assert main([*given, "2"]) == 0
     assert json.loads((out / "journal.jsonl").read_text().splitlines()[0])["sensor_file"] == "shipped_sensor.json"
+    monkeypatch.setattr("probewise.cli._explore.calibrate", lambda *_, **__: pytest.fail("calibrated again"))
     assert main([*given, "3", "--resume"]) == 0
     assert json.loads((out / "result.json").read_text())["readings"] == 3
     assert main(["explore", "--out", str(tmp_path / "other"), "--arm", "nxt:none"]) == 2

@@ -13,7 +13,7 @@ from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._bench import warn_if_place_sd_large
 from probewise.cli._fit_geometry import bring_to_mark, place_after_moves
-from probewise.cli._record import PersonAtBench, SheetCheck, uniform_shades_at_places
+from probewise.cli._record import SheetCheck, person_at_bench, uniform_shades_at_places
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}
@@ -171,7 +171,7 @@ def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet
     monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))
     plan = paper_plan()
     with arm:
-        hands = PersonAtBench(
+        hands = person_at_bench(
             arm, plan, (524.0, 260.0), SheetCheck(plan, white_is_bright=True), check_sheets=True, emulated=True
         )
         hands(RequestToPerson("lay sheet 'quadrant_c'", pattern="quadrant_c"))

@@ -1,5 +1,6 @@
 """Results are written whole or not at all, and nothing that was read is lost for them."""
 
+import contextlib
 import itertools
 import os
 import signal
@@ -200,6 +201,19 @@ def test_a_file_that_cannot_be_replaced_is_put_in_place_by_the_next_command(tmp_
     with staged_output(tmp_path):
         pass
     assert contents(tmp_path) == dict.fromkeys("abc", "new")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+def test_a_full_standard_output_is_told_with_what_it_was_to_print(
+    sensor_file, recording_file, tmp_path, monkeypatch, capsys
+):
+    with open("/dev/full", "w") as full, contextlib.suppress(OSError):
+        monkeypatch.setattr("sys.stdout", full)
+        out = tmp_path / "p.csv"
+        assert main(["predict", str(sensor_file), str(recording_file), "--out", str(out)]) == 2
+        said = capsys.readouterr().err
+        assert "standard output takes no more (No space left on device); it was to print '" in said
+        assert said.endswith(f"what was written is kept: {out}\n")
 
 
 def test_a_signal_while_files_are_put_in_place_is_heard_when_all_are(tmp_path, monkeypatch):

@@ -9,10 +9,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import hand_made_sensor
 from PIL import Image
 
 from probewise.arm import SimulatedArm
-from probewise.calibration import FittedSensor, OrderEvidence, predict
+from probewise.calibration import predict
 from probewise.experiment import (
     Experiment,
     Exploration,
@@ -28,7 +29,7 @@ from probewise.report import calibration as calibration_report
 from probewise.report import exploration
 from probewise.report.pictures import animated_gif
 from probewise.scene import Circle, HypothesisScene, Rectangle, outlines
-from probewise.sensor import Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
+from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
 
 TRUTH = np.array([[600.0, 260.0, 120.0]])
@@ -156,23 +157,6 @@ def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run
         off |= np.abs(values - mean) > 12.0
     assert document["chance_off_12mm"] == pytest.approx(weight[off].sum(), abs=1e-3)
     assert probability_of_length_off(run.experiment, run.posterior, 1e6) == 0.0
-
-
-def hand_made_sensor():
-    """One sample far off, as the posterior of a long scan along one line may have."""
-    rng = np.random.default_rng(0)
-    samples = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0]) + 1e-3 * rng.standard_normal((500, 8))
-    samples[0, 3:6] = 0.5, 0.9, 0.65
-    axis = np.arange(-20.0, 20.5)
-    return FittedSensor(
-        names=("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max"),
-        samples=samples,
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.6),
-        field=mean_ssf_field(footprint_of(samples[1:2, :6], 1), u_mm=axis, v_mm=axis),
-        instrumentation=Instrumentation(),
-        orders=(OrderEvidence(1, -389.8199, 0.0234), OrderEvidence(2, -394.28, 0.53)),
-    )
 
 
 @pytest.mark.slow

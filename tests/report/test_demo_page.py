@@ -1,9 +1,11 @@
 """The demo's page: what it compares begins alike, its map is that of the circles drawn on it."""
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import hand_made_sensor
 from PIL import Image
 
 import probewise
@@ -114,3 +116,35 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
         assert f">{row}<" in said
     assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt_sentence(searches)
     assert found.stop_reason in said
+
+
+@pytest.mark.slow
+def test_the_page_shows_every_figure_that_is_drawn(found):
+    """Of a diagnosis of few readings, which is quick; the calibration is a sensor made by hand."""
+    from probewise.arm import read_geometry, shipped_geometry_path
+    from probewise.calibration import predict
+    from probewise.diagnosis import diagnose
+    from probewise.report import demo as report
+
+    recording = read_recording(shipped("paper"))
+    sensor = hand_made_sensor()
+    calibration = SimpleNamespace(sensor=sensor, orders=sensor.orders, fields={1: sensor.field})
+    outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
+    truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
+    searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("naive", "SSF")]
+    shared = {
+        "prediction": predict(sensor, recording.plan, recording.readings),
+        "searches": searches,
+        "started_alike": searches,
+        "diagnosis": diagnose(recording.take(np.arange(0, 408, 8)), rng=np.random.default_rng(1)),
+        "doubt": searches,
+    }
+    geometry = read_geometry(shipped_geometry_path())
+    drawers = report.figure_drawers(calibration, recording, **shared, geometry=geometry)
+    drawn = {name: draw() for name, draw in drawers.items()}
+    frames = [[drawn["doubt.png"]] * 2] * 2
+    more = {"frames": frames, "drawn": drawn, "concealed": "lag", "seed": 1, "seconds": 2.0}
+    page = report.page_html(calibration, recording, **shared, **more)
+    assert page.count("<img") == len(drawn) + 1  # two slides, and one figure is a file alone, ssf.png
+    assert "could not be drawn" not in page
+    assert "The simulated world that made this recording concealed: lag." in page

@@ -200,6 +200,7 @@ def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
     side, above = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
     pages = pages_of(sheets_pdf([side, above], paper="a4", title="t"))
     assert len(pages) == 1 + len(tiles_of(side, "a4")) + len(tiles_of(above, "a4"))
+    assert len(tiles_of(side, "a4")) == 4  # of six: two pages between the links are blank
     beam = side.strokes_mm[0]
     assert np.ptp(beam, axis=0) == pytest.approx([8.0, 358.0])
     for _, paths in pages:

@@ -103,7 +103,7 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         else:
             arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
             emulated = not is_own and _is_pty(nxt_port(arguments.arm))
-            ask = PersonAtBench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
+            ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             print_result(
                 f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
@@ -202,67 +202,57 @@ def _pattern_names_by_row(plan: Plan) -> list[str]:
 # Sheets that a person lays
 
 
-class PersonAtBench:
-    """A function that prompts a person to carry out a request of `carry_out`, and then checks the sheet that was laid.
+def person_at_bench(
+    arm: LegoArm | OwnInstrument | SimulatedArm,
+    plan: Plan,
+    origin_mm: tuple[float, float],
+    sheet_check: SheetCheck,
+    *,
+    check_sheets: bool,
+    emulated: bool,
+) -> Callable[[RequestToPerson], None]:
+    """Return a function that prompts a person to carry out a request of `carry_out`, and then checks the sheet.
 
-    `origin_mm` is the place of the plan's origin. With `check_sheets` a sheet is checked before it is scanned; a user's
-    own instrument takes only the plan's readings. If `emulated`, requests are carried out by typing in the emulator's
-    terminal.
+    `origin_mm` is the place of the plan's origin. With `check_sheets` a sheet is checked before it is scanned, until it
+    is right or the person overrides the check; a user's own instrument takes only the plan's readings. If `emulated`,
+    requests are carried out by typing in the emulator's terminal, and the prompt says what.
     """
+    answer = _bench.prompter_for_answer(arm)
 
-    def __init__(
-        self,
-        arm: LegoArm | OwnInstrument | SimulatedArm,
-        plan: Plan,
-        origin_mm: tuple[float, float],
-        sheet_check: SheetCheck,
-        *,
-        check_sheets: bool,
-        emulated: bool,
-    ) -> None:
-        self._arm, self._plan, self._origin, self._sheet_check = arm, plan, origin_mm, sheet_check
-        self._emulated, self._check_sheets = emulated, check_sheets
-        self._answer = _bench.prompter_for_answer(arm)
-
-    def __call__(self, request: RequestToPerson) -> None:
-        """Prompt, and check the sheet until it is right or the person overrides the check."""
-        text = f"{request[0].upper()}{request[1:]}{self._hint_for_emulator_terminal(request)}"
-        self._answer(f"{text}, then press Enter: ")
-        if request.pattern is None or not self._check_sheets:
-            return
-        while (wrong := self._complaint_after_reading_sheet(request.pattern)) is not None:
-            if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
-                print_warning(f"{wrong}; is the right sheet there, the right way round?")
-                break
-            said = self._answer(f"{wrong}. Correct it and press Enter, or type go to continue anyway:  ")
-            if said.lower() == "go":
-                break
-
-    def _hint_for_emulator_terminal(self, request: RequestToPerson) -> str:
-        """Return a hint on what to type in the emulator's terminal to carry out the request; "" without an emulator."""
-        if not self._emulated:
+    def hint(request: RequestToPerson) -> str:
+        if not emulated or (request.turned_rad is None and request.pattern is None):
             return ""
         if request.turned_rad is not None:
             return f" (in the emulator's terminal: turn {np.degrees(request.turned_rad):g})"
-        if request.pattern is None:
-            return ""
         try:
-            scene = scene_text(_bench.shifted_pattern(self._plan.patterns[request.pattern], self._origin))
+            scene = scene_text(_bench.shifted_pattern(plan.patterns[request.pattern], origin_mm))
         except ParameterError:
             return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
         return f" (in the emulator's terminal: {scene})"
 
-    def _complaint_after_reading_sheet(self, name: str) -> str | None:
+    def complaint_about_sheet(name: str) -> str | None:
         """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
-        bounds, origin = reachable_places_of(self._arm), np.array(self._origin)
+        bounds, origin = reachable_places_of(arm), np.array(origin_mm)
+        chosen = sheet_check.white_and_black_places(name, lambda places: bounds.contains(places + origin))
         values = {}
-        for is_white, place in self._sheet_check.white_and_black_places(
-            name, lambda places: bounds.contains(places + origin)
-        ).items():
+        for is_white, place in chosen.items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
-            standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
-            values[is_white] = self._arm.measure(Pose(x_mm, y_mm, standing)).value
-        return self._sheet_check.complaint_about_levels(name, values)
+            standing = float(arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
+            values[is_white] = arm.measure(Pose(x_mm, y_mm, standing)).value
+        return sheet_check.complaint_about_levels(name, values)
+
+    def ask(request: RequestToPerson) -> None:
+        answer(f"{request[0].upper()}{request[1:]}{hint(request)}, then press Enter: ")
+        if request.pattern is None or not check_sheets:
+            return
+        while (wrong := complaint_about_sheet(request.pattern)) is not None:
+            if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
+                print_warning(f"{wrong}; is the right sheet there, the right way round?")
+                break
+            if answer(f"{wrong}. Correct it and press Enter, or type go to continue anyway:  ").lower() == "go":
+                break
+
+    return ask
 
 
 def _is_pty(port: str) -> bool:

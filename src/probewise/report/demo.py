@@ -20,7 +20,7 @@ from probewise.report.diagnosis_figures import before_and_after
 from probewise.report.html import Section, element, figure, fragment, page, paragraph, slideshow, table
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
-from probewise.report.plots.canvas import png
+from probewise.report.plots.canvas import lay_out, png
 from probewise.report.plots.probabilities import hypothesis_probabilities
 from probewise.report.plots.readings import quadrant_patterns, residuals_by_scan, sensor_orientations
 from probewise.report.searches import RobotSearch, search_comparison_table
@@ -107,7 +107,7 @@ def figure_drawers(
         "progress.png": lambda: of_searches.draw_widths_and_information(searches),
         "explanations.png": lambda: hypothesis_probabilities(names, [h.probability for h in diagnosis.hypotheses]),
         "scans.png": lambda: residuals_by_scan(diagnosis.recording, before, after),
-        "before_after.png": lambda: before_and_after(diagnosis),
+        "before_after.png": lambda: lay_out(before_and_after(diagnosis)),
         "doubt.png": lambda: of_searches.draw_final_posteriors(doubt),
         "belief.png": lambda: of_searches.draw_effect_probabilities(doubt[-1].run),
     }

@@ -148,13 +148,19 @@ def axes_or_panel(ax: Axes | None, *, height_in: float = 2.7) -> Axes:
     return panel
 
 
-def svg(drawing: Axes | AxesGrid) -> bytes:
-    """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
+def lay_out(drawing: Axes | AxesGrid) -> Axes | AxesGrid:
+    """Give a stack of axes margins for its labels; return the drawing."""
     sheet = figure_of(drawing)
     labels = _tick_labels(sheet)
     sheet.tight_layout(pad=0.4, h_pad=0.9)
     if _tick_labels(sheet) != labels:  # finer ticks of axes that have grown have longer labels
         sheet.tight_layout(pad=0.4, h_pad=0.9)
+    return drawing
+
+
+def svg(drawing: Axes | AxesGrid) -> bytes:
+    """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
+    sheet = figure_of(lay_out(drawing))
     buffer, own = io.BytesIO(), sheet.canvas
     canvas: Any = FigureCanvasSVG(sheet)
     with mpl.rc_context({"svg.hashsalt": "probewise"}):

@@ -60,6 +60,7 @@ DAMAGED = {
     "unknown filter": (png(2, 1, bytes([9, 1, 2])), "damaged"),
     "not zlib": (GOOD[:33] + chunk(b"IDAT", b"abc") + chunk(b"IEND", b""), "damaged"),
     "no header": (GOOD[:8] + chunk(b"IEND", b""), "no header"),
+    "short palette": (png(2, 1, bytes([0, 0, 1]), colour=3, more=chunk(b"PLTE", bytes(3))), "palette"),
     "no palette": (png(2, 1, bytes([0, 1, 2]), colour=3), "palette"),
 }
 

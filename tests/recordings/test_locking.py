@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-from multiprocessing import get_all_start_methods, get_context
 
 import pytest
 
@@ -18,12 +17,6 @@ with hold_lock(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)
 """
-
-
-def count_to_25(path):
-    for _ in range(25):
-        with hold_lock(path, patience_s=60):
-            path.write_text(str(int(path.read_text()) + 1))
 
 
 def test_a_second_process_is_refused_and_a_killed_holder_holds_it_no_more(tmp_path):
@@ -42,20 +35,6 @@ def test_a_second_process_is_refused_and_a_killed_holder_holds_it_no_more(tmp_pa
 def test_a_lock_is_not_taken_twice_within_one_process_either(tmp_path):
     with hold_lock(tmp_path / "a"), pytest.raises(FileError, match="another process"), hold_lock(tmp_path / "a"):
         pass
-
-
-@pytest.mark.skipif("fork" not in get_all_start_methods(), reason="processes cannot be forked here")
-def test_processes_that_come_and_go_never_hold_it_together(tmp_path):
-    """Each adds 25 to a number that two at once would miscount."""
-    path = tmp_path / "number"
-    path.write_text("0")
-    counting = [get_context("fork").Process(target=count_to_25, args=(path,)) for _ in range(3)]
-    for process in counting:
-        process.start()
-    for process in counting:
-        process.join(60)
-    assert [process.exitcode for process in counting] == [0, 0, 0]
-    assert path.read_text() == "75"
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -186,7 +187,7 @@ def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
         planned = rows.covariates.get(name, np.full(len(readings), math.nan)).tolist()
         own = [reading.covariates.get(name, usual) for reading, usual in zip(readings, planned, strict=True)]
         covariates[name] = np.array(own)
-    there = {
+    there: dict[str, Any] = {
         name: np.array([getattr(reading.pose, name) for reading in readings])
         for name in ("x_mm", "y_mm", "orientation_rad")
     }

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -228,7 +229,7 @@ def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -
 
 def _geometry_with_values(geometry: Geometry, values: FloatArray) -> Geometry:
     """Return the geometry with values of `FITTED`; limits and stops, counted from home, shift with the home angles."""
-    joints = {}
+    joints: dict[str, Any] = {}
     for name, joint, home in zip(JOINTS, geometry.joints, values[:3].tolist(), strict=True):
         ends = {end: getattr(joint, end) for end in ("low_rad", "high_rad", "stop_rad")}
         shifted = {end: angle + (home - joint.home_rad) for end, angle in ends.items() if angle is not None}

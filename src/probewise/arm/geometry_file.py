@@ -58,7 +58,7 @@ def read_geometry(path: str | Path) -> Geometry:
         raise sensor.error_at("whole_percent", "true or false")
     tables = {name: joints.table(name) for name in JOINTS}
     known = top.table("accuracy") if "accuracy" in content else None
-    parts = {name: _parse_joint(table) for name, table in tables.items()}
+    parts: dict[str, Any] = {name: _parse_joint(table) for name, table in tables.items()}
     accuracy = None if known is None else _parse_accuracy(known)
     geometry = _built(
         top,

@@ -214,7 +214,7 @@ class OwnInstrument:
                 name: _checked_covariate(name, number) for name, number in found.items() if name not in (*own, "value")
             }
             own = {name: _float_or_nan(name, found.get(name, usual)) for name, usual in own.items()}
-            there = Pose(*(own[name] for name in _OF_THE_POSE), height_mm=pose.height_mm)
+            there = Pose(own["x_mm"], own["y_mm"], own["orientation_rad"], pose.height_mm)
             reading = Reading(_checked_value(f"value{_RETURNED}", found["value"]), there, own["time_s"], known)
         for name, number in own.items():
             checked_finite_number(f"{name}{_RETURNED}", number)

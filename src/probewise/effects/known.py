@@ -31,7 +31,7 @@ class WrappedEffect(Effect[V]):
 
     @property
     def form(self) -> str:
-        return getattr(self.effect, "form", "")
+        return str(getattr(self.effect, "form", ""))
 
     @property
     def prior(self) -> Prior:

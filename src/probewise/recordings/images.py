@@ -104,9 +104,8 @@ def _albedo_from_png(path: Path, content: bytes) -> FloatArray:
     try:
         Pillow.open(io.BytesIO(content), formats=["PNG"]).verify()  # the checksums
         with Pillow.open(io.BytesIO(content), formats=["PNG"]) as picture:
-            picture.load()
-            palette = picture.palette
-            if picture.mode == "P" and (palette is None or len(palette.palette) <= 3 * picture.getextrema()[1]):
+            palette = b"" if picture.palette is None else picture.palette.getdata()[1]  # before it is padded
+            if picture.mode == "P" and len(palette) <= 3 * int(np.asarray(picture).max()):
                 raise ValueError("the palette is missing or too short for the pixels")
             pixels = np.asarray(picture.convert("RGBA"), dtype=np.float64)
     except Exception as error:  # damaged files make Pillow raise many kinds

@@ -203,22 +203,21 @@ class Motor:
         if side * self._checked_target >= side * target:
             # A target left by a move in the other direction would lead beyond the goal.
             here = self._find_firmware_target()
-        least = max(side * here, side * self._checked_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coast_counts(fast, side))
-        if side * short > least + self.drive.lead_counts:
-            return self._make_limited_move(short, side, fast, here)
-        return self._make_limited_move(side * max(side * target, least), side, slow, here)
+        return self._move(side, here, short, target)
 
     def _back_off_behind_goal(self, goal: int, side: Side, here: int) -> int:
         """Back off behind the goal, far enough for a slow move to start and take up the play; return the count."""
         back: Side = 1 if side == -1 else -1
-        fast, slow = self.drive.fast_power, self.drive.slow_power
-        behind = goal - side * (self._coast_counts(slow, side) + 2 * self.drive.lead_counts)
-        least = max(back * here, back * self._checked_target) + 1
-        short = behind + side * self._coast_counts(fast, back)
-        if back * short > least + self.drive.lead_counts:
-            return self._make_limited_move(short, back, fast, here)
-        return self._make_limited_move(back * max(back * behind, least), back, slow, here)
+        behind = goal - side * (self._coast_counts(self.drive.slow_power, side) + 2 * self.drive.lead_counts)
+        return self._move(back, here, behind + side * self._coast_counts(self.drive.fast_power, back), behind)
+
+    def _move(self, side: Side, here: int, fast_target: int, slow_target: int) -> int:
+        """Make a fast move if it is long enough, else a slow one; return the count at rest."""
+        least = max(side * here, side * self._checked_target) + 1  # a target behind this position causes no motion
+        if side * fast_target > least + self.drive.lead_counts:
+            return self._make_limited_move(fast_target, side, self.drive.fast_power, here)
+        return self._make_limited_move(side * max(side * slow_target, least), side, self.drive.slow_power, here)
 
     def _coast_counts(self, power: int, side: Side) -> int:
         share = power / self.drive.fast_power

@@ -2,7 +2,7 @@
 
     python benchmarks/speed.py --before EARLIER/bin/python --out docs/results/speed.json
 
-Every row is run before, now, before, now (those over a minute once each; children included, one thread of linear
+Every row is run before, now, before, now (those over 20 s once each; children included, one thread of linear
 algebra), and its ratio is the mean of both pairs: seconds grow where a machine does other things too, so only what
 stands in one row may be compared. A run of more than --limit processor seconds is stopped: over. Rows in the file stay,
 unless --rows names them. Both environments need the dependencies; `--tests` times the README's tests (wall time) of
@@ -29,7 +29,7 @@ HERE = Path(__file__).resolve().parent.parent
 DATA = HERE / "src/probewise/data"
 PENDULUM = HERE / "examples/simulators/pendulum.py"
 NOISE = 0.1
-LONG_S = 60  # a row that takes as long before is run once each
+LONG_S = 20  # a row that takes as long before is run once each
 CLOSED = """import numpy as np
 reading, unit, time, run, vectorized = "y", "V", "t_s", "run", True
 parameters = {"a": (0, 20), "tau_s": ("log", 1, 1000), "b": ("normal", 0, 10), "gain": ("normal", 1, 1)}

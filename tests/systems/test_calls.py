@@ -1,11 +1,14 @@
 """How a person's function is called: whatever it takes, the same readings."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.priors import Uniform
-from probewise.systems import Law, ProgressWithCallCount, RunTable, Simulator, System
+from probewise.systems import Law, ProgressWithCallCount, RunTable, Simulator, System, read_simulator
+from probewise.systems.calls import Caller, SpreadCalls
 
 X = np.linspace(0, 1, 11)
 
@@ -50,6 +53,21 @@ def test_a_parameter_that_varies_by_row_is_interpolated_where_a_function_takes_o
     parameters = {"a": np.full((1, 1), 1.2), "b": (1.0 + 0.1 * X)[None, :]}
     np.testing.assert_allclose(loop.caller(parameters, {"x": X}), quick.caller(parameters, {"x": X}), atol=1e-6)
     assert loop.caller.interpolated == {"b"}
+
+
+def test_calls_that_are_spread_over_processes_give_the_same_readings_in_as_many_calls(tmp_path):
+    """Threads stand for the processes; of some samples the function raises an error."""
+    text = "import math\nreading, unit, parameters = 'y', 'V', {'a': (0, 2), 'b': (0, 2)}\n"
+    text += "def simulate(p, data):\n    return [math.sqrt(p['a'] - 1.4) * math.exp(-p['b'] * x) for x in data['x']]\n"
+    (tmp_path / "own.py").write_text(text)
+    simulate = read_simulator(tmp_path / "own.py").simulate
+    with ThreadPoolExecutor(2) as executor:
+        spread = SpreadCalls(simulate, tmp_path / "own.py", executor, 2)
+        here, there = (Caller(function, broadcasts=False) for function in (simulate, spread))
+        parameters = {"a": np.array([[1.3], [1.5], [1.8]]), "b": np.outer([1.0, 1.1, 1.2], 1 + 0.1 * X)}
+        both = [caller(parameters, {"x": X}) for caller in (here, there)]
+    np.testing.assert_array_equal(*both)
+    assert (here.n_calls, here.n_failed) == (there.n_calls, there.n_failed) == (11, 1)
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import add, parse_path
+from probewise.cli._common import add, count_up_to, parse_path
 from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
@@ -21,6 +23,27 @@ def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead 
         "only those that you trust)"
     )
     add(parser, "--simulator FILE.py", about, type=parse_path)
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add --workers N for the calls of a simulator."""
+    about = "processes for a simulator that is called for one sample at a time (default 1); results are the same"
+    add(parser, "--workers N", about, type=count_up_to(1024), default=1)
+
+
+@contextlib.contextmanager
+def open_simulator(path: Path, n_workers: int) -> Iterator[Simulator]:
+    """Read a simulator; with workers, the calls of its `simulate` are spread over processes."""
+    from probewise.cli._executor import worker_pool
+    from probewise.systems import read_simulator
+    from probewise.systems.calls import SpreadCalls
+
+    simulator = read_simulator(path)
+    if n_workers == 1 or simulator.simulate is None or simulator.vectorized:
+        yield simulator
+        return
+    with worker_pool(n_workers) as pool:
+        yield replace(simulator, simulate=SpreadCalls(simulator.simulate, path, pool, n_workers))
 
 
 def refuse_sensor(sensor: Path | None) -> None:

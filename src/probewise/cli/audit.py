@@ -10,7 +10,7 @@ from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._arm import SHIPPED, read_or_shipped_plan
 from probewise.cli._common import add, add_quiet, finish, inputs_and_filled_in_plan, parse_path, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._simulator import add_simulator, refuse_sensor
+from probewise.cli._simulator import add_simulator, add_workers, open_simulator, refuse_sensor
 
 if TYPE_CHECKING:
     from probewise._writing import StagedFiles
@@ -22,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(parser, "plan PLAN.csv", about, type=parse_path)
     add(parser, "--sensor S.json", "the calibrated sensor (default: a typical one)", type=parse_path)
     add_simulator(parser)
+    add_workers(parser)
     about = (
         "directory for audit.json, audit.png, report.html and (without --simulator) cure_plan.csv; by default only the "
         "text is printed"
@@ -38,17 +39,17 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.diagnosis import CURE_PLAN, audit_json
     from probewise.recordings import write_plan
     from probewise.report import audit as report
-    from probewise.systems import read_simulator, read_table_for
+    from probewise.systems import read_table_for
 
     refuse_journal(arguments.plan)
     drawings = None if arguments.out is None else Drawings(checked_output_directory(arguments.out))
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
             refuse_sensor(arguments.sensor)
-            simulator = read_simulator(arguments.simulator)
-            table = read_table_for(simulator, arguments.plan)
-            progress("building the effects")
-            audit = diagnosis.audit_system(simulator, table)
+            with open_simulator(arguments.simulator, arguments.workers) as simulator:
+                table = read_table_for(simulator, arguments.plan)
+                progress("building the effects")
+                audit = diagnosis.audit_system(simulator, table)
         else:
             plan = read_or_shipped_plan(str(arguments.plan), progress=progress)
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)

@@ -11,7 +11,7 @@ from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.cli import _common as common
 from probewise.cli._executor import add_executor
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._simulator import add_simulator, read_joined_table, refuse_sensor
+from probewise.cli._simulator import add_simulator, open_simulator, read_joined_table, refuse_sensor
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -64,12 +64,12 @@ def run(arguments: argparse.Namespace) -> int:
         from probewise.cli._each import diagnose_each
 
         return diagnose_each(arguments, run)
+    if arguments.simulator is not None and arguments.scheduler is None:
+        return _diagnose_simulator(arguments)
     if arguments.workers > 1 or arguments.scheduler is not None:
         raise common.CommandError(
             "--workers and --scheduler are for --each, which diagnoses several recordings one by one"
         )
-    if arguments.simulator is not None:
-        return _diagnose_simulator(arguments)
     from probewise.diagnosis import NEXT_PLAN, SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
     from probewise.report import diagnosis as report
 
@@ -118,15 +118,16 @@ def _diagnose_simulator(arguments: argparse.Namespace) -> int:
     from probewise._progress import progress_shown
     from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
     from probewise.report import diagnosis as report
-    from probewise.systems import read_simulator
 
     refuse_sensor(arguments.sensor)
     drawings = Drawings(checked_output_directory(arguments.out))
-    simulator = read_simulator(arguments.simulator)
-    table, notes = read_joined_table(simulator, arguments.recordings)
     diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
     source = ", ".join(path.name for path in arguments.recordings)
-    with progress_shown(quiet=arguments.quiet) as progress:
+    with (
+        open_simulator(arguments.simulator, arguments.workers) as simulator,
+        progress_shown(quiet=arguments.quiet) as progress,
+    ):
+        table, notes = read_joined_table(simulator, arguments.recordings)
         diagnosis = diagnose_system(
             simulator,
             table,

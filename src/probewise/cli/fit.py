@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import CommandError, add, add_out, add_seed_and_quiet, finish, parse_path
-from probewise.cli._simulator import add_simulator, read_joined_table
+from probewise.cli._simulator import add_simulator, add_workers, open_simulator, read_joined_table
 
 if TYPE_CHECKING:
     from probewise._writing import StagedFiles
@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the options of `probewise fit`."""
     add(parser, "tables DATA.csv", "table of readings; several are fitted together", type=parse_path, nargs="+")
     add_simulator(parser, replaces="")
+    add_workers(parser)
     add(parser, "--thorough", "compute the evidence by nested sampling as well")
     add_out(parser)
     add_seed_and_quiet(parser)
@@ -29,15 +30,17 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise._progress import progress_shown
     from probewise.diagnosis import fit_json, fit_simulator
     from probewise.report import fit as report
-    from probewise.systems import read_simulator, samples_csv, write_fitted_system
+    from probewise.systems import samples_csv, write_fitted_system
 
     if arguments.simulator is None:
         raise CommandError("--simulator FILE.py is missing; to fit a light sensor, use probewise calibrate")
     drawings = Drawings(checked_output_directory(arguments.out))
-    simulator = read_simulator(arguments.simulator)
-    table, notes = read_joined_table(simulator, arguments.tables)
     source = ", ".join(path.name for path in arguments.tables)
-    with progress_shown(quiet=arguments.quiet) as progress:
+    with (
+        open_simulator(arguments.simulator, arguments.workers) as simulator,
+        progress_shown(quiet=arguments.quiet) as progress,
+    ):
+        table, notes = read_joined_table(simulator, arguments.tables)
         rng = np.random.default_rng(arguments.seed)
         fitted = fit_simulator(
             simulator, table, source=source, notes=notes, thorough=arguments.thorough, rng=rng, progress=progress

@@ -6,8 +6,11 @@ import hashlib
 import inspect
 import itertools
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import FileError, ParameterError, ShapeError, message_of
 from probewise.progress import Progress
 from probewise.recordings.io import EndedByFile
-from probewise.systems.simulator import Simulate, Simulator
+from probewise.systems.simulator import Simulate, Simulator, read_simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
 _MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
@@ -165,16 +168,21 @@ class Caller:
             if self.broadcasts:
                 return np.concatenate([self._call_together(*own, (1, n_points), strict=strict) for own in each])
             out, first_error = np.full((n_samples, n_points), np.nan), None
-            for k, (own, table) in enumerate(each):
-                by_row = self.by_row if n_points == 1 else ()  # arrays even if there is only one row in the table
-                values = {n: float(v[0, 0]) if v.shape == (1, 1) and n not in by_row else v[0] for n, v in own.items()}
-                try:
-                    out[k] = self._call_for_one_sample(values, table, n_points)
-                except (ShapeError, KeyboardInterrupt):
-                    raise
-                except Exception as error:
-                    self.n_failed += 1
-                    first_error = first_error or error
+            by_row = self.by_row if n_points == 1 else ()  # arrays even if there is only one row in the table
+            samples = [
+                ({n: float(v[0, 0]) if v.shape == (1, 1) and n not in by_row else v[0] for n, v in own.items()}, table)
+                for own, table in each
+            ]
+            for first in range(0, n_samples, step := max(_MOST_REMEMBERED // (2 * _N_NODES * n_points), 1)):
+                self._call_ahead(samples[first : first + step], n_points)
+                for k, (values, table) in enumerate(samples[first : first + step], start=first):
+                    try:
+                        out[k] = self._call_for_one_sample(values, table, n_points)
+                    except (ShapeError, KeyboardInterrupt):
+                        raise
+                    except Exception as error:
+                        self.n_failed += 1
+                        first_error = first_error or error
             if strict and first_error is not None and not np.isfinite(out).any():
                 raise first_error
         return out
@@ -234,11 +242,7 @@ class Caller:
 
     def _cached_call(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
         """Return the readings of one sample, (n_points,), by a call or from an earlier one with the same arguments."""
-        digest = hashlib.blake2b(digest_size=16)
-        for name, values in (*own.items(), *columns.items()):
-            digest.update(name.encode())
-            digest.update(np.ascontiguousarray(values).tobytes())
-        known = self._known.pop(key := digest.digest(), None)
+        known = self._known.pop(key := _digest_of_arguments(own, columns), None)
         if known is None:
             self._count_call()
             known = _readings_broadcast_to_shape(np.array(self._simulated(own, columns), float), (n_points,), self.name)
@@ -246,6 +250,22 @@ class Caller:
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
         return known
+
+    def _call_ahead(
+        self, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]]], n_points: int
+    ) -> None:
+        """Make the calls for some samples at once where `simulate` is a `SpreadCalls`; those that fail are left."""
+        if not isinstance(self.simulate, SpreadCalls):
+            return
+        asked = {}
+        for own, columns in samples:
+            for _, fixed in self._interpolation(own, n_points):
+                asked[_digest_of_arguments(fixed, columns)] = fixed, columns
+        unknown = {key: given for key, given in asked.items() if key not in self._known}
+        for key, readings in zip(unknown, self.simulate.many(list(unknown.values())), strict=True):
+            if readings is not None and readings.shape == (n_points,):
+                self._count_call()
+                self._known[key] = readings
 
     def _simulated(self, parameters: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Any:
         return call_on_read_only(self.simulate, read_only_views(parameters), read_only_views(columns))
@@ -257,19 +277,69 @@ class Caller:
     def _call_for_one_sample(
         self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int
     ) -> FloatArray:
+        out = np.zeros(n_points)
+        for share, fixed in self._interpolation(own, n_points):
+            if share is None:
+                return self._cached_call(fixed, columns, n_points)
+            self.interpolated.update(name for name in own if np.ndim(own[name]) != np.ndim(fixed[name]))
+            out += share * self._cached_call(fixed, columns, n_points)
+        return out
+
+    def _interpolation(
+        self, own: Mapping[str, Any], n_points: int
+    ) -> Iterator[tuple[FloatArray | None, Mapping[str, Any]]]:
+        """Yield arguments of calls for one sample, and the share of each in every reading; None for a single call."""
         vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
         if not vary:
-            return self._cached_call(own, columns, n_points)
-        self.interpolated.update(vary)
+            yield None, own
+            return
         nodes = [_chebyshev_nodes(own[name]) for name in vary]
-        out = np.zeros(n_points)
         for at in itertools.product(*(range(len(each)) for each in nodes)):
-            fixed = {name: float(each[i]) for name, each, i in zip(vary, nodes, at, strict=True)}
             share = np.ones(n_points)
             for name, each, i in zip(vary, nodes, at, strict=True):
                 share = share * _lagrange_basis(each, i, own[name])
-            out += share * self._call_for_one_sample({**own, **fixed}, columns, n_points)
-        return out
+            yield share, {**own, **{name: float(each[i]) for name, each, i in zip(vary, nodes, at, strict=True)}}
+
+
+class SpreadCalls:
+    """A user's `simulate` whose calls for many samples are made in other processes, which run its file themselves."""
+
+    def __init__(self, simulate: Simulate, path: Path, executor: Executor, n_workers: int) -> None:
+        self.__wrapped__, self._path, self._executor, self._n_chunks = simulate, path, executor, 4 * n_workers
+
+    def __call__(self, parameters: Mapping[str, Any], columns: Mapping[str, Any]) -> Any:
+        """Call it here."""
+        return self.__wrapped__(parameters, columns)
+
+    def many(self, given: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Iterator[FloatArray | None]:
+        """Yield what it returns for each parameters and columns, in this order; None where it raises an error."""
+        chunks = [given[k :: self._n_chunks] for k in range(min(self._n_chunks, len(given)))]
+        done = list(self._executor.map(partial(_call_each, self._path), chunks))
+        return (done[k % len(done)][k // len(done)] for k in range(len(given)))
+
+
+@cache
+def _simulate_of_file(path: Path) -> Any:
+    return read_simulator(path).simulate
+
+
+def _call_each(path: Path, given: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[FloatArray | None]:
+    out: list[FloatArray | None] = []
+    with np.errstate(all="ignore"):
+        for each in given:
+            try:
+                out.append(np.array(call_on_read_only(_simulate_of_file(path), *map(read_only_views, each)), float))
+            except Exception:
+                out.append(None)
+    return out
+
+
+def _digest_of_arguments(own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
+    digest = hashlib.blake2b(digest_size=16)
+    for name, values in (*own.items(), *columns.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.digest()
 
 
 class ProgressWithCallCount:

@@ -11,9 +11,9 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.diagnose_simulator import recording_from_table
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, laplace_evidence
 from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.left_out import recording_from_table
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, starts_with_more_gaussians

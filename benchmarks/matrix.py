@@ -154,14 +154,13 @@ def _names_of_forms(kind: str) -> frozenset[str]:
 
 def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
     """Draw a system of a kind and its readings with a form or a noise."""
-    refit = SystemRefit()
     for wanted in (*np.repeat(SIZES, 3), None):
         drawn = small_system(kind, rng)
         forms = forms_by_name(drawn).get(what, [])
         effects: list[SystemEffect] = []
         with contextlib.suppress(errors.NotConvergedError):
             if forms and wanted is not None:
-                effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, refit, rng)]
+                effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, SystemRefit(), rng)]
             elif forms:  # the parameters take it up, whatever its size
                 amplitude = min(20 * forms[0].first, forms[0].limit)
                 effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)), 0.0)]

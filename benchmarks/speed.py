@@ -178,6 +178,9 @@ def main() -> None:
     told_to = parser.parse_args()
     found = json.loads(told_to.out.read_text()) if told_to.out.exists() else {}
     pythons = {"before": told_to.before, "now": Path(sys.executable)}
+    for python in pythons.values():  # so that no row pays for it
+        compiled = "import compileall, probewise as p; compileall.compile_dir(p.__path__[0], quiet=2)"
+        subprocess.run([python, "-c", compiled], check=True, env=environment(python))
     with tempfile.TemporaryDirectory() as folder:
         at, trees = Path(folder), {"before": told_to.tests or folder, "now": HERE if told_to.tests else folder}
         tests = ("the README's tests", 0.4, ["-m", "pytest", "-q", "-n", "logical", "--dist", "loadfile"])

@@ -147,10 +147,15 @@ def find_lost_readings(
     is_bent |= bool(size.max() > LARGEST_SIZE * np.median(size) / MAD_OF_NORMAL)
     if not is_bent and not improbable_rows(first, law).size:
         return None
+    run, by_chance = recording.plan.scan[usable], -ndtri(0.5 * _BY_CHANCE / len(usable))
+    in_runs = np.argsort(run, kind="stable")
+    steps = np.abs(np.diff((first.residuals / law.sd)[in_runs])[np.diff(run[in_runs]) == 0])
+    if not steps.size or steps.max() < by_chance * np.median(steps) / MAD_OF_NORMAL:
+        return None  # bent or not, the residuals have no step that a reading far from its neighbours would make
     found = _least_trimmed_fit(model, recording, [first.z, *starts], law, n_most)
     if found is None:
         return None
-    residual, run = found.residuals / law.sd, recording.plan.scan[usable]
+    residual = found.residuals / law.sd
     aside = _farthest(residual, n_most, law)
     known = replace(law, lost=aside)
     apart = np.diff(residual)[(np.diff(run) == 0) & ~aside[1:] & ~aside[:-1]]
@@ -162,7 +167,6 @@ def find_lost_readings(
     told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), every.T)
     unknown = np.sqrt(1 + np.einsum("ij,ji->i", every, told))
     size = np.abs(_beyond_neighbours(residual, run, aside)) / (sd * unknown)
-    by_chance = -ndtri(0.5 * _BY_CHANCE / len(usable))
     far = aside & (size > LARGEST_SIZE * by_chance)
     readings = recording.readings[usable]
     far |= aside & (size > by_chance) & np.isin(readings, readings[far])  # lost to one value, nearer to what was there

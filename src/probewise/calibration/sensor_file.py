@@ -94,32 +94,23 @@ class FittedSensor(NamedSamples):
         Noise sd of a reading in a new scan for each sample, pooled over scans, (n_samples,).
     field
         Posterior mean of the SSF fields: the paper's discrete SSF (eq. "discreteR"). The robot uses `mean_mixture()`.
-    instrumentation
-        The instrument: unit, range and step of the readings, sensor, controls.
     effects
         Names of the effects in the model, in the order of their columns.
-    forms
-        By effect, which of its formulas it has (`OTHER_FORMS`); others have the vocabulary's.
-    patterns
-        By effect, the names of the patterns to which it is restricted; other effects act on all patterns.
+    forms, patterns
+        By effect, which of its formulas it has (`OTHER_FORMS`), others have the vocabulary's; and the names of the
+        patterns to which it is restricted, others act on all.
     absent
         By effect, a mask of the samples without the effect, (n_samples,), where a diagnosis is uncertain whether it is
         present; other effects act in all samples.
     origins
         By effect, the time and position from which it counts, where it was found in a recording far from 0; others
         count from 0.
-    scan_noise
-        Noise of each scan of the recording.
-    fingerprint, source
-        Of the recording: hash of its content, and its file name.
+    scan_noise, fingerprint, source
+        Of the recording: noise of each scan, hash of its content, and its file name.
     orders
         Log evidence of every order tried.
-    priors
-        The table of priors.
     notes
         Reasons to use the result with care; empty if there are none.
-    version
-        Version of the package.
     """
 
     names: tuple[str, ...]
@@ -242,9 +233,10 @@ class FittedSensor(NamedSamples):
             noise_sd=self.noise_sd[rows],
             field=posterior_mean_ssf_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
             effects=tuple(name for name in self.effects if name not in left_out),
-            forms={name: own for name, own in self.forms.items() if name not in left_out},
-            patterns={name: own for name, own in self.patterns.items() if name not in left_out},
-            origins={name: own for name, own in self.origins.items() if name not in left_out},
+            **{
+                key: {name: own for name, own in getattr(self, key).items() if name not in left_out}
+                for key in ("forms", "patterns", "origins")
+            },
             absent={},
         )
 
@@ -394,15 +386,7 @@ class FittedSensor(NamedSamples):
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
-    """Write a fitted sensor to the file `path` (sensor.json), atomically.
-
-    Raises
-    ------
-    ParameterError
-        If `sensor` is not a FittedSensor; that of a Calibration is its `sensor`.
-    FileError
-        If the file cannot be written.
-    """
+    """Write a fitted sensor to the file `path` (sensor.json), atomically; FileError if it cannot be written."""
     require_fitted_sensor(sensor)
     path = checked_path("path", path)
     write_text_atomically(path, sensor.to_json())
@@ -411,10 +395,7 @@ def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
 def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
     """Read a fitted sensor from the file `path` (sensor.json).
 
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, or of another format.
+    FileError if the file is missing, damaged, or of another format.
     """
     path = checked_path("path", path, "the name of a sensor.json file; a FittedSensor needs no reading")
     return FittedSensor.from_json(read_text(path, _ALLOWED), path)

@@ -137,9 +137,9 @@ class FittedSensor(NamedSamples):
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
-        unknown = [both for both in self.forms.items() if both[0] not in self.effects or both not in OTHER_FORMS]
-        if unknown:
-            raise ParameterError("forms", unknown[0], f"effects of the model among {sorted(OTHER_FORMS)}")
+        other = [both for both in self.forms.items() if both[0] not in self.effects or both not in OTHER_FORMS]
+        if other:
+            raise ParameterError("forms", other[0], f"effects of the model among {sorted(OTHER_FORMS)}")
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
@@ -226,6 +226,10 @@ class FittedSensor(NamedSamples):
         left_out = {name for name, out in zip(self.absent, sets[np.argmax(counts)], strict=True) if out}
         kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] not in left_out]
         samples = self.samples[rows][:, kept]
+        of_effects: dict[str, Any] = {
+            key: {name: own for name, own in getattr(self, key).items() if name not in left_out}
+            for key in ("forms", "patterns", "origins")
+        }
         return dataclasses.replace(
             self,
             names=tuple(self.names[k] for k in kept),
@@ -233,10 +237,7 @@ class FittedSensor(NamedSamples):
             noise_sd=self.noise_sd[rows],
             field=posterior_mean_ssf_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
             effects=tuple(name for name in self.effects if name not in left_out),
-            **{
-                key: {name: own for name, own in getattr(self, key).items() if name not in left_out}
-                for key in ("forms", "patterns", "origins")
-            },
+            **of_effects,
             absent={},
         )
 

@@ -24,7 +24,7 @@ from probewise.calibration.quick import (
 )
 from probewise.calibration.search import ProblemsByOrder, search_prior_of_order
 from probewise.nested import Weighted
-from probewise.recordings import Disc, HalfPlane, Plan, Recording, paper_plan
+from probewise.recordings import Recording, paper_plan
 from probewise.world import Blob, World, gaussian_spot
 
 
@@ -33,28 +33,6 @@ def two_lobes() -> Recording:
     """A sensor of two spots of equal light, 8 mm apart."""
     spot = gaussian_spot([Blob(0.5, (3.5, 2.0), (2.5, 3.0)), Blob(0.5, (-3.5, -2.0), (2.5, 3.0))])
     return World(spot, noise_sd=0.4).simulate(paper_plan(), rng=np.random.default_rng(8))
-
-
-@pytest.fixture(scope="module")
-def mirrored() -> Recording:
-    """Edges along x and y, and discs about the origin: a footprint at 45 degrees looks like its mirror image."""
-    along, still = np.linspace(-15.0, 15.0, 41), np.zeros(41)
-    pattern = np.repeat(np.arange(5), [41, 41, 4, 4, 4])
-    discs = {f"disc {r} mm": Disc((0.0, 0.0), r, inside=1.0, outside=0.0) for r in (1.5, 2.5, 4.0)}
-    patterns = {"x": HalfPlane(0.0, 0.0, 1.0, 0.0), "y": HalfPlane(np.pi / 2, 0.0, 1.0, 0.0), **discs}
-    plan = Plan(
-        x_mm=np.concatenate([along, still, np.zeros(12)]),
-        y_mm=np.concatenate([still, along, np.zeros(12)]),
-        orientation_rad=np.zeros(94),
-        time_s=np.arange(94.0),
-        scan=np.minimum(pattern, 2),
-        scan_names=("along x", "along y", "discs"),
-        pattern=pattern,
-        pattern_names=tuple(patterns),
-        patterns=patterns,
-    )
-    spot = gaussian_spot([Blob(1.0, (0.0, 0.0), (4.0, 1.2), 0.78)])
-    return World(spot, noise_sd=0.15).simulate(plan, rng=np.random.default_rng(5))
 
 
 def climbed(recording: Recording, order: int, seed: int) -> tuple[FloatArray, FloatArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import itertools
 import multiprocessing
 import sys
 import threading
@@ -18,7 +19,7 @@ import pytest
 from nested_sampling import problems
 
 from probewise.errors import NotConvergedError
-from probewise.nested import Evaluator, KernelMove, NestedResult, RoundSummary, SliceMove, run
+from probewise.nested import Evaluator, KernelMove, NestedResult, SliceMove, run
 from probewise.priors import Product, Uniform
 
 # A module of its own, since a process is sent the names of functions and not the functions.
@@ -163,41 +164,16 @@ def test_the_check_too_evaluates_its_batches_in_the_executor() -> None:
 
 def test_parts_of_a_batch_are_evaluated_at_the_same_time() -> None:
     """The first three parts wait for one another: were they evaluated in turn, none would ever go on."""
-    meeting, lock = threading.Barrier(3, timeout=60), threading.Lock()
-    n_met, here, most = 0, 0, 0
+    meeting, calls = threading.Barrier(3, timeout=60), itertools.count()
 
     def function(theta: np.ndarray) -> np.ndarray:
-        nonlocal n_met, here, most
-        with lock:
-            n_met, here = n_met + 1, here + 1
-            most, meets = max(most, here), n_met <= 3
-        if meets:
+        if next(calls) < 3:
             meeting.wait()
-        with lock:
-            here -= 1
         return 30 * theta[:, 0]
 
     problem = problems.Known(problems.box(2, 0, 1), function, 0.0)
     with ThreadPoolExecutor(3) as pool:
-        run(problem, rng=rng(), n_live=30, executor=pool, n_workers=3)
-    assert most == 3
-
-
-def test_a_run_with_an_executor_is_taken_up_again_without_and_the_other_way_round(
-    executor: Executor, slopes: ModuleType, tmp_path: Path
-) -> None:
-    class Stop(Exception):
-        pass
-
-    def stop(state: RoundSummary) -> None:
-        raise Stop
-
-    whole = run(slopes.Slope(), rng=rng(), n_live=50)
-    path = tmp_path / "run.npz"
-    for pool in (executor, None, executor, None, executor):
-        with pytest.raises(Stop):
-            run(slopes.Slope(), rng=rng(), n_live=50, executor=pool, checkpoint=path, progress=stop)
-    assert_same(run(slopes.Slope(), rng=rng(), n_live=50, executor=executor, checkpoint=path), whole)
+        assert run(problem, rng=rng(), n_live=30, executor=pool, n_workers=3).complete
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from nested_sampling.problems import box
 from scipy.integrate import quad
 from scipy.special import gammaln, logsumexp
 from scipy.stats import binom, chi2, kstest, norm
@@ -39,10 +40,6 @@ class Posed:
     def log_likelihood(self, theta: np.ndarray) -> np.ndarray:
         self.seen.append(theta.copy())
         return np.asarray(self.function(theta), dtype=np.float64)
-
-
-def box(n_params: int, low: float, high: float) -> Product:
-    return Product({f"p{i}": Uniform(low, high) for i in range(n_params)})
 
 
 def seeded(*more: int) -> np.random.Generator:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,8 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem, StudentT
-from probewise.nested import Weighted, pareto_k
+from probewise.nested import Weighted
+from probewise.nested.importance import weighted_draws
 from probewise.nested.weights import n_effective, student_t_draws, student_t_log_norm, tempering_power
 from probewise.priors import Coordinates
 
@@ -199,25 +200,15 @@ def weigh_draws_about_peaks(
     mixture = _MixtureAboutPeaks(space, densities, share / share.sum())
     _, theta, log_density = mixture.draw(_N_DRAWS, rng)
     log_likelihood = problem.log_likelihood(theta)
-    log_weight = log_likelihood - log_density
-    n_eff, k = n_effective(log_weight), pareto_k(log_weight)
+    found = weighted_draws(problem.prior.names, theta, log_likelihood, log_likelihood - log_density, _N_DRAWS)
+    # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
+    error = found.log_z_error * _N_DRAWS ** min(max(found.pareto_k - 0.5, 0.0), 1.0)
 
     def log_weight_at(theta: FloatArray) -> FloatArray:
         y = space.enter(theta)
         return problem.log_likelihood(theta) + space.leave(y)[1] - mixture.log_density(y)
 
-    return Weighted(
-        problem.prior.names,
-        theta,
-        log_likelihood=log_likelihood,
-        log_weight=log_weight - logsumexp(log_weight),
-        log_z=float(logsumexp(log_weight)) - math.log(_N_DRAWS),
-        # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
-        log_z_error=math.sqrt(max(1.0 / n_eff - 1.0 / _N_DRAWS, 0.0)) * _N_DRAWS ** min(max(k - 0.5, 0.0), 1.0),
-        n_eff=n_eff,
-        n_calls=n_calls + len(theta),
-        pareto_k=k,
-    ), log_weight_at
+    return replace(found, log_z_error=error, n_calls=n_calls + len(theta)), log_weight_at
 
 
 def _laplace(problem: SensorProblem, space: LightContrasts, peak: FloatArray) -> _StudentTDensity:

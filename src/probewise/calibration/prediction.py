@@ -42,8 +42,6 @@ def predict(
 
     Parameters
     ----------
-    sensor
-        The fitted sensor.
     plan
         Pose, time and pattern of every reading, n_points rows; or a recording, whose readings are then scored.
     readings
@@ -58,10 +56,9 @@ def predict(
 
     Raises
     ------
-    ShapeError
-        If readings and rows differ in number.
-    ParameterError
-        If readings are given with a recording, or the plan reads over a pattern that is not described.
+    ShapeError, ParameterError
+        If readings and rows differ in number; if readings are given with a recording, or the plan reads over a pattern
+        that is not described.
 
     Warns
     -----

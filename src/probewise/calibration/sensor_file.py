@@ -94,32 +94,23 @@ class FittedSensor(NamedSamples):
         Noise sd of a reading in a new scan for each sample, pooled over scans, (n_samples,).
     field
         Posterior mean of the SSF fields: the paper's discrete SSF (eq. "discreteR"). The robot uses `mean_mixture()`.
-    instrumentation
-        The instrument: unit, range and step of the readings, sensor, controls.
     effects
         Names of the effects in the model, in the order of their columns.
-    forms
-        By effect, which of its formulas it has (`OTHER_FORMS`); others have the vocabulary's.
-    patterns
-        By effect, the names of the patterns to which it is restricted; other effects act on all patterns.
+    forms, patterns
+        By effect, which of its formulas it has (`OTHER_FORMS`), others have the vocabulary's; and the names of the
+        patterns to which it is restricted, others act on all.
     absent
         By effect, a mask of the samples without the effect, (n_samples,), where a diagnosis is uncertain whether it is
         present; other effects act in all samples.
     origins
         By effect, the time and position from which it counts, where it was found in a recording far from 0; others
         count from 0.
-    scan_noise
-        Noise of each scan of the recording.
-    fingerprint, source
-        Of the recording: hash of its content, and its file name.
+    scan_noise, fingerprint, source
+        Of the recording: noise of each scan, hash of its content, and its file name.
     orders
         Log evidence of every order tried.
-    priors
-        The table of priors.
     notes
         Reasons to use the result with care; empty if there are none.
-    version
-        Version of the package.
     """
 
     names: tuple[str, ...]
@@ -146,9 +137,9 @@ class FittedSensor(NamedSamples):
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
-        unknown = [both for both in self.forms.items() if both[0] not in self.effects or both not in OTHER_FORMS]
-        if unknown:
-            raise ParameterError("forms", unknown[0], f"effects of the model among {sorted(OTHER_FORMS)}")
+        other = [both for both in self.forms.items() if both[0] not in self.effects or both not in OTHER_FORMS]
+        if other:
+            raise ParameterError("forms", other[0], f"effects of the model among {sorted(OTHER_FORMS)}")
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
@@ -235,6 +226,10 @@ class FittedSensor(NamedSamples):
         left_out = {name for name, out in zip(self.absent, sets[np.argmax(counts)], strict=True) if out}
         kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] not in left_out]
         samples = self.samples[rows][:, kept]
+        of_effects: dict[str, Any] = {
+            key: {name: own for name, own in getattr(self, key).items() if name not in left_out}
+            for key in ("forms", "patterns", "origins")
+        }
         return dataclasses.replace(
             self,
             names=tuple(self.names[k] for k in kept),
@@ -242,9 +237,7 @@ class FittedSensor(NamedSamples):
             noise_sd=self.noise_sd[rows],
             field=posterior_mean_ssf_field(samples[:100], self.n_gaussians, pixel_mm=self.field.pixel_mm),
             effects=tuple(name for name in self.effects if name not in left_out),
-            forms={name: own for name, own in self.forms.items() if name not in left_out},
-            patterns={name: own for name, own in self.patterns.items() if name not in left_out},
-            origins={name: own for name, own in self.origins.items() if name not in left_out},
+            **of_effects,
             absent={},
         )
 
@@ -394,15 +387,7 @@ class FittedSensor(NamedSamples):
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
-    """Write a fitted sensor to the file `path` (sensor.json), atomically.
-
-    Raises
-    ------
-    ParameterError
-        If `sensor` is not a FittedSensor; that of a Calibration is its `sensor`.
-    FileError
-        If the file cannot be written.
-    """
+    """Write a fitted sensor to the file `path` (sensor.json), atomically; FileError if it cannot be written."""
     require_fitted_sensor(sensor)
     path = checked_path("path", path)
     write_text_atomically(path, sensor.to_json())
@@ -411,10 +396,7 @@ def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
 def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
     """Read a fitted sensor from the file `path` (sensor.json).
 
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, or of another format.
+    FileError if the file is missing, damaged, or of another format.
     """
     path = checked_path("path", path, "the name of a sensor.json file; a FittedSensor needs no reading")
     return FittedSensor.from_json(read_text(path, _ALLOWED), path)

@@ -24,11 +24,11 @@ from probewise.diagnosis.noise_models import HIDDEN, NoiseModel
 from probewise.diagnosis.outlying import note_on_improbable_rows
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node
 from probewise.diagnosis.simulator_fit import log_evidence_of, modes_of
-from probewise.diagnosis.simulator_posterior import NUMBERS, Draws, ProblemInBlocks, draw_by_importance
+from probewise.diagnosis.simulator_posterior import NUMBERS, ProblemInBlocks, draw_by_importance
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.nested import Weighted
 from probewise.nested.repartition import repartitioned
-from probewise.nested.weights import resampled_rows
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, run_table_csv, table_for
@@ -98,6 +98,7 @@ def fitted_system_from_samples(
     )
 
 
+_LEAST_ERROR = 1e-3  # of the log evidence
 _N_LIVE = 200
 _MOST_SAMPLES = 2000  # equally weighted, where many predictions cost little; else as few as a diagnosis has
 _ROUNDING = 1e-15  # of the largest reading: least noise sd
@@ -227,7 +228,7 @@ def fit_simulator(
     n_samples = N_SAMPLES
     if system.predicts_in_bulk:
         n_samples = int(np.clip(NUMBERS // len(recording), N_SAMPLES, _MOST_SAMPLES))
-    z = draws.z[rng.permutation(resampled_rows(draws.weight, n_samples, rng))]
+    z = draws.samples(n_samples, rng=rng)
     predicted = problem.predict(z)
     likeliest = noise.likeliest_law
     if likeliest.flat:
@@ -247,7 +248,7 @@ def fit_simulator(
     known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
     fitted = fitted_system_from_samples(system, samples, recording, mean, known=known)
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
-    evidence = Evidence(draws.log_z, draws.log_z_error, "importance sampling")
+    evidence = Evidence(draws.log_z, max(draws.log_z_error, _LEAST_ERROR), "importance sampling")
     beside = _nested_sampling(problem, z, rng=rng, progress=progress) if thorough else None
     return SystemFit(recording, fitted, evidence, mean, sd, beside)
 
@@ -265,7 +266,7 @@ def _distinct(fits: Sequence[Fit], law: NoiseLaw) -> list[Fit]:
 
 
 def _doubts(
-    problem: HypothesisProblem, draws: Draws, mode: FloatArray, n_even: int, *, is_settled: bool
+    problem: HypothesisProblem, draws: Weighted, mode: FloatArray, n_even: int, *, is_settled: bool
 ) -> Iterator[str]:
     """Yield a note if parameters can be exchanged, if draws are few, and if all are far less likely than the mode."""
     if n_even > 1:
@@ -275,7 +276,7 @@ def _doubts(
         )
     if not is_settled:
         yield (
-            f"the posterior is hard to sample ({draws.n_effective:.0f} effective draws, Pareto k "
+            f"the posterior is hard to sample ({draws.n_eff:.0f} effective draws, Pareto k "
             f"{draws.pareto_k:.2f}): medians, sds and log evidence are rough; the mode is not"
         )
     lost = float(problem.log_likelihood(mode[None, :])[0] - draws.log_likelihood.max())

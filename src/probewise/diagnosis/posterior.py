@@ -293,8 +293,8 @@ def posterior_draws(
     if in_bulk:
         asked = ProblemInBlocks(found.model, recording, problem.noise)
         draws, _ = draw_by_importance(asked, [found], laplace.law, sizes=_SIZES, rng=rng, progress=progress)
-        if draws.n_effective >= _LEAST_OF_IT * _ENOUGH * n_samples:
-            return np.asarray(draws.z[rng.permutation(resampled_rows(draws.weight, n_samples, rng))])
+        if draws.n_eff >= _LEAST_OF_IT * _ENOUGH * n_samples:
+            return draws.samples(n_samples, rng=rng)
     return _annealed(laplace, steps, log_posterior, n_samples, rng=rng, progress=progress)
 
 

@@ -20,9 +20,9 @@ from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit
 from probewise.diagnosis.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.simulator_fit import log_evidence_of
-from probewise.nested import pareto_k
+from probewise.nested import Weighted
+from probewise.nested.importance import weighted_draws
 from probewise.nested.weights import (
-    n_effective,
     resampled_rows,
     student_t_draws,
     student_t_log_norm,
@@ -68,50 +68,6 @@ class ProblemInBlocks(HypothesisProblem):
 
 
 @dataclass(frozen=True, eq=False)
-class Draws:
-    """Draws of a posterior, coordinates (n, n_params), with log likelihoods and log importance weights, (n,) both."""
-
-    z: FloatArray
-    log_likelihood: FloatArray
-    log_weight: FloatArray
-
-    @property
-    def log_z(self) -> float:
-        """Log evidence."""
-        return float(logsumexp(self.log_weight)) - math.log(len(self.z))
-
-    @property
-    def log_z_error(self) -> float:
-        """Its standard error."""
-        return math.sqrt(max(1 / max(self.n_effective, 1.0) - 1 / len(self.z), 1e-6))
-
-    @property
-    def n_effective(self) -> float:
-        """Kish's effective sample size."""
-        return n_effective(self.log_weight)
-
-    @property
-    def pareto_k(self) -> float:
-        """Shape of the weights' tail."""
-        there = self.log_weight[np.isfinite(self.log_weight)]
-        return pareto_k(there) if len(there) > 1 else math.inf
-
-    @property
-    def weight(self) -> FloatArray:
-        """Weights, (n,), the largest 1."""
-        return np.asarray(np.exp(self.log_weight - self.log_weight.max()))
-
-    def sd(self) -> FloatArray:
-        """Return the sd of each coordinate, (n_params,)."""
-        off = self.z - np.average(self.z, axis=0, weights=self.weight)
-        return np.asarray(np.sqrt(np.average(off**2, axis=0, weights=self.weight)))
-
-    def tempered_weight(self, wanted: float) -> FloatArray:
-        """Return the weights to the largest power, up to 1, that leaves so many effective draws, (n,)."""
-        return np.asarray(self.weight ** tempering_power(self.log_weight, wanted))
-
-
-@dataclass(frozen=True, eq=False)
 class _Kernels:
     """A mixture of Student-t kernels: means (k, n_params), precisions (k, n_params, n_params), shares (k,), tails."""
 
@@ -152,7 +108,7 @@ def draw_by_importance(
     sizes: tuple[int, int, int, float] | None = None,
     rng: np.random.Generator,
     progress: Progress,
-) -> tuple[Draws, bool]:
+) -> tuple[Weighted, bool]:
     """Draw from a posterior by adaptive importance sampling from its modes; return the draws, and whether they settled.
 
     The first proposal has a kernel at each mode, the second kernels along the ridges from there. Each further one has
@@ -179,21 +135,23 @@ def draw_by_importance(
         log_prior, log_likelihood = np.append(log_prior, prior), np.append(log_likelihood, problem.log_likelihood(new))
         log_mixture = np.append(log_mixture, logsumexp(of_all, axis=0))
         height = np.where((np.abs(z) < FARTHEST).all(axis=1), log_prior + log_likelihood, -np.inf)
-        draws = Draws(z, log_likelihood, height - log_mixture + math.log((1 + 1 / _PER_PRIOR) * len(proposals)))
-        sd = draws.sd()
-        now, share = (draws.log_z, sd), draws.n_effective / len(z)
-        is_sound = draws.n_effective >= enough and (draws.pareto_k < _UNSURE_K or share > _UNIFORM)
+        log_ratio = height - log_mixture + math.log((1 + 1 / _PER_PRIOR) * len(proposals))
+        draws = weighted_draws(problem.prior.names, z, log_likelihood, log_ratio, len(z))
+        weight = np.exp(log_ratio - log_ratio.max())
+        sd = np.sqrt(np.average((z - np.average(z, axis=0, weights=weight)) ** 2, axis=0, weights=weight))
+        now, share = (draws.log_z, sd), draws.n_eff / len(z)
+        is_sound = draws.n_eff >= enough and (draws.pareto_k < _UNSURE_K or share > _UNIFORM)
         is_still = abs(now[0] - before[0]) < _SETTLED[0] and np.allclose(sd, before[1], rtol=_SETTLED[1])
         if is_sound and (is_still or (not k and share > _AS_IT_IS)):
             return draws, True
         before = now
-        progress("sampling the posterior", note=f"{draws.n_effective:.0f} effective draws")
+        progress("sampling the posterior", note=f"{draws.n_eff:.0f} effective draws")
         along = not k and sensor.predicts_in_bulk and not sensor.predicts_dearly
         anchors = rng.permutation(ridge.follow(fits, rng=rng)) if along else z[:0]
         if len(anchors) > n_params:
             spread, anchors = np.cov(anchors.T), anchors[:n_kernels]
         else:  # readings that are met exactly leave a mode from which no stride is likely enough
-            weight = draws.tempered_weight(_TEMPERED * n_params)
+            weight = weight ** tempering_power(log_ratio, _TEMPERED * n_params)
             anchors = z[np.unique(resampled_rows(weight, n_kernels, rng))]
             middle, spread = np.average(z, axis=0, weights=weight), np.cov(z.T, aweights=weight)
             anchors[1::2] = np.clip(middle + _STRETCHED * (anchors[1::2] - middle), -FARTHEST, FARTHEST)

@@ -117,6 +117,20 @@ def evenly_weighted(
     )
 
 
+def weighted_draws(
+    names: tuple[str, ...], theta: FloatArray, log_likelihood: FloatArray, log_ratio: FloatArray, n_draws: int
+) -> Weighted:
+    """Return draws, (n, n_params), weighted by the log of target over proposal density, (n,), as plain samples.
+
+    The evidence is the mean weight of the `n_draws` that were made, those left out as impossible included.
+    """
+    total, n_eff = float(logsumexp(log_ratio)), n_effective(log_ratio)
+    error = math.sqrt(max(1.0 / max(n_eff, 1.0) - 1.0 / n_draws, 0.0))
+    there, evidence = log_ratio[np.isfinite(log_ratio)], (total - math.log(n_draws), error, n_eff)
+    k = pareto_k(there) if len(there) > 1 else math.inf
+    return Weighted(names, theta, log_likelihood, log_ratio - total, *evidence, n_draws, k)
+
+
 @dataclass(frozen=True, eq=False)
 class Proposal:
     """A mixture of Student-t kernels, of one shape within each cluster.

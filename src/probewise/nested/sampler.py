@@ -286,15 +286,15 @@ def replace_worst_live_points(
     start = survivors.take_rows(begin)
     new, tally = move.draw(start.without_births(), bound, survivors.u, evaluate, rng)
     ident = live.ident.max() + 1 + np.arange(n_replaced)
-    level = np.full(n_replaced, bound.log_likelihood), np.full(n_replaced, bound.label)
-    after = LivePoints.join(survivors, LivePoints(*vars(new).values(), *level, ident, start.ident))
+    level = {"log_birth": np.full(n_replaced, bound.log_likelihood), "birth_label": np.full(n_replaced, bound.label)}
+    after = LivePoints.join(survivors, LivePoints(**vars(new), **level, ident=ident, parent=start.ident))
     place = np.empty(n_live, dtype=np.int64)
     place[after.rows_by_rising_likelihood()] = np.arange(n_live)
     n_ranked = len(survivors) + np.arange(n_replaced)
     worse = place[None, :] < place[len(survivors) :, None]
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    return after, DeadPoints(*vars(doomed).values(), n_at_death, rank, n_ranked), tally
+    return after, DeadPoints(**vars(doomed), n_at_death=n_at_death, rank=rank, n_ranked=n_ranked), tally
 
 
 def run_once(

@@ -48,7 +48,8 @@ class LivePoints(Points):
     def drawn_from_prior(cls, points: Points) -> Self:
         """Return draws from the prior, numbered from 0."""
         n = len(points)
-        return cls(*vars(points).values(), np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
+        births = {"log_birth": np.full(n, -np.inf), "birth_label": np.ones(n), "parent": np.full(n, -1)}
+        return cls(**vars(points), **births, ident=np.arange(n))
 
 
 @dataclass(frozen=True, eq=False)

@@ -172,7 +172,7 @@ def _draw_matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: fl
     shown = np.where(np.eye(len(labels), dtype=np.bool_), np.nan, cosines)
     compared = np.nan_to_num(shown).any(axis=0) | np.nan_to_num(shown).any(axis=1)
     shown[~compared, :] = np.nan
-    columns = np.flatnonzero(compared if compared.any() else ~compared)
+    columns = np.flatnonzero(compared if compared.any() else ~compared).tolist()
     image = ax.imshow(shown[:, columns], cmap=canvas.COPPER, vmin=0, vmax=1, aspect="auto")
     at_row, at_column = np.nonzero(np.nan_to_num(shown[:, columns]) >= alias)
     ax.plot(at_column, at_row, linestyle="none", marker="o", markersize=4, color="white", markeredgecolor="black")

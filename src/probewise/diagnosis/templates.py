@@ -63,7 +63,7 @@ class TemplateBank:
 
     def __getitem__(self, at: int) -> FloatArray:
         """Return the template of entry number `at`, (n_points, k)."""
-        return self.templates[self.which[at]]
+        return self.templates[int(self.which[at])]
 
     @property
     def _precision(self) -> np.dtype[Any]:

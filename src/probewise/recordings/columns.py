@@ -197,7 +197,7 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
 def codes_and_names_of_runs(cells: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
     """Return the number of each cell's run of equal cells, from 0, (n_cells,), and what is in each run."""
     begins = np.fromiter((k == 0 or cells[k] != cells[k - 1] for k in range(len(cells))), dtype=np.bool_)
-    return np.cumsum(begins) - 1, tuple(cells[k] for k in np.flatnonzero(begins))
+    return np.cumsum(begins) - 1, tuple(cells[k] for k in np.flatnonzero(begins).tolist())
 
 
 def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:

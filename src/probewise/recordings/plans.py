@@ -112,7 +112,7 @@ def _plan_of_scans(scans: Sequence[_Scan], break_s: float) -> Plan:
     counts = [len(each) for each in places]
     intervals = np.repeat(np.array(paces_s, dtype=np.float64), counts)
     intervals[np.cumsum(counts)[:-1]] = break_s
-    time_s = np.round(np.cumsum(intervals), 3)
+    time_s = np.round(np.cumsum(intervals), 3).astype(np.float64)
     x_mm, y_mm = np.concatenate(places).T
     under = [name for own, n in zip(named, counts, strict=True) for name in (own if len(own) == n else own * n)]
     patterns = {name: pattern for name, pattern in PATTERNS.items() if name in under}

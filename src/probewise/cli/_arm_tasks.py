@@ -6,6 +6,7 @@ import argparse
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -64,9 +65,9 @@ def open_instrument(
         raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
     if chosen.kind == "file":
         refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
-    default = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
-    given = {name: getattr(arguments, name, None) for name in default}
-    given = {name: default[name] if value is None else value for name, value in given.items()}
+    default: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
+    asked = {name: getattr(arguments, name, None) for name in default}
+    given = default | {name: value for name, value in asked.items() if value is not None}
     opened = _bench.open_arm_and_bench(chosen, geometry, arguments.geometry, **given, start_s=start_s, n_taken=n_taken)
     print_result(f"seed {given['seed']}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
     return opened

@@ -220,10 +220,10 @@ def person_at_bench(
     answer = _bench.prompter_for_answer(arm)
 
     def hint(request: RequestToPerson) -> str:
-        if not emulated or (request.turned_rad is None and request.pattern is None):
-            return ""
-        if request.turned_rad is not None:
+        if emulated and request.turned_rad is not None:
             return f" (in the emulator's terminal: turn {np.degrees(request.turned_rad):g})"
+        if not emulated or request.pattern is None:
+            return ""
         try:
             scene = scene_text(_bench.shifted_pattern(plan.patterns[request.pattern], origin_mm))
         except ParameterError:

@@ -78,13 +78,13 @@ def _run_demo(
         diagnosing = pool.submit(_diagnose_shipped_recording, seed)
         calibration = _calibrate_shipped_recording(seed, arguments.full, pool)
         sensor = calibration.sensor
-        seek, longest = partial(pool.submit, search, sensor, truth, seed), {"max_readings": MAX_READINGS}
-        doubting = {
-            name: seek(7, trust=trust, saturating=True, max_readings=MAX_READINGS_DOUBT)
-            for name, trust in TRUSTS.items()
-        }
-        starting = {name: seek(6, model=model, utility=ReadingEntropy(), **longest) for model, name in MODELS.items()}
-        searching = {name: seek(2, model=model, on_circle=False, **longest) for model, name in MODELS.items()}
+
+        def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
+            return pool.submit(search, sensor, truth, seed, stream, max_readings=max_readings, **options)
+
+        doubting = {name: seek(7, MAX_READINGS_DOUBT, trust=trust, saturating=True) for name, trust in TRUSTS.items()}
+        starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in MODELS.items()}
+        searching = {name: seek(2, model=model, on_circle=False) for model, name in MODELS.items()}
         parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
         progress(doing, 1, 8)
         for done, future in enumerate(as_completed(parts), start=2):

@@ -67,7 +67,7 @@ def open_instrument(
         refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
     default: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
     asked = {name: getattr(arguments, name, None) for name in default}
-    given = default | {name: value for name, value in asked.items() if value is not None}
+    given: dict[str, Any] = default | {name: value for name, value in asked.items() if value is not None}
     opened = _bench.open_arm_and_bench(chosen, geometry, arguments.geometry, **given, start_s=start_s, n_taken=n_taken)
     print_result(f"seed {given['seed']}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
     return opened

@@ -265,7 +265,8 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
 
 def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     """Return an arm in the world with the concealed effect; seed, circle and reading number determine its noise."""
-    now, made = trial.conditions, ()
+    now = trial.conditions
+    made: Any = ()
     if trial.effect:
         make, sizes = CONCEALED[trial.effect]
         made = make(sizes[trial.size], now, np.random.default_rng([trial.seed, trial.circle, trial.size, 2]))

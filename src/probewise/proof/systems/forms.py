@@ -199,7 +199,8 @@ def _form_of_number(
     name: str, side: Side, number: str, act: Callable[..., Any], first: float, limit: float, *more: Any, **others: Any
 ) -> Form:
     """Return a form of one parameter, the `number`, which is the amplitude."""
-    return Form(name, side, act, first, limit, *more, of_amplitude=lambda a, drawn: {number: a}, signed=False, **others)
+    others |= {"of_amplitude": lambda a, drawn: {number: a}, "signed": False}
+    return Form(name, side, act, first, limit, *more, **others)
 
 
 def delayed_values(values: FloatArray, rows: SystemTable, tau: float) -> FloatArray:

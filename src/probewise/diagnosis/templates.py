@@ -32,7 +32,7 @@ from probewise.effects import NamedEffect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
-_ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error
+_ABSENT = {8: 1e-9, 4: 1e-5}  # share of a template's squares below which its projection is rounding, by bytes
 _REMEMBERED = 5  # most recent noise models of which whitened templates are cached, up to `_MOST_BYTES`
 _MOST_BYTES = 2**28
 _MOST_GRAMS = 64  # noise models of which the Gram matrices are
@@ -115,7 +115,7 @@ class TemplateBank:
                 absorbed = taken[:, at].transpose(1, 0, 2)
                 left = products - absorbed.transpose(0, 2, 1) @ absorbed
                 gain, axes = _gram_eigensystems(left)
-                gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
+                gain = np.where(gain > _ABSENT[self._precision.itemsize] * n_kept, gain, 0.0)
                 turned = axes.transpose(0, 2, 1) @ along[at]
                 explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
                 out[group.start + members] = average_over_amplitude_scales(explained, gain, n_kept)

@@ -183,14 +183,21 @@ def _forms_of_levels(true: TrueSystem) -> Iterator[Form]:
     common: dict[str, Any] = {"signed": False, "order": _CEILING}
     for name, bound, end in (("saturation", np.minimum, high), ("saturation (floor)", np.maximum, low)):
         inwards = -1.0 if end == high else 1.0
+
+        def bounded(y: FloatArray, rows: SystemTable, v: Any, bound: Any = bound) -> FloatArray:
+            return np.asarray(bound(y, v["level"]))
+
+        def level_at(a: float, drawn: Any, end: float = end, inwards: float = inwards) -> dict[str, float]:
+            return {"level": end + inwards * a}
+
         yield Form(
             name,
             "reading",
-            lambda y, rows, v, bound=bound: bound(y, v["level"]),
+            bounded,
             2 * sd,
             0.5 * span,
             ("level",),
-            of_amplitude=lambda a, drawn, end=end, inwards=inwards: {"level": end + inwards * a},
+            of_amplitude=level_at,
             **common,
         )
 

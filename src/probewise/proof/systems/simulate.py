@@ -105,7 +105,9 @@ class _Integration:
         """Return every state by name at every row, (n_points,)."""
         names, first = list(self.law.start), self.rows_by_position_and_run[0]
         starts = [self.parameters[each] if isinstance(each, str) else each for each in self.law.start.values()]
-        s = np.array([np.broadcast_to(each[first] if np.ndim(each) else each, len(first)) for each in starts])
+        s = np.array(
+            [np.broadcast_to(np.asarray(each)[first] if np.ndim(each) else each, len(first)) for each in starts]
+        )
         for form, level in self.hard:
             if form.stops:
                 k = names.index(form.target)
@@ -240,7 +242,7 @@ class _Integration:
                         found[form.target] = (
                             0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
                         )
-                    return gap * np.array([found[name] for name in names])
+                    return np.asarray(gap * np.array([found[name] for name in names]))
 
                 ends = [_end_of_mode(*f, mode, names, free_rates) for f, mode in zip(self.hard, modes, strict=True)]
                 solved = self._solved(slope, share, high, s, ends)

@@ -12,7 +12,7 @@ from probewise.inquiry import CardedForecast, TabulatedChain, forecast_of
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
-from probewise.scene import Card
+from probewise.scene import Card, CardedScene
 from probewise.world import World
 
 CARDS = (Card(300.0, 200.0, 60.0, 40.0, 0.5), Card(700.0, 100.0, 30.0, 30.0, 1.0))
@@ -21,7 +21,7 @@ CARDS = (Card(300.0, 200.0, 60.0, 40.0, 0.5), Card(700.0, 100.0, 30.0, 30.0, 1.0
 @pytest.fixture(scope="module")
 def chain():
     plain = experiment_of(REFERENCE).model
-    return replace(plain, scene=replace(plain.scene, cards=CARDS))
+    return replace(plain, scene=CardedScene(plain.scene.shape, CARDS))
 
 
 @pytest.fixture(scope="module")

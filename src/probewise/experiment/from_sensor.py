@@ -28,7 +28,7 @@ from probewise.priors import LogNormal, Marginal, Normal, Product
 from probewise.recordings import Recording
 from probewise.recordings import Uniform as UniformPattern
 from probewise.recordings.plan import require_patterns_described, require_recording
-from probewise.scene import AnyOf, Card, Field, HypothesisScene, KnownScene, Shape
+from probewise.scene import AnyOf, Card, CardedScene, Field, HypothesisScene, KnownScene, Shape
 from probewise.sensor import (
     FAST_NODES,
     Chain,
@@ -160,7 +160,7 @@ def experiment_for(
             raise ParameterError(name, value, allowed)
     sensor = sensor.with_leading_effects()  # a mean over several hypotheses describes none of them
     noise_sd = float(sensor.noise_sd.mean())
-    scene = HypothesisScene(shape, cards)
+    scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     if trust is None:
         unrivalled = paper or model == "naive" or learn_sensor or isinstance(shape, AnyOf)
         trust = 1.0 if unrivalled or chosen not in (None, Finishing()) else TRUST

@@ -32,7 +32,7 @@ from probewise.inquiry.forecast import (
 from probewise.inquiry.grid import Designs, Grid
 from probewise.inquiry.readout import evenly_spaced_levels
 from probewise.recordings.plan import Plan
-from probewise.scene import Circle, HypothesisScene
+from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.scene.scenes import mean_albedo_with_cards
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
 from probewise.sensor.commanded import led_state
@@ -86,7 +86,7 @@ class DiscTable:
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
-        if model.scene.cards:
+        if isinstance(model.scene, CardedScene):
             return None
         shape = model.scene.shape
         if not isinstance(shape, Circle) or model.names != NAMES:

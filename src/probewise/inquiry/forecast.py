@@ -13,7 +13,7 @@ from probewise.errors import ParameterError
 from probewise.inquiry.grid import Designs
 from probewise.inquiry.readout import evenly_spaced_levels
 from probewise.recordings.plan import Plan
-from probewise.scene import Card, HypothesisScene, outlines
+from probewise.scene import Card, CardedScene, HypothesisScene, outlines
 from probewise.scene.scenes import mean_albedo_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import RegionsAndPoses, response
@@ -172,7 +172,7 @@ def _bounding_boxes(model: SensorModel, theta: FloatArray, plan: Plan) -> tuple[
         return None
     if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
         return None
-    if not isinstance(model.scene, HypothesisScene) or model.scene.cards:
+    if not isinstance(model.scene, HypothesisScene) or isinstance(model.scene, CardedScene):
         return None
     try:
         edges = outlines(model.scene.shape.region(theta))
@@ -194,7 +194,7 @@ def _footprint_reach_mm(mixture: FixedMixture) -> float:
 def cards_of(model: SensorModel) -> tuple[Card, ...]:
     """Return the known cards on a model's field; empty if its scene has none."""
     scene = getattr(model, "scene", None)
-    return scene.cards if isinstance(scene, HypothesisScene) else ()
+    return scene.cards if isinstance(scene, CardedScene) else ()
 
 
 @dataclass(frozen=True, eq=False)

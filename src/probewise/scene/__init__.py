@@ -20,7 +20,7 @@ from probewise.scene.regions import (
     outlines,
     region_of,
 )
-from probewise.scene.scenes import Card, CardedRegion, HypothesisScene, KnownScene, Scene
+from probewise.scene.scenes import Card, CardedRegion, CardedScene, HypothesisScene, KnownScene, Scene
 from probewise.scene.shapes import (
     SHAPES,
     AnyOf,
@@ -40,6 +40,7 @@ __all__ = [
     "AnyOf",
     "Card",
     "CardedRegion",
+    "CardedScene",
     "Circle",
     "Ellipse",
     "EllipseRegion",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
@@ -61,10 +61,9 @@ class KnownScene:
 
 @dataclass(frozen=True)
 class HypothesisScene:
-    """One shape with unknown parameters, and known cards on it, under every reading, whatever the pattern's name."""
+    """One shape with unknown parameters under every reading, whatever the pattern's name."""
 
     shape: Shape
-    cards: tuple[Card, ...] = ()
 
     def __post_init__(self) -> None:
         require_shape(self.shape)
@@ -79,8 +78,7 @@ class HypothesisScene:
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return, for any pattern name, the regions of the hypotheses, one per row of theta (n_samples, n_params)."""
-        region = self.shape.region(theta)
-        return OneRegionForAllNames(CardedRegion(region, self.cards) if self.cards else region)
+        return OneRegionForAllNames(self.shape.region(theta))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,3 +180,14 @@ def _outlines_of_carded_region(region: CardedRegion, *, n_vertices: int = 96) ->
 @edge_distance.register
 def _edge_distance_of_carded_region(region: CardedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return edge_distance(region.region, x_mm, y_mm)
+
+
+@dataclass(frozen=True)
+class CardedScene(HypothesisScene):
+    """One shape of unknown parameters, and known cards on it, under every reading."""
+
+    cards: tuple[Card, ...] = field(default=())
+
+    def regions(self, theta: FloatArray) -> OneRegionForAllNames:
+        """Return, for any pattern name, the shape's regions with the cards on them, theta (n_samples, n_params)."""
+        return OneRegionForAllNames(CardedRegion(self.shape.region(theta), self.cards))

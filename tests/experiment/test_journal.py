@@ -24,7 +24,7 @@ from probewise.experiment import (
 )
 from probewise.recordings.patterns import Disc
 from probewise.recordings.plan import Instrumentation
-from probewise.scene import Circle, Field, HypothesisScene
+from probewise.scene import Card, CardedScene, Circle, Field, HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture
 
 SETTINGS = {"shape": "Circle()", "seed": "7", "spawn_key": [0], "options": {"n_live": 60}}
@@ -354,3 +354,14 @@ def test_what_lies_there_may_be_said_in_order_or_by_name(truth, name, theta):
     hidden = HiddenShape.given_or_drawn(truth, Circle(), Field(), rng=np.random.default_rng(0))
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
     assert hidden.journal_entry["shape"] == name
+
+
+@pytest.mark.parametrize(
+    ("cards", "begins"), [((), "d768feff3763a63d"), ((Card(120.0, 100.0, 80.0, 60.0, 1.0),), "fc65a040f38a87fb")]
+)
+def test_the_fingerprint_of_a_sensor_stays_that_of_the_journals_that_people_have(cards, begins):
+    """A class or a field with another name would refuse to resume every journal written before."""
+    circle = Circle(radius_mm=(50.0, 150.0), inside=True)
+    mixture = FixedMixture([1.0], [[0.0, 1.5]], [[[16.0, 0.0], [0.0, 6.25]]])
+    scene = CardedScene(circle, cards) if cards else HypothesisScene(circle)
+    assert value_digest(Chain(mixture, FixedLevels(10.0, 60.0), scene)).startswith(begins)

@@ -45,8 +45,17 @@ from probewise.systems.table import covariate_of_column, published_covariate
 TABLE = runs()
 
 
-def offered(controls=("power_w",), table=TABLE):
-    return {c.plan.scan_names[0]: c for c in possible_run_commands(table, "temp_c", controls, "s")}
+def offered(controls=("power_w",), table=TABLE, by_law=True):
+    commands = possible_run_commands(table, "temp_c", controls, "s", by_law=by_law)
+    return {command.plan.scan_names[0]: command for command in commands}
+
+
+def test_a_function_of_the_time_is_not_asked_what_no_recorded_run_shows():
+    """A step response holds while the power is constant: a switched power would be diagnosed as a delay."""
+    assert {"1 power_w low", "1 power_w high"} <= set(offered(by_law=False))
+    assert not {"1 power_w up", "1 power_w steps"} & set(offered(by_law=False))
+    power = np.where(np.arange(len(TABLE)) == 0, 2.5, TABLE.columns["power_w"])
+    assert "1 power_w steps" in offered(table=TABLE.with_columns({"power_w": power}), by_law=False)
 
 
 def test_a_control_is_swept_held_and_switched_between_its_ends():

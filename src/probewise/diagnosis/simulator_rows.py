@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -55,22 +55,27 @@ _BREAK = 0.5  # minutes, before a run
 _RUN = "run"
 
 
-def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[Command]:
+def possible_run_commands(
+    table: RunTable, reading: str, controls: Sequence[str], time_unit: str, *, by_law: bool = False
+) -> list[Command]:
     """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
 
     At most four recorded runs are taken, those that differ in their controls.
 
     `reading`: the predicted column, which is empty in rows yet to be taken; `controls`: columns that can be set;
-    without any, runs can only be repeated.
+    without any, runs can only be repeated. A function of the time may hold for constant controls alone, as a step
+    response does: unless the simulator is a law (`by_law`), only a control that varies in a recorded run does so again.
     """
     out: list[Command] = []
     settable = [name for name in controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
+    varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
+    free = set(settable) if by_law or table.time is None else varies
     for rows in _rows_of_distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
-        for kind, words, columns, slower in _variations_of_run(table, kept, ends, of):
+        for kind, words, columns, slower in _variations_of_run(table, kept, ends, free, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
             made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
             out.append(Command(kind, words, cast(Plan, made), _minutes_of_runs(made, time_unit)))
@@ -82,7 +87,7 @@ Change = tuple[str, str, Mapping[str, FloatArray], float]
 
 
 def _variations_of_run(
-    table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str
+    table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], free: Container[str], of: str
 ) -> Iterator[Change]:
     own = {name: table.covariates[name][rows] for name in ends}
     yield "again", f"take {of} again", {}, 1.0
@@ -110,6 +115,8 @@ def _variations_of_run(
         for kind, (said, shape) in shapes.items():
             text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{0.5 * (low + high):.4g}")
             values = shape(low, high)
+            if np.ptp(values) > 0 and name not in free:
+                continue
             if low < high:  # to a thousandth of the range or finer, so that they can be set; its ends stay
                 rounded = np.round(values, int(np.ceil(3 - np.log10(high - low))))
                 values = np.where((values == low) | (values == high), values, rounded)
@@ -396,7 +403,8 @@ class SimulatorApparatus(Apparatus):
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> list[Command]:
         own = self.system.simulator
-        return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
+        by_law = own.law is not None
+        return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit, by_law=by_law)
 
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_of_sequence = staticmethod(plan_of_sequence)

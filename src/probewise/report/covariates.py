@@ -138,7 +138,9 @@ class ResidualNoise:
             return cls(sd, noise.get("rho", 0.0), None)
         null = diagnosis.null
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
-        return cls(sd, noise.get("rho", 0.0), null.chain.predict(theta, plan))
+        # The null's spread is that of its own noise sd, which the misfit inflates.
+        narrower = min(1.0, float(diagnosis.repaired.noise_sd.mean() / null.noise_sd.mean()))
+        return cls(sd, noise.get("rho", 0.0), narrower * null.chain.predict(theta, plan))
 
     def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
         """Average the calibrated model's residuals in bins of a view; with `after`, also the repaired model's."""

@@ -99,7 +99,8 @@ def parse_arm(text: str) -> ArmName:
         return ArmName(kind, where)
     if text.endswith(".py"):
         return ArmName("file", text)
-    raise ParameterError("--arm", text, ARMS + did_you_mean(kind, ("simulated", "emulator", "nxt")))
+    meant = "; its port is missing" if kind == "nxt" else did_you_mean(kind, ("simulated", "emulator", "nxt"))
+    raise ParameterError("--arm", text, ARMS + meant)
 
 
 def parse_place(name: str, text: str) -> tuple[float, float]:

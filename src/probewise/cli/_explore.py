@@ -398,7 +398,7 @@ def explore(arguments: argparse.Namespace) -> int:
         _bench.InstrumentWithCallbacks(
             site.arm,
             lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
-            lambda reading: report_activity(f"thinking about {reading.value:g}"),
+            lambda reading: report_activity(f"thinking about a reading of {reading.value:g}"),
         ) as reporting,
         closing(
             experiments.explore(

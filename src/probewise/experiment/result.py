@@ -246,12 +246,13 @@ class Exploration(ShowsItself):
 
     def summary(self) -> str:
         """Describe the run in plain text."""
-        last = self.last
+        last, paper = self.last, ""
+        if self.reached:
+            paper = f" (the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} per reading)"
         lines = [
             f"readings     {len(self.steps)}",
             f"stopped      {self.stop_reason}",
-            f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} per reading "
-            f"(the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} per reading)",
+            f"information  {last.bits:.1f} bits, {self.bits_per_reading:.2f} per reading{paper}",
             f"log Z        {self.posterior.log_z:.2f} ± {self.posterior.log_z_error:.2f}",
             "fit          not tested: the most probable noise is not the declared one"
             if last.p_value is None

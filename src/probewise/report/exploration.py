@@ -82,7 +82,7 @@ def robot_view_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
-    ax = axes_of_frame((8.2, 4.7), (0.75, 1.1, 0.95, 0.35))
+    ax = axes_of_frame((8.4, 4.7), (0.75, 1.1, 1.15, 0.35))
     draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
     return png(ax, dpi=90, tight=False)
@@ -305,7 +305,7 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
         "stopped because": run.stop_reason,
         "cost": f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time",
         "information": f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading",
-        "the paper's count": f"{paper} bits per reading (25 bits over the readings)",
+        **({"the paper's count": f"{paper} bits per reading (25 bits over the readings)"} if run.reached else {}),
         f"probability that a length is off by over {OFF_MM:g} mm": off,
         "fit of the best hypothesis": fits,
         "seed": str(seed),

@@ -18,6 +18,7 @@ from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
+from probewise.nested.repartition import Repartitioned
 from probewise.priors import Normal, Product, Uniform
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene
@@ -132,7 +133,7 @@ def stub_of_the_whole_prior(monkeypatch, change):
 
     def run(problem, **options):
         result = nested.run(problem, **options)
-        return result if isinstance(problem, nested.Repartitioned) else change(result)
+        return result if isinstance(problem, Repartitioned) else change(result)
 
     monkeypatch.setattr(thorough, "nested", SimpleNamespace(**{**vars(nested), "run": run}))
 

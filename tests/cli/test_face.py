@@ -125,7 +125,10 @@ def test_a_seed_calibrates_the_same_sensor_in_python_and_on_the_command_line(
     assert main(["calibrate", str(recording_file), "--out", str(tmp_path / "out"), *options]) == 0
     theirs = probewise.read_sensor(tmp_path / "out" / "sensor.json")
     own = probewise.calibrate(recording, orders=[1], n_live=16, rng=np.random.default_rng(5), progress=False)
-    assert json.loads(own.sensor.to_json()) == json.loads(theirs.to_json())
+    ours, read = json.loads(own.sensor.to_json()), json.loads(theirs.to_json())
+    # A field that was read is normalised once more, which on some processors moves the last digit.
+    np.testing.assert_allclose(ours.pop("field").pop("values"), read.pop("field").pop("values"), rtol=1e-12)
+    assert ours == read
 
 
 @pytest.mark.slow

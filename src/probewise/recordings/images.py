@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import struct
+import zlib
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -15,7 +16,7 @@ from probewise.errors import FileError, ParameterError
 from probewise.recordings.io import read_bytes
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_COLOURS = (0, 2, 3, 4, 6)  # grey, RGB, palette, grey and RGB with alpha
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # grey, RGB, palette, grey and RGB with alpha
 _ALLOWED = "a PNG of 8 bits per channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
 _LARGEST_PIXELS = 100_000_000
 # By version; 3.0 is only for structured arrays.
@@ -98,7 +99,7 @@ def _albedo_from_png(path: Path, content: bytes) -> FloatArray:
     if content[12:16] != b"IHDR" or len(content) < 33:
         raise FileError(path, "the PNG has no header", _ALLOWED)
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", content[16:29])
-    if depth != 8 or colour not in _COLOURS or interlace or not 0 < width * height <= _LARGEST_PIXELS:
+    if depth != 8 or colour not in _CHANNELS or interlace or not 0 < width * height <= _LARGEST_PIXELS:
         found = f"{width} x {height} pixels, {depth} bits, colour type {colour}, interlace {interlace}"
         raise FileError(path, found, f"{_ALLOWED}, at most {_LARGEST_PIXELS} pixels")
     try:
@@ -108,6 +109,22 @@ def _albedo_from_png(path: Path, content: bytes) -> FloatArray:
             if picture.mode == "P" and len(palette) <= 3 * int(np.asarray(picture).max()):
                 raise ValueError("the palette is missing or too short for the pixels")
             pixels = np.asarray(picture.convert("RGBA"), dtype=np.float64)
+        size = height * (1 + width * _CHANNELS[colour])
+        n_bytes = _count_bytes_of_pixels(content, size + 1)
     except Exception as error:  # damaged files make Pillow raise many kinds
         raise FileError(path, f"the PNG is damaged or cut short ({error})", _ALLOWED) from error
+    if n_bytes != size:  # Pillow takes missing lines for black
+        raise FileError(path, f"{n_bytes} bytes of pixel data", f"{size} bytes for {width} x {height} pixels")
     return np.asarray(pixels[..., :3].mean(axis=-1) / 255.0 * (pixels[..., 3] / 255.0))
+
+
+def _count_bytes_of_pixels(content: bytes, most: int) -> int:
+    """Count the decompressed bytes of a PNG's pixels up to `most`: a small file can expand to gigabytes."""
+    packed, at = bytearray(), len(_SIGNATURE)
+    while at < len(content):
+        begin = at + 8
+        end = begin + int.from_bytes(content[at : at + 4], "big")
+        if content[at + 4 : begin] == b"IDAT":
+            packed += content[begin:end]
+        at = end + 4  # behind the checksum
+    return len(zlib.decompressobj().decompress(packed, most))

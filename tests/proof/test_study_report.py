@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from probewise.experiment import CLEAN, least_readings
 from probewise.proof import pages as report
 from probewise.proof import plots
-from probewise.proof.concealed_study import ConcealedTrial, concealed_rows
+from probewise.proof.concealed_study import ConcealedTrial, concealed_forms, concealed_rows
 from probewise.proof.configurations import REFERENCE, SearchConfiguration
 from probewise.proof.study import Study
 from probewise.proof.trial import experiment_of
@@ -124,6 +125,16 @@ def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
     page = report.concealed_html(rows, command="probewise study --concealed")
     assert "backlash (play) of the arm, 6" in page
     assert "0.00 | 1.00" in page
+    assert "By form" not in page
+
+
+def test_the_page_sums_up_what_was_concealed_by_form_where_there_are_several():
+    runs = concealed_runs()
+    runs |= {replace(trial, effect="bent_rail"): run for trial, run in runs.items() if trial.effect}
+    page = report.concealed_html(concealed_rows(runs), concealed_forms(runs), command="probewise study --concealed")
+    assert "By form" in page
+    assert ">in the list<" in page
+    assert ">in no list<" in page
 
 
 def test_doubt_and_trust_stand_beside_each_other_in_every_row():

@@ -220,7 +220,7 @@ def concealed_sentence(rows: Sequence[ConcealedRow]) -> str:
 def concealed_html(
     rows: Sequence[ConcealedRow], forms: Sequence[ConcealedRow] = (), *, command: str, draw: Draw = draw_or_raise
 ) -> str:
-    """Return the HTML of the page of a study of concealed effects, with the rows of their forms, if there are several.
+    """Return the HTML of the page of a study of concealed effects, also by their `forms` if there are several.
 
     Other parameters as in `study_html`.
     """
@@ -233,6 +233,8 @@ def concealed_html(
         Section("The table", (_doubt_against_trust_table(rows), _concealed_table_legend())),
         Section("How it was made", (definition_list([("command", command)]),)),
     ]
+    if len({row.concealed for row in forms}) > 1:
+        sections.insert(1, Section("By form", (_doubt_against_trust_table(forms), paragraph(_FORMS))))
     return page("A robot with a concealed fault", answer=concealed_sentence(rows), key_figure=drawn, sections=sections)
 
 

@@ -181,9 +181,7 @@ def n_independent(theta: FloatArray, weight: FloatArray, parent: IntArray) -> fl
     return float(1.0 / (drawn * part**2).sum(axis=0).max(initial=float(weight @ weight)))
 
 
-def relative_lineage_variance(
-    parent: IntArray, birth_row: IntArray, n_at_death: IntArray, log_weight: FloatArray
-) -> float:
+def relative_lineage_variance(parent: IntArray, birth_row: IntArray, n_at_death: IntArray, weight: FloatArray) -> float:
     """Estimate the variance of log Z relative to that of a run whose new points are independent draws.
 
     Every point that dies after a given time descends from one of the n points alive then. Let s be the shares of these
@@ -198,11 +196,10 @@ def relative_lineage_variance(
 
     `parent`: row of each point's parent, -1 for draws from the whole prior; rows are in order of death. `birth_row`:
     row of the dead point above whose level each was drawn, -1 at the start. `n_at_death`: number of points alive when
-    each died, itself included. `log_weight`: log of each point's share of the evidence. All (n_dead,).
+    each died, itself included. `weight`: each point's share of the evidence. All (n_dead,).
 
     Return the ratio of variances, 1 or more; 1 for a run of fewer than 17 rounds, too short for an estimate.
     """
-    weight = np.exp(log_weight)
     left = np.append(np.cumsum(weight[::-1])[::-1], 0.0)  # evidence from each row on
     from_shrinkage = np.concatenate([[0.0], np.cumsum((left[:-1] / n_at_death) ** 2)])
     births = np.sort(birth_row)

@@ -537,7 +537,8 @@ def _final_result(
     )
     parent = np.where(points.parent >= 0, np.argsort(points.ident)[points.parent], -1)
     born = birth_rows(points.log_likelihood, points.label, points.log_birth, points.birth_label)
-    remembered = relative_lineage_variance(parent, born, n_at_death, evidence.log_weight)
+    weight = np.exp(evidence.log_weight)
+    remembered = relative_lineage_variance(parent, born, n_at_death, weight)
     p_value = insertion_p_value(rank, n_ranked, rng=rng)
     doubts = [*notes, warning_of_few_possible_draws(now.log_start, now.log_start_error, n_live)]
     if now.n_stuck > _STUCK_SHARE * n_dead:
@@ -553,7 +554,7 @@ def _final_result(
     elif (n_of_weight := n_effective(evidence.log_weight)) < _FEW_EFFECTIVE:
         doubts.append(f"only {n_of_weight:.0f} effective samples: use more n_live")
     else:
-        doubts.append(warning_of_coarse_coordinates(evaluate.names, points.u, np.exp(evidence.log_weight)))
+        doubts.append(warning_of_coarse_coordinates(evaluate.names, points.u, weight))
     return NestedResult(
         names=evaluate.names,
         theta=points.theta,
@@ -570,7 +571,7 @@ def _final_result(
         log_z_error=evidence.log_z_error(remembered),
         memory=remembered,
         information=evidence.information,
-        n_eff=n_independent(points.theta, np.exp(evidence.log_weight), parent),
+        n_eff=n_independent(points.theta, weight, parent),
         n_calls=evaluate.n_calls,
         n_live=n_live,
         stop_reason=reason,

@@ -20,7 +20,13 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
-from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
+from probewise.diagnosis.locate import (
+    Covariate,
+    figure_name_of,
+    places_of_effect,
+    significant_places,
+    window_columns_and_bounds,
+)
 from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
@@ -298,6 +304,14 @@ def test_windows_never_part_equal_values():
     assert columns.shape == (50, len(ends))
     for column, (low, high) in zip(columns.T, ends, strict=True):
         np.testing.assert_array_equal(column > 0, (values >= low) & (values <= high))
+
+
+def test_a_figure_has_a_file_of_its_own_whatever_the_columns_are_called():
+    names = [f"witness_{column}" for column in ("time", "a/b", "a:b", "a_b/", "../a", "x" * 300, "x" * 301, "µ")]
+    files = [figure_name_of(name) for name in names]
+    assert files[0] == "witness_time.svg"
+    assert len(set(files)) == len(files)
+    assert all(len(file.encode()) < 255 and not set(file[:-4]) & set("./\\:") for file in files)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e12])

@@ -8,6 +8,7 @@ draw is compared in the same ways.
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -56,8 +57,11 @@ _PLAIN = 0.25  # p-value of the first draws above which more draws are not neede
 
 
 def figure_name_of(name: str) -> str:
-    """Return the file name of a figure, of letters, digits, - and _ alone."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in name) + ".svg"
+    """Return the file name of a figure, of letters, digits, - and _ alone; names that differ get files that differ."""
+    clean = "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+    if len(clean) > 60 or clean != name.replace(":", "_").replace(" ", "_"):
+        clean = f"{clean[:60]}_{zlib.crc32(name.encode()):08x}"
+    return f"{clean}.svg"
 
 
 @dataclass(frozen=True, eq=False)

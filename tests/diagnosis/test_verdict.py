@@ -69,7 +69,7 @@ def searched(probabilities):
     rare = [mean for mean, _ in probabilities if mean in (("arm_knock",), ("bent_rails",))]
     return SimpleNamespace(
         posterior=posterior,
-        evidences=SimpleNamespace(reported_shares=lambda mean: {("unknown",) if mean in rare else mean: 1.0}),
+        evidences=SimpleNamespace(reported_as=lambda mean: ("unknown",) if mean in rare else mean),
         leading_combination_out_of_vocabulary=lambda: max(rare, key=lambda m: posterior.marginal_over_noise[m]),
     )
 

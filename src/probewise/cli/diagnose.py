@@ -42,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "--thorough",
         "compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
-        "approximation where they differ by more than one nat plus its standard error and no run gives a warning "
-        "(first says how long it may take)",
+        "approximation where they differ by more than one nat plus its standard error and no run gives a warning",
     )
     common.add(
         parser,

@@ -195,11 +195,8 @@ class Judged:
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
 
-def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) -> Judged:
-    """Return the verdict, with probabilities and aliases, from a search and the global test.
-
-    The probability of what is out of vocabulary counts `unknown_weight` times against all others.
-    """
+def judge(searched: Searched, test: GlobalTest) -> Judged:
+    """Return the verdict, with probabilities and aliases, from a search and the global test."""
     prepared, prior = searched.prepared, searched.prior
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
     on_noise, certain, half = prepared.pure_noise_effect_names, frozenset(searched.certain), prior.named_needs_half
@@ -222,19 +219,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
             named_needs_half=half,
         )
 
-    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
-        searched, test.p_value, verdict_on, unknown_weight=unknown_weight
-    )
-    if (
-        verdict == "unknown"
-        and half
-        and credible_labels(hypotheses) != ("unknown",)  # otherwise nothing named is left to lead instead
-        and searched.evidences.one_name_outweighs_unnamed()
-    ):
-        # It leads by what was believed before alone. For a light sensor it stays the verdict: of 431 in 5,988 concealed
-        # recordings at most seven would be withdrawn, all of them right.
-        named = [h.effects for h in hypotheses if h.effects not in ((), ("unknown",))]
-        verdict, combination = "cannot_tell", named[0] if named else ()
+    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(searched, test.p_value, verdict_on)
     judged = Judged(
         verdict,
         combination,
@@ -249,29 +234,25 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
 
 
 def hypotheses_with_verdict(
-    searched: Searched,
-    p_value: float,
-    verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
-    *,
-    unknown_weight: float = 1.0,
+    searched: Searched, p_value: float, verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]]
 ) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
     """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
 
     A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
     `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
     """
-    posterior, shares = searched.posterior, searched.evidences.reported_shares
-    unknown = {mean: p * shares(mean).get(("unknown",), 0.0) for mean, p in posterior.marginal_over_noise.items()}
+    posterior, reported_as = searched.posterior, searched.evidences.reported_as
+    unknown = {mean: p for mean, p in posterior.marginal_over_noise.items() if reported_as(mean) == ("unknown",)}
     rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
     if rare:
         hypotheses = ranked_hypotheses(
             posterior.probabilities,
-            lambda mean: {mean: 1.0} if effects_out_of_vocabulary(mean) == rare else shares(mean),
+            lambda mean: mean if effects_out_of_vocabulary(mean) == rare else reported_as(mean),
         )
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
             return hypotheses, rare, (verdict, combination)
-    hypotheses = ranked_hypotheses(posterior.probabilities, shares, unknown_weight=unknown_weight)
+    hypotheses = ranked_hypotheses(posterior.probabilities, reported_as)
     return hypotheses, (), verdict_on(hypotheses)
 
 
@@ -326,26 +307,23 @@ def _leader_on_mean(
     return max(likeliest, key=lambda names: physics[names], default=())
 
 
-def _unknown_if_out_of_vocabulary(mean: Names) -> Mapping[Names, float]:
-    return {("unknown",) if effects_out_of_vocabulary(mean) else mean: 1.0}
+def _unknown_if_out_of_vocabulary(mean: Names) -> Names:
+    return ("unknown",) if effects_out_of_vocabulary(mean) else mean
 
 
 def ranked_hypotheses(
     probabilities: Mapping[tuple[Names, Names], float],
-    reported_as: Callable[[Names], Mapping[Names, float]] = _unknown_if_out_of_vocabulary,
-    *,
-    unknown_weight: float = 1.0,
+    reported_as: Callable[[Names], Names] = _unknown_if_out_of_vocabulary,
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
-    `probabilities` are by the effects on the mean and those on the noise; `reported_as` maps the former to the
-    combinations under which they count, with the share of their probability that each gets.
+    `probabilities` are by the effects on the mean and those on the noise; `reported_as` gives the name of the former.
     """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
-        for known, share in reported_as(mean).items():
-            key = known if known == ("unknown",) else tuple(sorted((*known, *noise_effects_in_vocabulary(noise))))
-            joined[key] = joined.get(key, 0.0) + p * share * (unknown_weight if key == ("unknown",) else 1.0)
+        key = reported_as(mean)
+        key = key if key == ("unknown",) else tuple(sorted((*key, *noise_effects_in_vocabulary(noise))))
+        joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)

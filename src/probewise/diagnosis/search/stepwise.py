@@ -20,7 +20,6 @@ from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.refits import (
     ALIASED_NATS,
     EXTENDED_WITHIN,
-    SAME_MODE,
     NoiseModels,
     Refits,
     WeighedFit,
@@ -44,9 +43,6 @@ from probewise.progress import Progress, silent
 _REFITTED_WITHIN = 6.0
 _SINGLES = 6  # effects that are refitted alone; a bound on cost
 _BEAM = 8  # combinations that are refitted at each size above one
-# Effects that lead under plain noise, refitted about the null as it is fitted then, where noise with memory leads. Two
-# tanks of which one overflows: about the fit beside a walk the overflow lacked 68 nats, about the plain fit it led.
-_LEADING_PLAINLY = 3
 # Shares of a limited budget of refits that may be spent once one effect, or two, were tried: what is missing twice is
 # worth as much as the last of many names for what is missing once.
 _SHARES = (0.6, 0.9)
@@ -203,23 +199,6 @@ class SearchState:
             self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
         self.undetected.add(names)
         return None
-
-    def refit_subset_from(self, candidate: WeighedFit, left_out: str) -> None:
-        """Refit the combination without `left_out` from its coordinates in `candidate`, if it fits better there.
-
-        A better fit replaces the candidate of that combination. Where an effect changes the meaning of other parameters
-        (a stiffness that hardens, and a frequency), a fit from their values without it may stop at a local optimum.
-        """
-        model, stay = candidate.found.model.model_and_mask_without(left_out)
-        start = candidate.found.z[stay]
-        for held in self.candidates_of_combination(tuple(name for name in candidate.names if name != left_out)):
-            alike = held.n_gaussians == candidate.n_gaussians and set(model.effects) == set(held.found.model.effects)
-            if alike and self.refits.fits_better_at_z(model, start, held):
-                again = self.refits.fit_and_weigh(model, start[None, :], candidate.law)
-                again = again.with_variant_factor_and_weights(held.log_share, held.weights)
-                if again.log_z > held.log_z + SAME_MODE:
-                    self.store_candidate(again)
-                    self.refits.replace_fit(held, again)
 
     def largest_refitted_part(self, names: Names) -> WeighedFit:
         """Return the candidate with most of some effects and no others, the most probable one."""
@@ -395,11 +374,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
         refitted = []
         for k, proposal in enumerate(asked):
             state.progress(f"refitting effects, {size} at a time", k, len(asked))
-            parent = state.candidates[proposal.parent.n_gaussians, ()] if proposal.parent is null else proposal.parent
-            found = state.refit_with_effect(parent, proposal.added)
-            refitted.append(found)
-            if size == 1 and found is not None and state.null_is_given:
-                state.refit_subset_from(found, proposal.added)
+            refitted.append(state.refit_with_effect(proposal.parent, proposal.added))
         if size == 2:
             refitted += _refit_leading_pairs(state)
         state.share = 1.0
@@ -419,15 +394,14 @@ def _proposals_to_refit(
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
-        alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
-        return [*alone[:1], *_proposals_under_simplest_noise(state, null), *alone[1:]]
+        return [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
     if size == 2:
         best = _largest_scores_about_null(state)
         proposals = {
             names: replace(own, score=max(own.score, best.get(names, own.score))) for names, own in proposals.items()
         }
     chosen = promising_combinations(state, proposals, width=_BEAM, behind=ALIASED_NATS)
-    more = [*_leading_under_simplest_noise(state, proposals), *_pairs_of_repeatable_effects(state, null)]
+    more = _pairs_of_repeatable_effects(state, null)
     return [proposals[names] for names in dict.fromkeys([*chosen, *more]) if names in proposals]
 
 
@@ -533,27 +507,6 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
     ]
 
 
-def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
-    """Propose the effects that lead about the given null, refitted under the simplest noise.
-
-    Where noise with memory (a random walk, a correlation) leads, it absorbs a missing effect, and the effect may be
-    undetectable about the null that was fitted under it. Otherwise, or if the refit predicts the same: no proposals.
-    """
-    plain = state.refits.null_under_simplest_noise(null)
-    if plain is None:
-        return []
-    scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
-    odds = {
-        name: log_mean_exp(own) + state.prior.log_prior_on_mean((name,))
-        for name, own in scores.items()
-        if name_of_first_copy(name) is None
-    }
-    ranked = sorted(odds, key=lambda name: -odds[name])
-    # A walk takes up whatever depends on a slow column, so that the curve of each is tried before.
-    tried = [name for k, name in enumerate(ranked) if k < _LEADING_PLAINLY or name.startswith("curve:")]
-    return [Proposal(odds[name], plain, name) for name in tried if odds[name] > state.prior.log_prior_on_mean(())]
-
-
 def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     """Refit the pairs that lead by screening about the null and extend no refitted effect; return their candidates.
 
@@ -569,24 +522,6 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     for names in _leading_and_not_far_behind(state, odds, width=_BEAM, behind=ALIASED_NATS):
         state.refit_stepwise(names)
     return [c for names in odds for c in state.candidates_of_combination(names)]
-
-
-def _leading_under_simplest_noise(state: SearchState, proposals: Mapping[Names, Proposal]) -> list[Names]:
-    """Choose the proposed combinations that lead under the simplest noise, where noise with memory leads; else none.
-
-    Beside a first effect, noise with memory absorbs the second one, and screening sees no gain in it.
-    """
-    best = max(state.candidates.values(), key=state.log_posterior)
-    if not state.refits.likeliest_law(best).has_memory:
-        return []
-    plain = state.noises.certain
-    odds = {
-        names: max(known.get((names, plain), -np.inf) for known in (state.about_null, state.about_parts))
-        + state.prior.log_prior_on_mean(names)
-        for names in proposals
-        if not effects_out_of_vocabulary(names)
-    }
-    return sorted(odds, key=lambda names: -odds[names])[:_LEADING_PLAINLY]
 
 
 def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
@@ -612,8 +547,6 @@ def eliminate_backward(state: SearchState) -> None:
         others = tuple(name for name in names if name != left_out)
         if others not in state.refitted_combinations | state.undetected:
             state.refit_stepwise(others)
-        for candidate in state.candidates_of_combination(names):
-            state.refit_subset_from(candidate, left_out)
         held = max(state.candidates_of_combination(others), key=lambda c: c.log_z, default=None)
         if held is None:
             continue

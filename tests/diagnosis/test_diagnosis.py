@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
-from probewise.diagnosis.diagnosis import _weighing_json
+from probewise.diagnosis.diagnosis import _public_names
 from probewise.diagnosis.findings import EffectFound
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.search.thorough import Weighing
@@ -24,7 +24,7 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
     twice = ("interference", "interference~again")
     weighing = Weighing(twice, 0, -10.0, -10.1, 0.1)
     assert weighing.label == "interference+interference"
-    assert _weighing_json(weighing)["effects"] == ["interference", "interference"]
+    assert _public_names(weighing.effects) == ["interference", "interference"]
     effects = tuple(EffectFound(name, 0.9, 9.0, f"a wave, {k}", ()) for k, name in enumerate(twice))
     repair = SimpleNamespace(
         changes_predictions=False,

@@ -15,13 +15,11 @@ from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
     Linearised,
-    OrthonormalBlocks,
-    block_log_bayes_factors,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
-from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
+from probewise.diagnosis.noise_law import noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
@@ -222,8 +220,7 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     augmented = np.concatenate([r, np.zeros(p)])
     residual = augmented - basis @ (basis.T @ augmented)
     problem = Linearised(basis, residual, white_noise(n), 1.0, n)
-    blocks = OrthonormalBlocks.of(problem, [template])
-    found = block_log_bayes_factors(blocks, residual[:, None], n)[0, 0]
+    found = TemplateBank.of([template], ["a"]).log_bayes_factors(problem)[0, 0]
 
     unit = problem.project(template / np.sqrt(np.mean(template**2)))[:, 0]
     rss = float(residual @ residual)
@@ -246,21 +243,6 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
         center = 0.5 * math.log(rss / n)
         total += quad(density, center - 3, center + 3)[0] / quad(null, center - 3, center + 3)[0]
     assert found == pytest.approx(math.log(total / len(visible)), abs=1e-6)
-
-
-def test_a_bank_weighs_as_blocks_do():
-    """Route one: the templates projected; route two: the products that a fit takes off."""
-    rng = np.random.default_rng(4)
-    n, p = 60, 4
-    templates = [rng.normal(size=(n, k)) for k in (1, 2, 1, 3)]
-    law = NoiseLaw(np.exp(0.2 * rng.normal(size=n)), np.full(n, 0.3) * (np.arange(n) % 10 > 0), np.arange(n) == 5)
-    basis, _ = np.linalg.qr(rng.normal(size=(n + p, p)))
-    residuals = rng.normal(size=(n + p, 3))
-    residuals -= basis @ (basis.T @ residuals)
-    problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
-    blocks = OrthonormalBlocks.of(problem, templates)
-    wanted = block_log_bayes_factors(blocks, residuals, problem.n_kept)
-    np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4).log_bayes_factors(problem, residuals), wanted)
 
 
 def test_what_survives_of_a_template_is_what_no_parameter_takes_up():

@@ -23,7 +23,7 @@ NOISE = frozenset({"outliers"})
 
 
 def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
-    found = ranked_hypotheses(probabilities)
+    found = ranked_hypotheses(probabilities, lambda mean: mean)
     return verdict_and_combination(
         found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same), **more
     )
@@ -38,7 +38,8 @@ def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_n
             (("unknown",), ()): 0.1,
             (("unknown",), ("outliers",)): 0.1,
             (("arm_knock",), ()): 0.2,
-        }
+        },
+        lambda mean: ("unknown",) if mean == ("arm_knock",) else mean,
     )
     held = {h.effects: h.probability for h in found}
     assert held == {("lag",): pytest.approx(0.5), ("unknown",): pytest.approx(0.4), ("lag", "outliers"): 0.1}

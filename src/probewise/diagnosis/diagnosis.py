@@ -18,7 +18,7 @@ from probewise.diagnosis.advice import NextMeasurement
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.best_repair import BestRepair, Improvement
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
+from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, Remainder
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import ALARM, Place, places_of_effect, significant_places
 from probewise.diagnosis.noise_models import walk_given_readings
@@ -369,33 +369,24 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     Figures of places (`where`) and the next plan are given by file name; the report and the command line write them.
     """
     require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")
-    gain, plan = diagnosis.improvement, diagnosis.next_measurement
+    judged, report, plan = diagnosis.judged, diagnosis.report, diagnosis.next_measurement
+    remainder, formula = report.remainder, report.formula
     document: dict[str, Any] = {
         "format": "diagnosis/1",
         "verdict": diagnosis.verdict,
         "reason": diagnosis.reason,
         "p_value": diagnosis.p_value,
         "combination": _public_names(diagnosis.combination),
-        "hypotheses": [
-            {"effects": _public_names(h.effects), "probability": h.probability} for h in diagnosis.hypotheses
-        ],
+        "hypotheses": [asdict(h) | {"effects": _public_names(h.effects)} for h in diagnosis.hypotheses],
         "effects": [
-            {
-                "name": name_without_copy_suffix(e.name),
-                "probability": e.probability,
-                "size_lambda": e.size_lambda,
-                "sentence": e.sentence,
-                "parameters": [_parameter_json(p) for p in e.parameters],
-            }
-            | ({} if e.formula is None else {"formula": _formula_json(e.formula)})
-            for e in diagnosis.effects
+            _without_empty_formula(e, "scans") | {"name": name_without_copy_suffix(e.name)} for e in diagnosis.effects
         ],
-        "unknown_probability": diagnosis.judged.unknown_probability,
-        "clean_probability": diagnosis.judged.clean_probability,
+        "unknown_probability": judged.unknown_probability,
+        "clean_probability": judged.clean_probability,
         "unknown_candidates": [
-            {"name": name, "probability": probability} for name, probability in diagnosis.judged.unknown_candidates
+            {"name": name, "probability": probability} for name, probability in judged.unknown_candidates
         ],
-        "credible_set": list(diagnosis.judged.credible),
+        "credible_set": judged.credible,
         "where": [
             {
                 "covariate": place.covariate,
@@ -407,13 +398,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for place in diagnosis.where
         ],
-        "improvement": {k: v for k, v in asdict(gain).items() if k not in ("heldout_by_scan", "comes_next")},
-        "aliases": [asdict(a) | {"effects": list(a.effects)} for a in diagnosis.judged.aliases],
-        "noise": {
-            "model": diagnosis.report.noise.model,
-            "p_value": diagnosis.report.noise.p_value,
-            "parameters": [_parameter_json(p) for p in diagnosis.report.noise.parameters],
-        },
+        "improvement": _as_dict(diagnosis.improvement, "heldout_by_scan", "comes_next"),
+        "aliases": [asdict(a) for a in judged.aliases],
+        "noise": _as_dict(report.noise, "nuisances"),
         "next_measurement": None
         if plan is None
         else {
@@ -423,37 +410,34 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,
         },
     }
-    remainder, formula = diagnosis.report.remainder, diagnosis.report.formula
     if remainder is not None:
-        document["remainder"] = {key: value for key, value in asdict(remainder).items() if key != "formula"}
-        if remainder.formula is not None:
-            document["remainder"]["formula"] = _formula_json(remainder.formula)
+        document["remainder"] = _without_empty_formula(remainder)
     if formula is not None:
-        document["formula"] = _formula_json(formula)
-    if diagnosis.report.weighings:
-        document["thorough"] = [_weighing_json(w) for w in diagnosis.report.weighings]
-    return document
+        document["formula"] = asdict(formula)
+    if report.weighings:
+        document["thorough"] = [
+            {
+                "effects": _public_names(twice.effects),
+                "n_gaussians": twice.n_gaussians,
+                "log_evidence_laplace": twice.laplace,
+                "log_evidence_nested": twice.nested,
+                "error": twice.error,
+                "agree": twice.agree,
+                "doubts": twice.doubts,
+            }
+            for twice in report.weighings
+        ]
+    plain: dict[str, Any] = json.loads(json.dumps(document))  # with lists for tuples
+    return plain
 
 
 def _public_names(effects: Iterable[str]) -> list[str]:
     return sorted(map(name_without_copy_suffix, effects))
 
 
-def _weighing_json(twice: Weighing) -> dict[str, Any]:
-    return {
-        "effects": _public_names(twice.effects),
-        "n_gaussians": twice.n_gaussians,
-        "log_evidence_laplace": twice.laplace,
-        "log_evidence_nested": twice.nested,
-        "error": twice.error,
-        "agree": twice.agree,
-        "doubts": list(twice.doubts),
-    }
+def _as_dict(value: Any, *without: str) -> dict[str, Any]:
+    return {key: own for key, own in asdict(value).items() if key not in without}
 
 
-def _formula_json(formula: Formula) -> dict[str, Any]:
-    return asdict(formula) | {"parameters": [_parameter_json(p) for p in formula.parameters]}
-
-
-def _parameter_json(found: ParameterFound) -> dict[str, Any]:
-    return asdict(found) | {"interval95": list(found.interval95)}
+def _without_empty_formula(found: EffectFound | Remainder, *without: str) -> dict[str, Any]:
+    return _as_dict(found, *without, *(() if found.formula else ("formula",)))

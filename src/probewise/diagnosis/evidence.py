@@ -265,15 +265,11 @@ class OrthonormalBlocks:
     @classmethod
     def of(cls, problem: Linearised, templates: Sequence[FloatArray]) -> OrthonormalBlocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
-        return cls.of_projected_templates(scale_and_project(problem, templates), [t.shape[1] for t in templates])
-
-    @classmethod
-    def of_projected_templates(cls, projected: FloatArray, widths: Sequence[int]) -> OrthonormalBlocks:
-        """Orthonormalise each of the concatenated templates from `scale_and_project`, (n_rows, n_columns)."""
-        starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
+        projected, widths = scale_and_project(problem, templates), np.array([t.shape[1] for t in templates])
+        starts = np.cumsum(widths) - widths
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])
-        for width in set(widths):  # all templates of one width at a time
-            columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
+        for width in set(widths.tolist()):  # all templates of one width at a time
+            columns = (starts[widths == width, None] + np.arange(width)).ravel()
             u[:, columns], gain[columns] = orthonormalise_groups(projected[:, columns], width)
         return cls(u, gain, starts)
 
@@ -302,25 +298,6 @@ def orthonormalise_groups(
     per_length = np.where(there, 1 / np.sqrt(np.maximum(squares, least)), 0.0)
     u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
     return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
-
-
-def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_kept: int) -> FloatArray:
-    """Return the log Bayes factor of each block against the null, with amplitude and noise sd integrated out.
-
-    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
-    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
-
-    `residuals`: projected residuals, shape (n_rows, n_draws). Returns log Bayes factors, shape (n_blocks, n_draws).
-    """
-    scores = (blocks.u.T @ residuals) ** 2
-    scores /= np.maximum(np.sum(residuals**2, axis=0), 1e-300)
-    out = np.empty((len(blocks.starts), residuals.shape[1]))
-    widths = np.diff(blocks.starts, append=len(scores))
-    for width in np.unique(widths):  # all blocks of one width at a time
-        members = np.flatnonzero(widths == width)
-        columns = blocks.starts[members, None] + np.arange(width)
-        out[members] = average_over_amplitude_scales(scores[columns], blocks.gain[columns], n_kept)
-    return out
 
 
 def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_kept: int) -> FloatArray:

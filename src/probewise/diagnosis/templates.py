@@ -20,9 +20,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import (
     Linearised,
-    OrthonormalBlocks,
     average_over_amplitude_scales,
-    block_log_bayes_factors,
     scale_and_project,
 )
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
@@ -95,7 +93,7 @@ class TemplateBank:
         return [slice(first, end) for first, end in itertools.pairwise(bounds)]
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
-        """Return the log Bayes factor of adding each entry to a fit, as `block_log_bayes_factors` does.
+        """Return the log Bayes factor of adding each entry to a fit, amplitude and noise sd integrated out.
 
         `residuals`: projected residuals, (n_rows, n_draws); the fit's own by default. Returns log Bayes factors,
         (n_entries, n_draws).
@@ -114,11 +112,8 @@ class TemplateBank:
                 at = (np.cumsum(widths) - widths)[members, None] + np.arange(width)
                 absorbed = taken[:, at].transpose(1, 0, 2)
                 left = products - absorbed.transpose(0, 2, 1) @ absorbed
-                gain, axes = _gram_eigensystems(left)
-                gain = np.where(gain > _ABSENT[self._precision.itemsize] * n_kept, gain, 0.0)
-                turned = axes.transpose(0, 2, 1) @ along[at]
-                explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
-                out[group.start + members] = average_over_amplitude_scales(explained, gain, n_kept)
+                absent = _ABSENT[self._precision.itemsize] * n_kept
+                out[group.start + members] = _log_bayes_factors_of_grams(left, along[at], total, n_kept, absent)
         return out[self.which]
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
@@ -179,6 +174,25 @@ class _Whitened:
             products.setdefault(width, []).append(_gram_matrices(columns))
         grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
         return cls(whitened.astype(templates[0].dtype, copy=False), scale, grams)
+
+
+def _log_bayes_factors_of_grams(
+    grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int, absent: float
+) -> FloatArray:
+    """Return the log Bayes factors of templates of one width, (n, n_draws), with amplitude and noise sd integrated out.
+
+    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
+    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
+
+    `grams`: products of a projected template's columns, (n, width, width); `along`: their products with the residuals,
+    (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,). Directions of up to `absent` count as
+    none.
+    """
+    gain, axes = _gram_eigensystems(grams)
+    gain = np.where(gain > absent, gain, 0.0)
+    turned = axes.transpose(0, 2, 1) @ along
+    explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
+    return average_over_amplitude_scales(explained, gain, n_kept)
 
 
 def _gram_matrices(columns: FloatArray) -> FloatArray:
@@ -385,18 +399,22 @@ def log_bayes_factors_of_pairs(
     if not pairs:
         return {}
     columns = [templates[name].columns[i] for name, i in entries]
-    widths = [c.shape[1] for c in columns]
-    # In a basis of their joint span, with one more axis for the rest of the residual.
-    axes, turned = np.linalg.qr(scale_and_project(problem, columns))
-    along = axes.T @ problem.residual
-    rest = math.sqrt(max(float(problem.residual @ problem.residual - along @ along), 0.0))
-    turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
-    own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
+    widths = np.array([c.shape[1] for c in columns])
+    projected = scale_and_project(problem, columns)
+    products, along = projected.T @ projected, projected.T @ problem.residual[:, None]
+    own = dict(zip(entries, np.split(np.arange(len(along)), np.cumsum(widths)[:-1]), strict=True))
     asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
-    parts = [(own[first], own[second]) for first, second in asked]
-    both = [np.hstack([t * math.sqrt(t.shape[1] / (a.shape[1] + b.shape[1])) for t in (a, b)]) for a, b in parts]
-    blocks = OrthonormalBlocks.of_projected_templates(np.concatenate(both, axis=1), [c.shape[1] for c in both])
-    together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_kept)[:, 0]
+    both = [np.concatenate([own[first], own[second]]) for first, second in asked]
+    together = np.empty(len(both))
+    total = np.maximum(np.sum(problem.residual[:, None] ** 2, axis=0), 1e-300)
+    per_column = np.sqrt(np.repeat(widths, widths))
+    for width in {len(at) for at in both}:
+        members = [k for k, at in enumerate(both) if len(at) == width]
+        at = np.array([both[k] for k in members])
+        scale = (per_column[at] / math.sqrt(width))[:, :, None]  # both together of unit rms
+        grams = products[at[:, :, None], at[:, None, :]] * scale * scale.transpose(0, 2, 1)
+        scores = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept, _ABSENT[8])
+        together[members] = scores[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])
     gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)

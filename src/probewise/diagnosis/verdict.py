@@ -307,13 +307,8 @@ def _leader_on_mean(
     return max(likeliest, key=lambda names: physics[names], default=())
 
 
-def _unknown_if_out_of_vocabulary(mean: Names) -> Names:
-    return ("unknown",) if effects_out_of_vocabulary(mean) else mean
-
-
 def ranked_hypotheses(
-    probabilities: Mapping[tuple[Names, Names], float],
-    reported_as: Callable[[Names], Names] = _unknown_if_out_of_vocabulary,
+    probabilities: Mapping[tuple[Names, Names], float], reported_as: Callable[[Names], Names]
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 

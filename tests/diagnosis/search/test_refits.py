@@ -213,7 +213,7 @@ def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part
     searched = searching.search(prepared_line)
     state = searching.SearchState(
         {n: e for n, e in prepared_line.effects.items() if n not in prepared_line.noise_effect_names},
-        searched.prior, searched.refits.noises, searched.refits.templates, searched.refits,
+        searched.prior, searched.refits,
     )  # fmt: skip
     state.sensors |= searched.nulls
     state.candidates |= {key: f for key, f in searched.evidences.fits.items() if key[1] in ((), ("sensitivity:room",))}

@@ -13,6 +13,8 @@ from probewise.diagnosis.search.searched import Evidences, Searched, posterior_o
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 
+REFITS = SimpleNamespace(noises=SimpleNamespace(certain=()))
+
 
 class Fit(SimpleNamespace):
     """As much of a weighed fit as its evidence."""
@@ -83,7 +85,7 @@ def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_sta
 
 def test_too_few_readings_leave_no_second_copy_of_an_effect_alone():
     prepared = SimpleNamespace(effects=dict.fromkeys(("lag", "wave", "wave~again")), noise_effect_names=frozenset())
-    searched = Searched(prepared, PRIOR, {}, (), {}, None, None, EVIDENCES, posterior()).with_prior_probabilities()
+    searched = Searched(prepared, PRIOR, {}, None, REFITS, EVIDENCES, posterior()).with_prior_probabilities()
     by_mean = searched.posterior.marginal_over_noise
     assert set(by_mean) == {(), ("unknown",), ("lag",), ("wave",)}
     assert sum(by_mean.values()) == pytest.approx(1.0)

@@ -179,7 +179,8 @@ def test_what_predicts_the_same_as_a_name_is_left_out():
     ids=["as much, and nothing left", "something left", "far behind"],
 )
 def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
-    unknown = UnknownEffects(None, None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
+    state = SimpleNamespace(refits=SimpleNamespace(noises=NOISES), effects_in_vocabulary=[NAME])
+    unknown = UnknownEffects(state, None, (), {(1, (), ()): 0.0, (1, NAME, ()): beside})
     unknown.drop_superfluous([Held((), -50.0), Held(NAME, name)])
     assert ((1, (), ()) not in unknown.log_z) == speaks
     assert (1, NAME, ()) in unknown.log_z

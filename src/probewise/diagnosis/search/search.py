@@ -16,11 +16,8 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
@@ -95,30 +92,25 @@ def prune_out_of_vocabulary(
 class UnknownEffects:
     """Evidence of an unknown effect, by basis functions, added to candidates, under each of their leading noise models.
 
-    `scores`: function of a fit, a noise distribution and a bank: log Bayes factors of its templates, by label; `bases`:
-    bank of the basis functions; `covariates`: covariates in which outlying readings may cluster; `noises`: the noise
-    models; `complexity_penalty`: function of the degrees of freedom of an SSF: penalty in nats of an unknown effect
-    added to the null; `log_n_choices`: function of names: log of the number of combinations of this size, relative to
-    single names.
+    `bases`: bank of the basis functions; `covariates`: covariates in which outlying readings may cluster; `log_z`: log
+    evidence by (order, mean, noise); `shares`: share of each family of bases, beside the null with the largest evidence
+    of an unknown effect.
     """
 
-    scores: Callable[[Fit, NoiseLaw, TemplateBank], Mapping[str, FloatArray]]
+    state: SearchState
     bases: TemplateBank
     covariates: tuple[Covariate, ...]
-    noises: NoiseModels
-    complexity_penalty: Callable[[int], float]
     log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
-    """Log evidence by (order, mean, noise)."""
     shares: dict[str, float] = field(default_factory=dict)
-    """Share of each family of bases, beside the null with the largest evidence of an unknown effect."""
-    log_n_choices: Callable[[Names], float] = lambda names: 0.0
 
     def weigh_beside(self, candidates: Iterable[WeighedFit]) -> None:
         """Compute and store (`log_z`) the log evidence of each candidate with an unknown effect added."""
         best = -np.inf
         for candidate in candidates:
             for noise, evidence in candidate.leading_noises():
-                scores = self.scores(candidate.found, evidence.likeliest_law, self.bases)
+                scores = self.state.refits.log_bayes_factors_by_label(
+                    candidate.found, evidence.likeliest_law, self.bases
+                )
                 by_family = {family: log_mean_exp(own) for family, own in scores.items()}
                 if evidence.likeliest_law.share > 0:
                     far_out = outlier_probabilities(candidate.found.residuals, evidence.likeliest_law)
@@ -127,7 +119,8 @@ class UnknownEffects:
                     continue
                 value = evidence.log_z + log_mean_exp(np.array(list(by_family.values())))
                 if not candidate.names:
-                    value -= self.complexity_penalty(candidate.ssf_degrees_of_freedom)
+                    each = self.state.prior.unknown_complexity_penalty
+                    value -= self.state.complexity_penalty(candidate.ssf_degrees_of_freedom, each)
                 self.log_z[candidate.n_gaussians, candidate.names, noise] = value
                 if value > best and not candidate.names:
                     best = value
@@ -153,13 +146,15 @@ class UnknownEffects:
         The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
         """
         most = max((self._log_evidence_with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
-        believed = {
-            c: self._log_evidence_without_unknown(c)
-            - (self.log_n_choices(c.names) if len(c.names) - len(known) > 1 else 0.0)
-            for c in rivals
-        }
-        for candidate in sorted(believed, key=lambda c: -believed[c]):
-            if believed[candidate] < most - ALIASED_NATS:
+        n_named = len(self.state.effects_in_vocabulary)
+
+        def believed(rival: WeighedFit) -> float:
+            alone = self._log_evidence_without_unknown(rival)
+            n = len(rival.names)  # two names are chosen from many more combinations
+            return alone - (math.log(math.comb(n_named, n) / n_named) if n - len(known) > 1 else 0.0)
+
+        for candidate in sorted(rivals, key=believed, reverse=True):
+            if believed(candidate) < most - ALIASED_NATS:
                 return False
             if self._log_evidence_with_unknown(candidate) == -np.inf:
                 self.weigh_beside([candidate])
@@ -169,11 +164,13 @@ class UnknownEffects:
         return False
 
     def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
-        return self.noises.average_log_evidence(candidate.log_z_by_noise)
+        return self.state.refits.noises.average_log_evidence(candidate.log_z_by_noise)
 
     def _log_evidence_with_unknown(self, candidate: WeighedFit) -> float:
         own = candidate.n_gaussians, candidate.names
-        return self.noises.average_log_evidence({key[2]: value for key, value in self.log_z.items() if key[:2] == own})
+        return self.state.refits.noises.average_log_evidence(
+            {key[2]: value for key, value in self.log_z.items() if key[:2] == own}
+        )
 
 
 def search(
@@ -203,7 +200,7 @@ def search(
         refits = Refits(prepared.null, models, TemplateCache(prepared.usable_rows))
     else:
         refits = after.refits
-    noises, templates, own = refits.noises, refits.templates, prepared.apparatus.user_effect_names(on_mean)
+    noises, own = refits.noises, prepared.apparatus.user_effect_names(on_mean)
     if prepared.null is not None and prepared.null.may_be_far_off:
         own = frozenset(on_mean)
     spent = prepared.apparatus.refit_budget_share_spent()
@@ -211,7 +208,7 @@ def search(
     def share_is_spent(share: float) -> bool:
         return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
-    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, share_is_spent)
+    state = SearchState(on_mean, prior, refits, own, progress, share_is_spent)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
     else:
@@ -244,17 +241,7 @@ def search(
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
     unknown.drop_superfluous(state.candidates.values())
-    return Searched(
-        prepared,
-        prior,
-        noises.models,
-        noises.certain,
-        state.sensors,
-        misfit_templates,
-        refits,
-        evidences(),
-        posterior(),
-    )
+    return Searched(prepared, prior, state.sensors, misfit_templates, refits, evidences(), posterior())
 
 
 def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:
@@ -309,21 +296,8 @@ def _build_unknown_effects(state: SearchState, misfit_templates: MisfitTemplates
     formulas = [effect for name, effect in state.effects.items() if name.startswith(PROPOSAL)]
     if formulas:
         problem = Linearised.of(null.found, state.refits.likeliest_law(null))
-        bases = without_products_like(bases, state.templates.coarse_bank(null.found, formulas), problem)
-    n_named = len(_effects_in_vocabulary(state))
-    each = state.prior.unknown_complexity_penalty
-    return UnknownEffects(
-        state.refits.log_bayes_factors_by_label,
-        bases,
-        misfit_templates.covariates,
-        state.noises,
-        lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
-        log_n_choices=lambda names: math.log(math.comb(n_named, len(names)) / n_named) if len(names) > 1 else 0.0,
-    )
-
-
-def _effects_in_vocabulary(state: SearchState) -> list[NamedEffect[Any]]:
-    return [effect for name, effect in state.effects.items() if not effects_out_of_vocabulary((name,))]
+        bases = without_products_like(bases, state.refits.templates.coarse_bank(null.found, formulas), problem)
+    return UnknownEffects(state, bases, misfit_templates.covariates)
 
 
 def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTemplates:
@@ -335,9 +309,9 @@ def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTem
     multiplied = apparatus.multiplied_covariates(covariates)
     bases = bank_of_unknown_effects(covariates, level - level.min(), slope, scan, multiplied=multiplied)
     problem = Linearised.of(null.found, state.refits.likeliest_law(null))
-    named = state.templates.coarse_bank(null.found, _effects_in_vocabulary(state))
+    named = state.refits.templates.coarse_bank(null.found, state.effects_in_vocabulary)
     unlike = bases_unlike_named(bases, named, problem)
-    return MisfitTemplates(state.templates, null.found, unlike, tuple(covariates))
+    return MisfitTemplates(state.refits.templates, null.found, unlike, tuple(covariates))
 
 
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed

@@ -11,7 +11,6 @@ from scipy.special import logsumexp
 
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.refits import (
@@ -181,20 +180,22 @@ class MisfitTemplates:
 class Searched:
     """Result of a search.
 
-    `noise_models`, `certain`: noise models by the names of their effects; names of the noise effects beyond doubt;
     `nulls`: the null by SSF order (number of Gaussians), without fits; `refits`: all refits, for another search of the
     same recording.
     """
 
     prepared: Prepared
     prior: PriorOdds
-    noise_models: Mapping[Names, NoiseModel]
-    certain: Names
     nulls: Mapping[int, Null]
     misfit_templates: MisfitTemplates
     refits: Refits
     evidences: Evidences
     posterior: Posterior
+
+    @property
+    def certain(self) -> Names:
+        """Names of the noise effects beyond doubt, which are part of every noise model."""
+        return self.refits.noises.certain
 
     def with_evidences(self, evidences: Evidences) -> Searched:
         """Return the result with other evidences, and the probabilities that follow from them."""

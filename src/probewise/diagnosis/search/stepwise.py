@@ -20,7 +20,6 @@ from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.refits import (
     ALIASED_NATS,
     EXTENDED_WITHIN,
-    NoiseModels,
     Refits,
     WeighedFit,
     effects_out_of_vocabulary,
@@ -32,8 +31,8 @@ from probewise.diagnosis.sensors import (
     starts_with_more_gaussians,
     with_free_form,
 )
-from probewise.diagnosis.templates import TemplateBank, TemplateCache, log_bayes_factors_of_pairs, log_mean_exp
-from probewise.effects import AGAIN, Extent, NamedEffect, name_of_first_copy
+from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_of_pairs, log_mean_exp
+from probewise.effects import AGAIN, Extent, NamedEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.effects.noise import lattice_step
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
@@ -82,8 +81,6 @@ class SearchState:
 
     effects: Mapping[str, NamedEffect[Any]]
     prior: PriorOdds
-    noises: NoiseModels
-    templates: TemplateCache
     refits: Refits
     tried_always: frozenset[str] = frozenset()
     progress: Progress = silent
@@ -121,6 +118,11 @@ class SearchState:
         return self.refits.sensor is not None
 
     @property
+    def effects_in_vocabulary(self) -> list[NamedEffect[Any]]:
+        """The effects that are in the vocabulary."""
+        return [effect for name, effect in self.effects.items() if not is_out_of_vocabulary(name)]
+
+    @property
     def refitted_combinations(self) -> set[Names]:
         """The combinations that were refitted, with any number of Gaussians."""
         return {names for _, names in self.candidates}
@@ -136,8 +138,8 @@ class SearchState:
     def template_banks(self, about: WeighedFit) -> list[TemplateBank]:
         """Return the template banks of what a candidate lacks, about it: in the vocabulary, and out of it if any."""
         lacking = [effect for name, effect in self.effects.items() if name not in about.names]
-        parts = ([e for e in lacking if bool(effects_out_of_vocabulary((e.name,))) == rare] for rare in (False, True))
-        return [self.templates.coarse_bank(about.found, effects) for effects in parts if effects]
+        parts = ([e for e in lacking if is_out_of_vocabulary(e.name) == rare] for rare in (False, True))
+        return [self.refits.templates.coarse_bank(about.found, effects) for effects in parts if effects]
 
     def log_bayes_factors_by_effect(
         self, parent: WeighedFit, law: NoiseLaw, about: WeighedFit
@@ -285,7 +287,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     `max_order` is 1. The fits are stored in the state. Then pairs of noise effects are added to the noise models, if
     single ones are significant.
     """
-    noises, refits, null = state.noises, state.refits, prepared.null
+    refits, null, noises = state.refits, prepared.null, state.refits.noises
     recording = prepared.recording
     plan, law = recording.plan, white_noise_of_recording(recording, least=noises.least_sd)
 
@@ -412,7 +414,7 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:_PAIRED]
         singles = {name: singles[name] for name in ranked}
-        templates = {name: state.templates.templates_of(null.found, state.effects[name]) for name in ranked}
+        templates = {name: state.refits.templates.templates_of(null.found, state.effects[name]) for name in ranked}
         about = Linearised.of(null.found, evidence.likeliest_law)
         for pair, value in log_bayes_factors_of_pairs(about, templates, singles).items():
             state.about_null[pair, noise] = evidence.log_z + value
@@ -495,7 +497,7 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
 
     While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
     """
-    plain = state.noises.certain
+    plain = state.refits.noises.certain
     pairs = [(first, name) for name in state.effects if (first := name_of_first_copy(name)) is not None]
     return [
         (first, again)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -397,12 +397,9 @@ def _proposals_to_refit(
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
         return [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
-    if size == 2:
-        best = _largest_scores_about_null(state)
-        proposals = {
-            names: replace(own, score=max(own.score, best.get(names, own.score))) for names, own in proposals.items()
-        }
-    chosen = promising_combinations(state, proposals, width=_BEAM, behind=ALIASED_NATS)
+    best = _largest_scores_about_null(state) if size == 2 else {}
+    scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
+    chosen = promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS)
     more = _pairs_of_repeatable_effects(state, null)
     return [proposals[names] for names in dict.fromkeys([*chosen, *more]) if names in proposals]
 
@@ -449,21 +446,14 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
 
 
 def promising_combinations(
-    state: SearchState, proposals: Mapping[Names, Proposal], *, width: int, behind: float
+    state: SearchState, scores: Mapping[Names, float], *, width: int, behind: float
 ) -> list[Names]:
-    """Choose the proposed combinations that are most probable by screening, at most `width` in the vocabulary.
+    """Choose the combinations that are most probable by their `scores`, log evidences, at most `width` in vocabulary.
 
     At most three more are out of vocabulary. Combinations more than `behind` nats behind the best refitted one that
     they compete with are left out.
     """
-    odds = {names: proposal.score + state.prior.log_prior_on_mean(names) for names, proposal in proposals.items()}
-    return _leading_and_not_far_behind(state, odds, width=width, behind=behind)
-
-
-def _leading_and_not_far_behind(
-    state: SearchState, odds: Mapping[Names, float], *, width: int, behind: float
-) -> list[Names]:
-    """Choose combinations by their log posterior `odds`, as `promising_combinations` does."""
+    odds = {names: score + state.prior.log_prior_on_mean(names) for names, score in scores.items()}
     ranked = sorted(odds, key=lambda names: -odds[names])
     named, rest = ([n for n in ranked if bool(effects_out_of_vocabulary(n)) == rare] for rare in (False, True))
     return [
@@ -480,7 +470,8 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
     null absorbs nearly completely to first order, nor one of two copies of an effect. Each is a tuple of one name.
     """
-    ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_prior_on_mean(names)))
+    scores = {names: proposal.score for names, proposal in proposals.items()}
+    ranked = sorted(scores, key=lambda names: -(scores[names] + state.prior.log_prior_on_mean(names)))
     faint, about = set[str](), Linearised.of(null.found, null.law)
     for bank in state.template_banks(null):
         left = bank.unabsorbed_shares(about)
@@ -488,7 +479,7 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
     always = state.tried_always | faint | twice
-    chosen = promising_combinations(state, proposals, width=_SINGLES, behind=_REFITTED_WITHIN)
+    chosen = promising_combinations(state, scores, width=_SINGLES, behind=_REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
 
 
@@ -515,15 +506,15 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     Of a difference of two columns, neither column alone need explain anything.
     """
     settled = state.refitted_combinations | state.undetected
-    odds: dict[Names, float] = {
-        names: value + state.prior.log_prior_on_mean(names)
+    scores = {
+        names: value
         for names, value in _largest_scores_about_null(state).items()
         if len(names) == 2 and names not in settled
     }
     # All against what was best before: equal pairs are refitted, or none.
-    for names in _leading_and_not_far_behind(state, odds, width=_BEAM, behind=ALIASED_NATS):
+    for names in promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS):
         state.refit_stepwise(names)
-    return [c for names in odds for c in state.candidates_of_combination(names)]
+    return [c for names in scores for c in state.candidates_of_combination(names)]
 
 
 def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
@@ -553,7 +544,8 @@ def eliminate_backward(state: SearchState) -> None:
         if held is None:
             continue
         proposals = proposals_for(state, held, {})
-        chosen = [names, *promising_combinations(state, proposals, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
+        scores = {key: proposal.score for key, proposal in proposals.items()}
+        chosen = [names, *promising_combinations(state, scores, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
         for added in [proposals[key].added for key in chosen if key in proposals]:
             if (held, added) not in state.extended:
                 state.refit_with_effect(held, added)

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.diagnosis.evidence import covariance_root
 from probewise.diagnosis.fit import FARTHEST
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem, fold_problem
+from probewise.diagnosis.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched
@@ -173,11 +173,10 @@ def _weigh_by_nested_sampling(
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *noise_effects_in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = HypothesisProblem(candidate.found.model, searched.prepared.recording, evidence)
-    once = fold_problem(problem, candidate.found.z)
+    once = HypothesisProblem(candidate.found.model, searched.prepared.recording, evidence, candidate.found.z)
     # Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
     log_factor = candidate.log_prior_factor - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
-    n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
+    n_live = max(n_live, nested.LIVE_PER_PARAM * once.model.n_params)
     run = partial(
         nested.run,
         rng=rng,

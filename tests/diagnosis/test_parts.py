@@ -23,7 +23,7 @@ from probewise.diagnosis.noise_law import noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
-from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
+from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
 from probewise.effects.reference import candidate_scan_groups, sign_of_motion
@@ -531,23 +531,10 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
 )
 def test_verdicts_follow_the_probabilities(probability, verdict, combination):
     aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
-    assert verdict_from_probabilities(hypotheses(**probability), NOISE, aliases, lambda _: frozenset()) == (
-        verdict,
-        combination,
+    found = verdict_and_combination(
+        hypotheses(**probability), 0.0, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset()
     )
-
-
-@pytest.mark.parametrize(
-    ("lag", "verdict"), [(0.3, "cannot_tell"), (0.1, "named")], ids=["a rival", "out of the question"]
-)
-def test_what_readings_cannot_tell_apart_is_not_named(lag, verdict):
-    """Half of the probability is not enough where priors alone may have parted two that predict the same."""
-    found = hypotheses(clean=0.3 - lag, backlash=0.6, lag=lag, glint=0.1)
-    same = {("backlash",): frozenset({("lag",)})}
-    assert verdict_from_probabilities(found, NOISE, (), lambda names: same.get(names, frozenset())) == (
-        verdict,
-        ("backlash",),
-    )
+    assert found == (verdict, combination)
 
 
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():

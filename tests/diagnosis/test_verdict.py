@@ -115,6 +115,8 @@ def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_bei
     two = {(("lag",), ()): 0.6, (("backlash",), ()): 0.4}
     assert verdict(two) == ("named", ("lag",))
     assert verdict(two, same=[("backlash",)]) == ("cannot_tell", ("lag",))
+    assert verdict({(("lag",), ()): 0.8, (("backlash",), ()): 0.2}, same=[("backlash",)]) == ("cannot_tell", ("lag",))
+    assert verdict({(("lag",), ()): 0.9, (("backlash",), ()): 0.1}, same=[("backlash",)]) == ("named", ("lag",))
 
 
 def test_a_class_of_aliases_that_holds_half_is_not_told_apart():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 from typing import Any, cast
@@ -33,7 +33,6 @@ from probewise.sensor import Stage
 _ABSENT = {8: 1e-9, 4: 1e-5}  # share of a template's squares below which its projection is rounding, by bytes
 _REMEMBERED = 5  # most recent noise models of which whitened templates are cached, up to `_MOST_BYTES`
 _MOST_BYTES = 2**28
-_MOST_GRAMS = 64  # noise models of which the Gram matrices are
 _MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
 _LONG = 2**13  # rows from which templates are kept in single precision: rounding is far below the noise of a score
 
@@ -49,7 +48,7 @@ class TemplateBank:
     templates: tuple[FloatArray, ...]
     labels: tuple[str, ...]
     which: IntArray
-    _whitened: dict[tuple[bytes, ...], list[_Whitened | None]] = field(default_factory=dict, repr=False)
+    _whitened: dict[tuple[bytes, ...], list[_Whitened]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str]) -> TemplateBank:
@@ -129,43 +128,32 @@ class TemplateBank:
     def _whitened_under(self, law: NoiseLaw) -> Iterator[tuple[slice, _Whitened]]:
         """Yield all groups of templates, whitened and scaled to unit rms each, with Gram matrices.
 
-        They are cached for the last few noise models, but those of a long table without the templates.
+        They are cached for the last few noise models, unless they are too large.
         """
-        key, n_numbers = law.whitening_key, sum(template.size for template in self.templates)
-        known = self._whitened.pop(key, [None] * len(self.groups))
-        kept_whole = len(self.groups) == 1
-        room = min(max(_MOST_BYTES // max(8 * n_numbers, 1), 1), _REMEMBERED) if kept_whole else _MOST_GRAMS
-        while len(self._whitened) >= room:
-            self._whitened.pop(next(iter(self._whitened)))
-        self._whitened[key] = known
-        for number, group in enumerate(self.groups):
-            whitened = known[number]
-            if whitened is None:
-                whitened = _Whitened.of(self.templates[group], law)
-                known[number] = whitened if kept_whole else replace(whitened, templates=np.zeros((0, 0)))
-            elif not kept_whole:
-                again = law(np.concatenate(self.templates[group], axis=1))
-                again *= whitened.scale
-                whitened = replace(whitened, templates=again.astype(self._precision, copy=False))
-            yield group, whitened
+        key, n_bytes = law.whitening_key, sum(template.nbytes for template in self.templates)
+        known = self._whitened.pop(key, None) or (_Whitened.of(self.templates[group], law) for group in self.groups)
+        room = min(_MOST_BYTES // max(n_bytes, 1), _REMEMBERED)
+        if room:
+            known = self._whitened[key] = list(known)
+            while len(self._whitened) > room:
+                self._whitened.pop(next(iter(self._whitened)))
+        yield from zip(self.groups, known, strict=True)
 
 
 @dataclass(frozen=True, eq=False)
 class _Whitened:
-    """Templates, whitened, (n_points, n_columns), the scale of each, and by width Gram matrices, (n, width, width)."""
+    """Templates, whitened, of unit rms, (n_points, n_columns), and by width Gram matrices, (n, width, width)."""
 
     templates: FloatArray
-    scale: FloatArray
     products: dict[int, FloatArray]
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
         widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
         firsts = np.cumsum(widths) - widths
-        whitened = law(np.concatenate([np.zeros((len(templates[0]), 0), templates[0].dtype), *templates], axis=1))
+        whitened = law(np.concatenate(templates, axis=1))
         norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-        scale = np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
-        whitened *= scale
+        whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
         ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
         products: dict[int, list[FloatArray]] = {}
         for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
@@ -173,7 +161,7 @@ class _Whitened:
             columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
             products.setdefault(width, []).append(_gram_matrices(columns))
         grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
-        return cls(whitened.astype(templates[0].dtype, copy=False), scale, grams)
+        return cls(whitened.astype(templates[0].dtype, copy=False), grams)
 
 
 def _log_bayes_factors_of_grams(
@@ -342,8 +330,6 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     at = np.searchsorted(inside, usable[kept])
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
-    largest = np.abs(found.predicted).max(initial=0.0)
-    none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
     change = np.zeros((n_rows, len(usable)), dtype=np.float32 if len(usable) > _LONG else np.float64)
     step = max(AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):

@@ -340,28 +340,19 @@ def verdict_and_combination(
     effects on the mean count whatever effects on the noise are beside them, and need half the probability; otherwise
     the verdict is `cannot_tell`, with the combination.
     """
-    if named_needs_half:
-        by_mean, fullest = _joined_over_noise(hypotheses, noise_names)
-        verdict, combination = verdict_from_probabilities(by_mean, noise_names, aliases, aliased_with)
-        if verdict == "named" and max(h.probability for h in by_mean if h.effects == combination) < 0.5:
-            verdict = "cannot_tell"
-        combination = fullest.get(combination, combination)
-    else:
-        verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
+    by_mean, fullest = dict[Names, float](), dict[Names, Names]()
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        mean = hypothesis.effects
+        if named_needs_half:  # those with effects on the noise alone stay apart
+            mean = tuple(name for name in mean if name not in noise_names) or mean
+        by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
+        fullest.setdefault(mean, hypothesis.effects)
+    verdict, top = _verdict_by_probability(by_mean, noise_names, aliases, aliased_with)
+    if named_needs_half and verdict == "named" and by_mean[top] < 0.5:
+        verdict = "cannot_tell"
+    combination = fullest.get(top, top)
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
-
-
-def _joined_over_noise(
-    hypotheses: tuple[Hypothesis, ...], noise_names: frozenset[str]
-) -> tuple[tuple[Hypothesis, ...], dict[Names, Names]]:
-    """Join hypotheses with the same effects on the mean; those with effects on the noise alone stay apart."""
-    joined, fullest = dict[Names, float](), dict[Names, Names]()
-    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
-        mean = tuple(name for name in hypothesis.effects if name not in noise_names) or hypothesis.effects
-        joined[mean] = joined.get(mean, 0.0) + hypothesis.probability
-        fullest.setdefault(mean, hypothesis.effects)
-    return tuple(Hypothesis(mean, p) for mean, p in joined.items()), fullest
 
 
 def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
@@ -375,8 +366,8 @@ def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def verdict_from_probabilities(
-    hypotheses: tuple[Hypothesis, ...],
+def _verdict_by_probability(
+    probability: Mapping[Names, float],
     noise_names: frozenset[str],
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
@@ -390,7 +381,6 @@ def verdict_from_probabilities(
     - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
     - with less, if clean or unknown is more probable, or if there is no combination: then none is named.
     """
-    probability = {h.effects: h.probability for h in hypotheses}
     if probability.get(("unknown",), 0.0) >= 0.5:
         return "unknown", ("unknown",)
     if probability.get((), 0.0) >= 0.5:

@@ -95,8 +95,6 @@ class SearchState:
     """The same, about a fit with all but one of the effects."""
     undetected: set[Names] = field(default_factory=set)
     """Combinations in which a refit has shown one effect to be insignificant."""
-    extended: set[tuple[WeighedFit, str]] = field(default_factory=set)
-    """Refits done: candidate and added effect."""
     pruned: set[Names] = field(default_factory=set)
     """Combinations out of vocabulary that are aliased with named ones."""
     optimism: float = 0.0
@@ -183,7 +181,6 @@ class SearchState:
         against, names = self.penalty_of_extending(parent), tuple(sorted((*parent.names, added)))
         if self.share_is_spent(self.share):
             return max(self.candidates_of_combination(names), key=lambda c: c.log_z, default=None)
-        self.extended.add((parent, added))
         try:
             candidate, scores = self.refits.refit_with_effect(parent, self.effects[added], against)
         except NotConvergedError:  # its model diverges from every start
@@ -547,8 +544,7 @@ def eliminate_backward(state: SearchState) -> None:
         scores = {key: proposal.score for key, proposal in proposals.items()}
         chosen = [names, *promising_combinations(state, scores, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
         for added in [proposals[key].added for key in chosen if key in proposals]:
-            if (held, added) not in state.extended:
-                state.refit_with_effect(held, added)
+            state.refit_with_effect(held, added)
 
 
 def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:

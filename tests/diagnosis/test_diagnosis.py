@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
+from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, VerdictReport
 from probewise.diagnosis.diagnosis import _public_names
 from probewise.diagnosis.findings import EffectFound
 from probewise.diagnosis.light_sensor import LightSensorApparatus
@@ -55,10 +55,9 @@ def test_the_field_of_a_next_plan_is_described_as_it_is_believed_to_be():
     names = ("sd", "x_mm", "y_mm", "radius_mm")
     model = SimpleNamespace(chain=SimpleNamespace(names=names), theta=np.array([[1.0, 90.0, 40.0, 50.0]] * 3))
     diagnosis = replace(FOUND, repair=SimpleNamespace(model=model), next_measurement=asked)
-    null = SimpleNamespace(nuisance_names=names[1:], shape=Circle())
-    described = SensorAndShape.with_shape_in_next_plan(null, diagnosis).next_measurement.plan.patterns
+    described = diagnosis.with_shape_in_next_plan(Circle()).next_measurement.plan.patterns
     assert described["card"] == Uniform(0.5)
     corners = np.array(described["field"].vertices_mm)
     np.testing.assert_allclose(np.hypot(*(corners - [90.0, 40.0]).T), 50.0, rtol=0.01)
     without = replace(diagnosis, next_measurement=None)
-    assert SensorAndShape.with_shape_in_next_plan(null, without) is without
+    assert without.with_shape_in_next_plan(Circle()) is without

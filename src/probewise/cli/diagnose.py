@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
         if null is not None:
-            diagnosis = null.with_shape_in_next_plan(diagnosis)
+            diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
         source = ", ".join(path.name for path in arguments.recordings)
 
         def page(drawn: Mapping[str, bytes]) -> str:

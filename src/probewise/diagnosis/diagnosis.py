@@ -30,7 +30,9 @@ from probewise.diagnosis.verdict import N_DRAWS, GlobalTest, Hypothesis, Judged,
 from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, join_lists, join_names, p_in_words
 from probewise.effects import NamedEffect, is_out_of_vocabulary, name_without_copy_suffix
 from probewise.effects.effect import sentence_from_samples
+from probewise.recordings.patterns import Polygon
 from probewise.recordings.plan import Recording
+from probewise.scene import Shape, outlines
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,6 +316,21 @@ class Diagnosis(ShowsItself):
     def unstated_effects(self) -> tuple[tuple[str, float, str], ...]:
         """Effects in the repaired model that are not in `effects`: name, share of the samples with it, sentence."""
         return self.repair.unstated_effects({effect.name for effect in self.effects})
+
+    def with_shape_in_next_plan(self, shape: Shape) -> Diagnosis:
+        """Return the diagnosis with undescribed patterns of its next plan described, so that the plan can be written.
+
+        They become the unknown shape, of which the null has the parameters, at its posterior mean, as a polygon.
+        """
+        asked, names = self.next_measurement, list(self.repaired.chain.names)
+        if asked is None:
+            return self
+        believed = self.repaired.theta[:, [names.index(name) for name in shape.prior.names]].mean(axis=0)
+        outline = outlines(shape.region(believed[None, :]))[0]
+        polygon = Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
+        plan = asked.plan
+        patterns = {name: plan.patterns.get(name, polygon) for name in plan.pattern_names}
+        return replace(self, next_measurement=replace(asked, plan=replace(plan, patterns=patterns)))
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -35,6 +35,9 @@ _REMEMBERED = 5  # most recent noise models of which whitened templates are cach
 _MOST_BYTES = 2**28
 _MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
 _LONG = 2**13  # rows from which templates are kept in single precision: rounding is far below the noise of a score
+
+_Whitened: TypeAlias = tuple[FloatArray, dict[int, FloatArray]]
+"""Templates, whitened, of unit rms each, (n_points, n_columns), and by width Gram matrices, (n, width, width)."""
 
 
 @dataclass(eq=False)
@@ -102,11 +105,11 @@ class TemplateBank:
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.templates), own.shape[1]))
         basis, rows = (a[:n].astype(self._precision, copy=False) for a in (problem.basis, own))
-        for group, whitened in self._whitened_under(problem.law):
-            taken = np.asarray(basis.T @ whitened.templates, dtype=np.float64)  # what the fit absorbs
-            along = np.asarray(whitened.templates.T @ rows, dtype=np.float64)
+        for group, (whitened, grams) in self._whitened_under(problem.law):
+            taken = np.asarray(basis.T @ whitened, dtype=np.float64)  # what the fit absorbs
+            along = np.asarray(whitened.T @ rows, dtype=np.float64)
             widths = self.widths[group]
-            for width, products in whitened.products.items():  # all templates of one width at a time
+            for width, products in grams.items():  # all templates of one width at a time
                 members = np.flatnonzero(widths == width)
                 at = (np.cumsum(widths) - widths)[members, None] + np.arange(width)
                 absorbed = taken[:, at].transpose(1, 0, 2)
@@ -118,10 +121,10 @@ class TemplateBank:
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
         """Return the share of each entry's norm that a fit does not absorb, (n_entries,)."""
         out, basis = [np.zeros(0)], problem.basis[: problem.n_points].astype(self._precision, copy=False)
-        for group, whitened in self._whitened_under(problem.law):
-            taken = basis.T @ whitened.templates
+        for group, (whitened, _) in self._whitened_under(problem.law):
+            taken = basis.T @ whitened
             starts = np.cumsum(self.widths[group]) - self.widths[group]
-            whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), starts) for a in (whitened.templates, taken))
+            whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), starts) for a in (whitened, taken))
             out.append(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
         return np.concatenate(out)[self.which]
 
@@ -131,7 +134,9 @@ class TemplateBank:
         They are cached for the last few noise models, unless they are too large.
         """
         key, n_bytes = law.whitening_key, sum(template.nbytes for template in self.templates)
-        known = self._whitened.pop(key, None) or (_Whitened.of(self.templates[group], law) for group in self.groups)
+        known = self._whitened.pop(key, None) or (
+            _whitened_with_grams(self.templates[group], law) for group in self.groups
+        )
         room = min(_MOST_BYTES // max(n_bytes, 1), _REMEMBERED)
         if room:
             known = self._whitened[key] = list(known)
@@ -140,28 +145,20 @@ class TemplateBank:
         yield from zip(self.groups, known, strict=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Whitened:
-    """Templates, whitened, of unit rms, (n_points, n_columns), and by width Gram matrices, (n, width, width)."""
-
-    templates: FloatArray
-    products: dict[int, FloatArray]
-
-    @classmethod
-    def of(cls, templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
-        widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
-        firsts = np.cumsum(widths) - widths
-        whitened = law(np.concatenate(templates, axis=1))
-        norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-        whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
-        ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
-        products: dict[int, list[FloatArray]] = {}
-        for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
-            width, begin = int(widths[first]), int(firsts[first])
-            columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
-            products.setdefault(width, []).append(_gram_matrices(columns))
-        grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
-        return cls(whitened.astype(templates[0].dtype, copy=False), grams)
+def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
+    widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
+    firsts = np.cumsum(widths) - widths
+    whitened = law(np.concatenate(templates, axis=1))
+    norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+    whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+    ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
+    products: dict[int, list[FloatArray]] = {}
+    for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
+        width, begin = int(widths[first]), int(firsts[first])
+        columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
+        products.setdefault(width, []).append(_gram_matrices(columns))
+    grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
+    return whitened.astype(templates[0].dtype, copy=False), grams
 
 
 def _log_bayes_factors_of_grams(

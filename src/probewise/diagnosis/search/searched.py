@@ -11,6 +11,7 @@ from scipy.special import logsumexp
 
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.refits import (
@@ -24,8 +25,11 @@ from probewise.diagnosis.search.refits import (
 )
 from probewise.diagnosis.templates import TemplateBank, TemplateCache
 from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects.effect import ROWS_OF_A_SIDE
+from probewise.effects.noise import Outliers
 from probewise.sensor import Stage
 
+_BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
 _TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gains less than half of it
 
 
@@ -81,6 +85,32 @@ class Evidences:
         ]
         return max(options, key=lambda more: more.evidence[noise].log_z, default=None)
 
+    def only_outlying_readings_differ(self, prior: PriorOdds, certain: Names) -> bool:
+        """Return whether effects on the mean that beat outlying readings change no other readings than those.
+
+        Outlying readings are beyond doubt then without an effect. Jumps before the last reading, or delays past the
+        first, are many ways to say the same of fewer than five rows; the others differ by less than the three nats that
+        tell aliases apart.
+        """
+        noise = tuple(sorted({Outliers.name, *certain}))
+        nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
+        if not nulls:
+            return False
+        null = max(nulls, key=lambda fit: fit.evidence[noise].log_z)
+        least = null.evidence[noise].log_z
+        odds = prior.log_prior_on_noise((Outliers.name,)) - prior.log_prior_on_noise(())
+        rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
+        if not rivals or not least - max(fit.evidence[certain].log_z for fit in nulls) + odds > _BEYOND_DOUBT:
+            return False
+        law = null.evidence[noise].likeliest_law
+        narrow = 1 - outlier_probabilities(null.found.residuals, law)
+        sd = law.likeliest_sigma_of(null.found.residuals)
+        apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
+        return all(
+            0.5 * float(narrow @ change**2) < ALIASED_NATS and np.count_nonzero(np.abs(change) > 1) < ROWS_OF_A_SIDE
+            for change in apart
+        )
+
     def _largest_log_z(self, names: Names) -> float:
         return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
@@ -120,17 +150,22 @@ class Posterior:
 
 def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
     """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
+    outlying = evidences.only_outlying_readings_differ(prior, certain)
     log_z: dict[tuple[Names, Names], float] = {}
     for (_, names), fit in evidences.fits.items():
+        if names and outlying:
+            continue
         for noise, evidence in fit.evidence.items():
             log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), or_impossible(evidence.log_z)))
     log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
+        if names and outlying:
+            continue
         # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
         value = or_impossible(value) + prior.log_prior_with_unknown(names)
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
-    for (names, noise), value in evidences.screened.items():
+    for (names, noise), value in evidences.screened.items() if not outlying else ():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
 
     def log_prior_on_noise(noise: Names) -> float:

@@ -148,11 +148,6 @@ def decaying():
 
 
 @pytest.fixture(scope="module")
-def searched_line(prepared_line):
-    return searching.search(prepared_line)
-
-
-@pytest.fixture(scope="module")
 def searched_cup(decaying):
     return searching.search(decaying)
 
@@ -186,11 +181,6 @@ def test_a_start_of_its_own_in_each_run_does_not_make_every_effect_be_refitted(p
     assert ("sensitivity:room",) in alone
     assert len(alone) < (len(prepared_line.effects) - len(prepared_line.noise_effect_names)) / 2
     assert max(searched.posterior.marginal_over_noise.items(), key=lambda kv: kv[1])[0] == ("sensitivity:room",)
-
-
-def test_no_formula_is_searched_for_beside_a_name_that_explains_everything(searched_line, monkeypatch):
-    monkeypatch.setattr(searching, "search", lambda *a, **k: pytest.fail("searched once more"))
-    assert search_with_formulas(searched_line) is searched_line
 
 
 def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):

@@ -15,14 +15,21 @@ from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
     Linearised,
+    OrthonormalBlocks,
+    average_over_amplitude_scales,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places, window_columns_and_bounds
-from probewise.diagnosis.noise_law import noise_statistics, white_noise
+from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
-from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
+from probewise.diagnosis.templates import (
+    EffectTemplates,
+    TemplateBank,
+    log_bayes_factors_of_pairs,
+    templates_of_effect,
+)
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
@@ -243,6 +250,42 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
         center = 0.5 * math.log(rss / n)
         total += quad(density, center - 3, center + 3)[0] / quad(null, center - 3, center + 3)[0]
     assert found == pytest.approx(math.log(total / len(visible)), abs=1e-6)
+
+
+def _problem_and_templates():
+    """Templates of one to three columns about a fit of four parameters, with memory and a lost reading."""
+    rng = np.random.default_rng(4)
+    n, p = 60, 4
+    templates = [rng.normal(size=(n, k)) for k in (1, 2, 1, 3)]
+    law = NoiseLaw(np.exp(0.2 * rng.normal(size=n)), np.full(n, 0.3) * (np.arange(n) % 10 > 0), np.arange(n) == 5)
+    basis, _ = np.linalg.qr(rng.normal(size=(n + p, p)))
+    residuals = rng.normal(size=(n + p, 3))
+    residuals -= basis @ (basis.T @ residuals)
+    return Linearised(basis, residuals[:, 0], law, 1.3, n), residuals, templates
+
+
+def test_a_bank_weighs_as_orthonormal_columns_do():
+    """Route one: the products that a fit takes off; route two: each template projected and made orthonormal."""
+    problem, residuals, templates = _problem_and_templates()
+    blocks = OrthonormalBlocks.of(problem, templates)
+    explained = (blocks.u.T @ residuals) ** 2 / np.sum(residuals**2, axis=0)
+    wanted = [
+        average_over_amplitude_scales(explained[None, own], blocks.gain[None, own], problem.n_kept)[0]
+        for own in np.split(np.arange(blocks.u.shape[1]), blocks.starts[1:])
+    ]
+    np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4).log_bayes_factors(problem, residuals), wanted)
+
+
+def test_a_pair_weighs_as_one_template_of_all_its_columns():
+    problem, _, templates = _problem_and_templates()
+    one, first = (VOCABULARY["backlash"](),), np.zeros(1, dtype=np.int64)
+    banks = {name: EffectTemplates((t,), (t[:1],), one, first) for name, t in zip("abcd", templates, strict=True)}
+    singles = {
+        name: TemplateBank.of(own.columns, [name]).log_bayes_factors(problem)[:, 0] for name, own in banks.items()
+    }
+    for (a, b), found in log_bayes_factors_of_pairs(problem, banks, singles).items():
+        both = np.hstack([banks[a].columns[0], banks[b].columns[0]])
+        assert found == pytest.approx(TemplateBank.of([both], ["both"]).log_bayes_factors(problem)[0, 0])
 
 
 def test_what_survives_of_a_template_is_what_no_parameter_takes_up():

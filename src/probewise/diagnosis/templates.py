@@ -348,12 +348,6 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     return np.split(columns, len(bank), axis=1)
 
 
-def combinations_up_to(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
-    """List every combination of up to `most` names, each sorted, the empty one first."""
-    for size in range(most + 1):
-        yield from itertools.combinations(sorted(names), size)
-
-
 _BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
 
 

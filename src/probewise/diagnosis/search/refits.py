@@ -27,7 +27,6 @@ from probewise.diagnosis.templates import (
     EffectTemplates,
     TemplateBank,
     TemplateCache,
-    combinations_up_to,
     log_bayes_factors_by_label,
     log_mean_exp,
 )
@@ -200,7 +199,7 @@ class NoiseModels:
         self.certain = tuple(sorted(self._known))
         self._hidden = sd < HIDDEN * self._step
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
-        single = [tuple(sorted({*names, *self.certain})) for names in combinations_up_to(others, 1)]
+        single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in sorted(others)))]
         self.models = {names: self._build_model(names) for names in single}
 
     def _build_model(

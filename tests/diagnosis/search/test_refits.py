@@ -17,7 +17,6 @@ from probewise.diagnosis.search.searched import Evidences, posterior_of
 from probewise.effects import Extent
 from probewise.effects.noise import CorrelatedNoise, RandomWalk
 from probewise.priors import LogUniform, Uniform
-from probewise.progress import silent
 from probewise.systems import Law, RunTable, Simulator
 
 _N = 120
@@ -215,7 +214,7 @@ def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part
             Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
         )
 
-    searching._refit_favoured_by_screening(state, posterior, silent)
+    searching._refit_favoured_by_screening(state, posterior)
     assert pair not in state.refitted_combinations | state.undetected
     (part,) = state.candidates_of_combination(("sensitivity:room",))
     assert state.screened_log_evidences()[pair, ()] < part.log_z + 3.0
@@ -233,7 +232,7 @@ def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
             Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
         )
 
-    searching._refit_favoured_by_screening(state, posterior, silent)
+    searching._refit_favoured_by_screening(state, posterior)
     left = {
         names: value for (names, _), value in state.screened_log_evidences().items() if names not in state.undetected
     }

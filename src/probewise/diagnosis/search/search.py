@@ -780,21 +780,17 @@ def search(
     state = SearchState(on_mean, prior, refits, own, progress, share_is_spent)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
+        misfit_templates = _build_misfit_templates(state, prepared)
     else:
         state.sensors |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
-    misfit_templates = (
-        _build_misfit_templates(state, prepared)
-        if after is None
-        else replace(after.misfit_templates, about=state.null.found)
-    )
+        misfit_templates = replace(after.misfit_templates, about=state.null.found)
     unknown = _build_unknown_effects(state, misfit_templates)
 
-    def evidences() -> Evidences:
-        return Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
-
-    def posterior() -> Posterior:
-        return posterior_of(evidences(), prior, certain=noises.certain, n_forms=len(state.sensors))
+    def found() -> Searched:
+        own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
+        posterior = posterior_of(own, prior, certain=noises.certain, n_forms=len(state.sensors))
+        return Searched(prepared, prior, state.sensors, misfit_templates, refits, own, posterior)
 
     select_forward(state, depth=depth)
     if prepared.null is not None:
@@ -802,18 +798,18 @@ def search(
     eliminate_backward(state)
     # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
     unknown.weigh_beside([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
-    _refit_favoured_by_screening(state, posterior, progress)
+    _refit_favoured_by_screening(state, lambda: found().posterior)
     if prepared.null is None:
-        refit_at_other_orders(state, posterior().marginal_over_noise)
+        refit_at_other_orders(state, found().posterior.marginal_over_noise)
     state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
     progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
     unknown.drop_superfluous(state.candidates.values())
-    return Searched(prepared, prior, state.sensors, misfit_templates, refits, evidences(), posterior())
+    return found()
 
 
-def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:
+def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior]) -> None:
     """Refit the combinations that are probable by screening alone, until none is or six were refitted.
 
     After six, all other screened evidences are reduced (`state.optimism`) by the least amount by which a refit fell
@@ -824,7 +820,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
     shortfalls: list[float] = []
     screened = set[WeighedFit]()
     while len(shortfalls) < _MOST_REFITTED_LATE:
-        progress("refitting what screening believes in", len(shortfalls), _MOST_REFITTED_LATE)
+        state.progress("refitting what screening believes in", len(shortfalls), _MOST_REFITTED_LATE)
         by_mean = posterior().marginal_over_noise
         settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())

@@ -531,7 +531,7 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     Of a difference of two columns, neither column alone need explain anything.
     """
     settled = state.refitted_combinations | state.undetected
-    scores = {
+    scores: dict[Names, float] = {
         names: value
         for names, value in _largest_scores_about_null(state).items()
         if len(names) == 2 and names not in settled

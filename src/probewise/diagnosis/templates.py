@@ -30,11 +30,9 @@ from probewise.effects import NamedEffect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
-_ABSENT = {8: 1e-9, 4: 1e-5}  # share of a template's squares below which its projection is rounding, by bytes
-_REMEMBERED = 5  # most recent noise models of which whitened templates are cached, up to `_MOST_BYTES`
-_MOST_BYTES = 2**28
+_ABSENT = 1e-9  # share of a template's squares below which its projection is rounding
+_REMEMBERED = 5  # most recent noise models of which whitened templates are cached, unless in groups
 _MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
-_LONG = 2**13  # rows from which templates are kept in single precision: rounding is far below the noise of a score
 
 _Whitened: TypeAlias = tuple[FloatArray, dict[int, FloatArray]]
 """Templates, whitened, of unit rms each, (n_points, n_columns), and by width Gram matrices, (n, width, width)."""
@@ -51,7 +49,7 @@ class TemplateBank:
     templates: tuple[FloatArray, ...]
     labels: tuple[str, ...]
     which: IntArray
-    _whitened: dict[tuple[bytes, ...], list[_Whitened]] = field(default_factory=dict, repr=False)
+    _whitened: dict[tuple[bytes, ...], _Whitened] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str]) -> TemplateBank:
@@ -64,10 +62,6 @@ class TemplateBank:
     def __getitem__(self, at: int) -> FloatArray:
         """Return the template of entry number `at`, (n_points, k)."""
         return self.templates[int(self.which[at])]
-
-    @property
-    def _precision(self) -> np.dtype[Any]:
-        return self.templates[0].dtype if self.templates else np.dtype(np.float64)
 
     @cached_property
     def widths(self) -> IntArray:
@@ -104,23 +98,20 @@ class TemplateBank:
         n, n_kept = problem.n_points, problem.n_kept
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.templates), own.shape[1]))
-        basis, rows = (a[:n].astype(self._precision, copy=False) for a in (problem.basis, own))
         for group, (whitened, grams) in self._whitened_under(problem.law):
-            taken = np.asarray(basis.T @ whitened, dtype=np.float64)  # what the fit absorbs
-            along = np.asarray(whitened.T @ rows, dtype=np.float64)
+            taken, along = problem.basis[:n].T @ whitened, whitened.T @ own[:n]  # what the fit absorbs, and the rest
             widths = self.widths[group]
             for width, products in grams.items():  # all templates of one width at a time
                 members = np.flatnonzero(widths == width)
                 at = (np.cumsum(widths) - widths)[members, None] + np.arange(width)
                 absorbed = taken[:, at].transpose(1, 0, 2)
                 left = products - absorbed.transpose(0, 2, 1) @ absorbed
-                absent = _ABSENT[self._precision.itemsize] * n_kept
-                out[group.start + members] = _log_bayes_factors_of_grams(left, along[at], total, n_kept, absent)
+                out[group.start + members] = _log_bayes_factors_of_grams(left, along[at], total, n_kept)
         return out[self.which]
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
         """Return the share of each entry's norm that a fit does not absorb, (n_entries,)."""
-        out, basis = [np.zeros(0)], problem.basis[: problem.n_points].astype(self._precision, copy=False)
+        out, basis = [np.zeros(0)], problem.basis[: problem.n_points]
         for group, (whitened, _) in self._whitened_under(problem.law):
             taken = basis.T @ whitened
             starts = np.cumsum(self.widths[group]) - self.widths[group]
@@ -131,18 +122,16 @@ class TemplateBank:
     def _whitened_under(self, law: NoiseLaw) -> Iterator[tuple[slice, _Whitened]]:
         """Yield all groups of templates, whitened and scaled to unit rms each, with Gram matrices.
 
-        They are cached for the last few noise models, unless they are too large.
+        They are cached for the last few noise models if they are one group.
         """
-        key, n_bytes = law.whitening_key, sum(template.nbytes for template in self.templates)
-        known = self._whitened.pop(key, None) or (
-            _whitened_with_grams(self.templates[group], law) for group in self.groups
-        )
-        room = min(_MOST_BYTES // max(n_bytes, 1), _REMEMBERED)
-        if room:
-            known = self._whitened[key] = list(known)
-            while len(self._whitened) > room:
-                self._whitened.pop(next(iter(self._whitened)))
-        yield from zip(self.groups, known, strict=True)
+        if len(self.groups) != 1:
+            yield from ((group, _whitened_with_grams(self.templates[group], law)) for group in self.groups)
+            return
+        key = law.whitening_key
+        self._whitened[key] = self._whitened.pop(key, None) or _whitened_with_grams(self.templates, law)
+        if len(self._whitened) > _REMEMBERED:
+            self._whitened.pop(next(iter(self._whitened)))
+        yield self.groups[0], self._whitened[key]
 
 
 def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
@@ -158,23 +147,20 @@ def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whi
         columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
         products.setdefault(width, []).append(_gram_matrices(columns))
     grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
-    return whitened.astype(templates[0].dtype, copy=False), grams
+    return whitened, grams
 
 
-def _log_bayes_factors_of_grams(
-    grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int, absent: float
-) -> FloatArray:
+def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int) -> FloatArray:
     """Return the log Bayes factors of templates of one width, (n, n_draws), with amplitude and noise sd integrated out.
 
     The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
     the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
 
     `grams`: products of a projected template's columns, (n, width, width); `along`: their products with the residuals,
-    (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,). Directions of up to `absent` count as
-    none.
+    (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,).
     """
     gain, axes = _gram_eigensystems(grams)
-    gain = np.where(gain > absent, gain, 0.0)
+    gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
     turned = axes.transpose(0, 2, 1) @ along
     explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
     return average_over_amplitude_scales(explained, gain, n_kept)
@@ -300,7 +286,7 @@ def templates_of_effect(
     gates = effect.variant_masks(found.model.plan)
     if gates is not None:
         (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
-        columns = [everywhere * gates.opened[k][usable, None].astype(everywhere.dtype) for k in choice]
+        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
@@ -327,7 +313,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     at = np.searchsorted(inside, usable[kept])
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
-    change = np.zeros((n_rows, len(usable)), dtype=np.float32 if len(usable) > _LONG else np.float64)
+    change = np.zeros((n_rows, len(usable)))
     step = max(AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
         rows = slice(first, min(first + step, n_rows))
@@ -390,7 +376,7 @@ def log_bayes_factors_of_pairs(
         at = np.array([both[k] for k in members])
         scale = (per_column[at] / math.sqrt(width))[:, :, None]  # both together of unit rms
         grams = products[at[:, :, None], at[:, None, :]] * scale * scale.transpose(0, 2, 1)
-        scores = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept, _ABSENT[8])
+        scores = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept)
         together[members] = scores[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])

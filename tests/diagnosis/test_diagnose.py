@@ -17,7 +17,7 @@ from probewise.diagnosis.held_out import HeldOutGain
 from probewise.effects import EFFECTS, VOCABULARY, Origin
 from probewise.errors import ParameterError
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
-from probewise.sensor import N_FREE_FORM, Stage
+from probewise.sensor import N_FREE_FORM
 from probewise.world import concealed as hidden
 from probewise.world import unlisted
 from probewise.world.spots import Blob, gaussian_spot
@@ -113,16 +113,6 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     assert found.judged.unknown_probability < 0.05
 
 
-@pytest.mark.single_case
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
-    """What differs between ways to come holds hysteresis and more; were it not spoken for, a tenth would be unknown."""
-    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=seed), rng=np.random.default_rng(0))
-    assert found.combination == ("hysteresis",)
-    assert found.judged.unknown_probability < 0.03
-
-
 @pytest.mark.slow
 def test_backlash_is_named_measured_located_and_repaired():
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
@@ -208,36 +198,6 @@ def test_too_few_readings_are_said_to_be_too_few():
     assert "20 usable readings are too few" in found.reason
 
 
-CASES = [
-    (hidden.GainDrift(0.05, 200.0), ("gain_drift",)),
-    (hidden.AmbientGradient(0.012, 0.0), ("ambient_gradient",)),
-    (hidden.Saturation(57.0), ("saturation",)),
-    (hidden.Nonlinearity(1.08), ("nonlinearity",)),
-    (hidden.Backlash(0.4), ("backlash",)),
-    (hidden.CorrelatedNoise(0.5), ("correlated_noise",)),
-    (hidden.Outliers(0.03, 8.0), ("outliers",)),
-    (hidden.HeavyTails(4.0), ("outliers",)),
-    (hidden.Dropouts(0.01, 0.0), ("dropouts",)),
-    (hidden.SignalDependentNoise(4.0), ("signal_dependent_noise",)),
-    (hidden.Quantisation(1.5), ("quantisation",)),
-]
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-@pytest.mark.parametrize(("effect", "combination"), CASES)
-def test_each_effect_is_named_in_a_two_way_recording(effect, combination):
-    plan = two_way_plan()
-    spot = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)])
-    made = World(spot, concealed=(effect,)).simulate(plan, rng=np.random.default_rng(3))
-    found = diagnose(made, rng=np.random.default_rng(0))
-    strict(found)
-    assert found.combination == combination
-    on_noise = VOCABULARY[combination[0]].stage is Stage.NOISE
-    assert found.verdict == ("noise" if on_noise else "named")
-    assert (found.p_value > 0.01) == on_noise
-
-
 @pytest.mark.slow
 def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
     plain = recording("two_way")
@@ -316,17 +276,6 @@ def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
 
 
 @pytest.mark.slow
-def test_a_tone_that_slides_is_no_memory_of_the_noise():
-    plain = recording("paper")
-    turns = (plain.plan.time_s - plain.plan.time_s[0]) / np.ptp(plain.plan.time_s)
-    tone = 1.2 * np.sin(2 * np.pi * (4 * turns + 14 * turns**2))
-    found = diagnose(dataclasses.replace(plain, readings=plain.readings + tone), rng=np.random.default_rng(0))
-    strict(found)
-    assert found.verdict == "unknown"
-    assert "time" in [place.covariate for place in found.where[:2]]
-
-
-@pytest.mark.slow
 def test_a_rare_effect_is_named_and_its_repair_predicts():
     """The paper slips; the model that finds it moves the arm instead."""
     half_way_s = float(np.median(two_way_plan().time_s))
@@ -393,11 +342,3 @@ def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_
     amp = found.repaired.effect_samples("hysteresis")[:, 0]
     # The share that does without it is that of the rest.
     assert np.mean(amp != 0) == pytest.approx(found.hypotheses[0].probability, abs=0.05)
-
-
-@pytest.mark.slow
-def test_two_effects_are_both_named():
-    both = recording("two_way", hidden.Backlash(0.5), hidden.GainDrift(0.05, 200.0))
-    found = diagnose(both, rng=np.random.default_rng(0))
-    strict(found)
-    assert found.combination == ("backlash", "gain_drift")

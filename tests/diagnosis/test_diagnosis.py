@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, SensorAndShape, VerdictReport
-from probewise.diagnosis.diagnosis import _weighing_json
+from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, VerdictReport
+from probewise.diagnosis.diagnosis import _public_names
 from probewise.diagnosis.findings import EffectFound
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.search.thorough import Weighing
@@ -24,7 +24,7 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
     twice = ("interference", "interference~again")
     weighing = Weighing(twice, 0, -10.0, -10.1, 0.1)
     assert weighing.label == "interference+interference"
-    assert _weighing_json(weighing)["effects"] == ["interference", "interference"]
+    assert _public_names(weighing.effects) == ["interference", "interference"]
     effects = tuple(EffectFound(name, 0.9, 9.0, f"a wave, {k}", ()) for k, name in enumerate(twice))
     repair = SimpleNamespace(
         changes_predictions=False,
@@ -55,10 +55,9 @@ def test_the_field_of_a_next_plan_is_described_as_it_is_believed_to_be():
     names = ("sd", "x_mm", "y_mm", "radius_mm")
     model = SimpleNamespace(chain=SimpleNamespace(names=names), theta=np.array([[1.0, 90.0, 40.0, 50.0]] * 3))
     diagnosis = replace(FOUND, repair=SimpleNamespace(model=model), next_measurement=asked)
-    null = SimpleNamespace(nuisance_names=names[1:], shape=Circle())
-    described = SensorAndShape.with_shape_in_next_plan(null, diagnosis).next_measurement.plan.patterns
+    described = diagnosis.with_shape_in_next_plan(Circle()).next_measurement.plan.patterns
     assert described["card"] == Uniform(0.5)
     corners = np.array(described["field"].vertices_mm)
     np.testing.assert_allclose(np.hypot(*(corners - [90.0, 40.0]).T), 50.0, rtol=0.01)
     without = replace(diagnosis, next_measurement=None)
-    assert SensorAndShape.with_shape_in_next_plan(null, without) is without
+    assert without.with_shape_in_next_plan(Circle()) is without

@@ -16,7 +16,7 @@ from probewise.diagnosis.evidence import (
     SCALES,
     Linearised,
     OrthonormalBlocks,
-    block_log_bayes_factors,
+    average_over_amplitude_scales,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
@@ -30,8 +30,13 @@ from probewise.diagnosis.locate import (
 from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
-from probewise.diagnosis.templates import EffectTemplates, TemplateBank, templates_of_effect
-from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_from_probabilities
+from probewise.diagnosis.templates import (
+    EffectTemplates,
+    TemplateBank,
+    log_bayes_factors_of_pairs,
+    templates_of_effect,
+)
+from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
 from probewise.effects.reference import candidate_scan_groups, sign_of_motion
@@ -228,8 +233,7 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     augmented = np.concatenate([r, np.zeros(p)])
     residual = augmented - basis @ (basis.T @ augmented)
     problem = Linearised(basis, residual, white_noise(n), 1.0, n)
-    blocks = OrthonormalBlocks.of(problem, [template])
-    found = block_log_bayes_factors(blocks, residual[:, None], n)[0, 0]
+    found = TemplateBank.of([template], ["a"]).log_bayes_factors(problem)[0, 0]
 
     unit = problem.project(template / np.sqrt(np.mean(template**2)))[:, 0]
     rss = float(residual @ residual)
@@ -254,8 +258,8 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     assert found == pytest.approx(math.log(total / len(visible)), abs=1e-6)
 
 
-def test_a_bank_weighs_as_blocks_do():
-    """Route one: the templates projected; route two: the products that a fit takes off."""
+def _problem_and_templates():
+    """Templates of one to three columns about a fit of four parameters, with memory and a lost reading."""
     rng = np.random.default_rng(4)
     n, p = 60, 4
     templates = [rng.normal(size=(n, k)) for k in (1, 2, 1, 3)]
@@ -263,10 +267,31 @@ def test_a_bank_weighs_as_blocks_do():
     basis, _ = np.linalg.qr(rng.normal(size=(n + p, p)))
     residuals = rng.normal(size=(n + p, 3))
     residuals -= basis @ (basis.T @ residuals)
-    problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
+    return Linearised(basis, residuals[:, 0], law, 1.3, n), residuals, templates
+
+
+def test_a_bank_weighs_as_orthonormal_columns_do():
+    """Route one: the products that a fit takes off; route two: each template projected and made orthonormal."""
+    problem, residuals, templates = _problem_and_templates()
     blocks = OrthonormalBlocks.of(problem, templates)
-    wanted = block_log_bayes_factors(blocks, residuals, problem.n_kept)
+    explained = (blocks.u.T @ residuals) ** 2 / np.sum(residuals**2, axis=0)
+    wanted = [
+        average_over_amplitude_scales(explained[None, own], blocks.gain[None, own], problem.n_kept)[0]
+        for own in np.split(np.arange(blocks.u.shape[1]), blocks.starts[1:])
+    ]
     np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4).log_bayes_factors(problem, residuals), wanted)
+
+
+def test_a_pair_weighs_as_one_template_of_all_its_columns():
+    problem, _, templates = _problem_and_templates()
+    one, first = (VOCABULARY["backlash"](),), np.zeros(1, dtype=np.int64)
+    banks = {name: EffectTemplates((t,), (t[:1],), one, first) for name, t in zip("abcd", templates, strict=True)}
+    singles = {
+        name: TemplateBank.of(own.columns, [name]).log_bayes_factors(problem)[:, 0] for name, own in banks.items()
+    }
+    for (a, b), found in log_bayes_factors_of_pairs(problem, banks, singles).items():
+        both = np.hstack([banks[a].columns[0], banks[b].columns[0]])
+        assert found == pytest.approx(TemplateBank.of([both], ["both"]).log_bayes_factors(problem)[0, 0])
 
 
 def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
@@ -563,23 +588,10 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
 )
 def test_verdicts_follow_the_probabilities(probability, verdict, combination):
     aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
-    assert verdict_from_probabilities(hypotheses(**probability), NOISE, aliases, lambda _: frozenset()) == (
-        verdict,
-        combination,
+    found = verdict_and_combination(
+        hypotheses(**probability), 0.0, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset()
     )
-
-
-@pytest.mark.parametrize(
-    ("lag", "verdict"), [(0.3, "cannot_tell"), (0.1, "named")], ids=["a rival", "out of the question"]
-)
-def test_what_readings_cannot_tell_apart_is_not_named(lag, verdict):
-    """Half of the probability is not enough where priors alone may have parted two that predict the same."""
-    found = hypotheses(clean=0.3 - lag, backlash=0.6, lag=lag, glint=0.1)
-    same = {("backlash",): frozenset({("lag",)})}
-    assert verdict_from_probabilities(found, NOISE, (), lambda names: same.get(names, frozenset())) == (
-        verdict,
-        ("backlash",),
-    )
+    assert found == (verdict, combination)
 
 
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():

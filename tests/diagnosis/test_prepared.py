@@ -102,7 +102,7 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     samples = ModelSamples(chain, np.tile(tilted, (500, 1)), np.full(500, 0.5), ("sensor_tilt",), 1)
     repaired = samples.fitted_sensor(replace(whole, plan=high), rng=np.random.default_rng(0))
     np.testing.assert_allclose(predict(repaired, high).mean, expected[0])
-    over_shape = SensorAndShape(prepared.null, Circle(), np.zeros((1, 10))).chain(high, (), n_nodes=16)
+    over_shape = SensorAndShape.over(prepared.null, Circle(), np.zeros((1, 3))).chain(high, (), n_nodes=16)
     circled = np.concatenate([prepared.null.theta(np.zeros((1, 7))), [[5.0, 5.0, 30.0]]], axis=1)
     np.testing.assert_array_equal(over_shape.predict(circled, high), over_shape.predict(circled, commanded))
     offered = SENSOR.candidate_measurements(high)

@@ -23,7 +23,7 @@ NOISE = frozenset({"outliers"})
 
 
 def verdict(probabilities, *, p_value=1e-6, aliases=(), same=(), **more):
-    found = ranked_hypotheses(probabilities)
+    found = ranked_hypotheses(probabilities, lambda mean: mean)
     return verdict_and_combination(
         found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same), **more
     )
@@ -38,7 +38,8 @@ def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_n
             (("unknown",), ()): 0.1,
             (("unknown",), ("outliers",)): 0.1,
             (("arm_knock",), ()): 0.2,
-        }
+        },
+        lambda mean: ("unknown",) if mean == ("arm_knock",) else mean,
     )
     held = {h.effects: h.probability for h in found}
     assert held == {("lag",): pytest.approx(0.5), ("unknown",): pytest.approx(0.4), ("lag", "outliers"): 0.1}
@@ -69,7 +70,7 @@ def searched(probabilities):
     rare = [mean for mean, _ in probabilities if mean in (("arm_knock",), ("bent_rails",))]
     return SimpleNamespace(
         posterior=posterior,
-        evidences=SimpleNamespace(reported_shares=lambda mean: {("unknown",) if mean in rare else mean: 1.0}),
+        evidences=SimpleNamespace(reported_as=lambda mean: ("unknown",) if mean in rare else mean),
         leading_combination_out_of_vocabulary=lambda: max(rare, key=lambda m: posterior.marginal_over_noise[m]),
     )
 
@@ -114,6 +115,8 @@ def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_bei
     two = {(("lag",), ()): 0.6, (("backlash",), ()): 0.4}
     assert verdict(two) == ("named", ("lag",))
     assert verdict(two, same=[("backlash",)]) == ("cannot_tell", ("lag",))
+    assert verdict({(("lag",), ()): 0.8, (("backlash",), ()): 0.2}, same=[("backlash",)]) == ("cannot_tell", ("lag",))
+    assert verdict({(("lag",), ()): 0.9, (("backlash",), ()): 0.1}, same=[("backlash",)]) == ("named", ("lag",))
 
 
 def test_a_class_of_aliases_that_holds_half_is_not_told_apart():

@@ -1,7 +1,7 @@
 """The state of a search after its nulls, and one effect refitted in it, as a diagnosis does."""
 
 from probewise.diagnosis.search.refits import NoiseModels, Refits
-from probewise.diagnosis.search.stepwise import SearchState, fit_nulls
+from probewise.diagnosis.search.search import SearchState, fit_nulls
 from probewise.diagnosis.templates import TemplateCache
 
 
@@ -11,7 +11,7 @@ def state_with_nulls(prepared, on_noise=None):
     noises = NoiseModels(prepared.recording, on_noise or {}, prior)
     refits = Refits(prepared.null, noises, TemplateCache(prepared.usable_rows))
     on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
-    state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
+    state = SearchState(on_mean, prior, refits)
     fit_nulls(state, prepared, max_order=1)
     return state
 

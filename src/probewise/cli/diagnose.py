@@ -42,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "--thorough",
         "compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
-        "approximation where they differ by more than one nat plus its standard error and no run gives a warning "
-        "(first says how long it may take)",
+        "approximation where they differ by more than one nat plus its standard error and no run gives a warning",
     )
     common.add(
         parser,
@@ -92,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
         if null is not None:
-            diagnosis = null.with_shape_in_next_plan(diagnosis)
+            diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
         source = ", ".join(path.name for path in arguments.recordings)
 
         def page(drawn: Mapping[str, bytes]) -> str:

@@ -39,8 +39,7 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.reason import TO_SEPARATE
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.search.thorough import Weighing, weigh_thoroughly
-from probewise.diagnosis.sensors import SensorPrior
-from probewise.diagnosis.unknown_shape import SensorAndShape
+from probewise.diagnosis.sensors import SensorAndShape, SensorPrior
 from probewise.diagnosis.verdict import Hypothesis, Judged, Verdict
 from probewise.diagnosis.words import p_in_words
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.apparatus import SETTLED
 from probewise.diagnosis.evidence import SCALES, Linearised
 from probewise.diagnosis.fit import Fit, fit_each_start
 from probewise.diagnosis.held_out import (
@@ -26,12 +25,11 @@ from probewise.diagnosis.held_out import (
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import walk_given_readings
-from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.templates import TemplateBank
-from probewise.diagnosis.verdict import GlobalTest, Judged, judge
+from probewise.diagnosis.verdict import GlobalTest, Judged
 from probewise.recordings.plan import Recording
 
 
@@ -154,8 +152,7 @@ def judged_and_best_repair(
     """Choose the fit that belongs to a verdict; the null if nothing was found.
 
     Returns the verdict, withdrawn if the named effects predict held-out readings far worse; and the fit. A formula that
-    predicts them no better than the null is none. If nothing unknown does, its odds against nothing on the mean are
-    those of the prior, if the latter is credible.
+    predicts them no better than the null is none.
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
@@ -166,16 +163,7 @@ def judged_and_best_repair(
             if best.improvement.heldout_log_density_per_reading > 0:
                 return judged, best
         best = BestRepair.of(searched, test, searched.likeliest_fit_beside_unknown(noise) or null, noise, rng=rng)
-        # Outlying readings that cluster change no mean: there is nothing of them to predict.
-        clusters = sum(share for form, share in judged.unknown_shares.items() if form.endswith(FAR_OUT))
-        if clusters < 0.5 and not _corrects_held_out_readings(searched, best):
-            on_noise, prior = searched.prepared.noise_effect_names, searched.prior
-            mean_is_right = sum(h.probability for h in judged.hypotheses if {*h.effects} <= on_noise)
-            if mean_is_right > 1 - SETTLED:
-                odds = prior.unknown / prior.clean_mean * mean_is_right / judged.unknown_probability
-                judged = judge(searched, test, unknown_weight=min(odds, 1.0))
-        if judged.verdict == "unknown":
-            return judged, best
+        return judged, best
     on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
         stated = tuple(name for name in judged.repaired_by if name in on_noise)
@@ -186,17 +174,6 @@ def judged_and_best_repair(
         judged = replace(judged, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
         return judged, BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best
-
-
-def _corrects_held_out_readings(searched: Searched, best: BestRepair) -> bool:
-    """Return whether a correction by the best basis predicts held-out parts better or, where it does not, blocks."""
-    prepared, bases = searched.prepared, searched.misfit_templates.unknown_bases
-    parts, _ = prepared.apparatus.held_out_parts(prepared.recording)
-    fixed = correct_by_best_basis(best.repaired, best.problem, bases, parts)
-    if fixed.gains_nothing:
-        blocks, _ = partition_into_blocks(prepared.recording)
-        fixed = correct_by_best_basis(best.repaired, best.problem, bases, blocks)
-    return fixed.held_out.per_reading > 0
 
 
 _ABOUT_EQUAL = 5.0  # nats

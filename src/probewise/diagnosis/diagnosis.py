@@ -18,7 +18,7 @@ from probewise.diagnosis.advice import NextMeasurement
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.best_repair import BestRepair, Improvement
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
+from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, Remainder
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import ALARM, Place, places_of_effect, significant_places
 from probewise.diagnosis.noise_models import walk_given_readings
@@ -30,7 +30,9 @@ from probewise.diagnosis.verdict import N_DRAWS, GlobalTest, Hypothesis, Judged,
 from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, join_lists, join_names, p_in_words
 from probewise.effects import NamedEffect, is_out_of_vocabulary, name_without_copy_suffix
 from probewise.effects.effect import sentence_from_samples
+from probewise.recordings.patterns import Polygon
 from probewise.recordings.plan import Recording
+from probewise.scene import Shape, outlines
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,6 +317,21 @@ class Diagnosis(ShowsItself):
         """Effects in the repaired model that are not in `effects`: name, share of the samples with it, sentence."""
         return self.repair.unstated_effects({effect.name for effect in self.effects})
 
+    def with_shape_in_next_plan(self, shape: Shape) -> Diagnosis:
+        """Return the diagnosis with undescribed patterns of its next plan described, so that the plan can be written.
+
+        They become the unknown shape, of which the null has the parameters, at its posterior mean, as a polygon.
+        """
+        asked, names = self.next_measurement, list(self.repaired.chain.names)
+        if asked is None:
+            return self
+        believed = self.repaired.theta[:, [names.index(name) for name in shape.prior.names]].mean(axis=0)
+        outline = outlines(shape.region(believed[None, :]))[0]
+        polygon = Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
+        plan = asked.plan
+        patterns = {name: plan.patterns.get(name, polygon) for name in plan.pattern_names}
+        return replace(self, next_measurement=replace(asked, plan=replace(plan, patterns=patterns)))
+
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""
         lines = [f"{self.verdict}: {self.reason}"]
@@ -369,33 +386,24 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     Figures of places (`where`) and the next plan are given by file name; the report and the command line write them.
     """
     require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")
-    gain, plan = diagnosis.improvement, diagnosis.next_measurement
+    judged, report, plan = diagnosis.judged, diagnosis.report, diagnosis.next_measurement
+    remainder, formula = report.remainder, report.formula
     document: dict[str, Any] = {
         "format": "diagnosis/1",
         "verdict": diagnosis.verdict,
         "reason": diagnosis.reason,
         "p_value": diagnosis.p_value,
         "combination": _public_names(diagnosis.combination),
-        "hypotheses": [
-            {"effects": _public_names(h.effects), "probability": h.probability} for h in diagnosis.hypotheses
-        ],
+        "hypotheses": [asdict(h) | {"effects": _public_names(h.effects)} for h in diagnosis.hypotheses],
         "effects": [
-            {
-                "name": name_without_copy_suffix(e.name),
-                "probability": e.probability,
-                "size_lambda": e.size_lambda,
-                "sentence": e.sentence,
-                "parameters": [_parameter_json(p) for p in e.parameters],
-            }
-            | ({} if e.formula is None else {"formula": _formula_json(e.formula)})
-            for e in diagnosis.effects
+            _without_empty_formula(e, "scans") | {"name": name_without_copy_suffix(e.name)} for e in diagnosis.effects
         ],
-        "unknown_probability": diagnosis.judged.unknown_probability,
-        "clean_probability": diagnosis.judged.clean_probability,
+        "unknown_probability": judged.unknown_probability,
+        "clean_probability": judged.clean_probability,
         "unknown_candidates": [
-            {"name": name, "probability": probability} for name, probability in diagnosis.judged.unknown_candidates
+            {"name": name, "probability": probability} for name, probability in judged.unknown_candidates
         ],
-        "credible_set": list(diagnosis.judged.credible),
+        "credible_set": judged.credible,
         "where": [
             {
                 "covariate": place.covariate,
@@ -407,13 +415,9 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for place in diagnosis.where
         ],
-        "improvement": {k: v for k, v in asdict(gain).items() if k not in ("heldout_by_scan", "comes_next")},
-        "aliases": [asdict(a) | {"effects": list(a.effects)} for a in diagnosis.judged.aliases],
-        "noise": {
-            "model": diagnosis.report.noise.model,
-            "p_value": diagnosis.report.noise.p_value,
-            "parameters": [_parameter_json(p) for p in diagnosis.report.noise.parameters],
-        },
+        "improvement": _as_dict(diagnosis.improvement, "heldout_by_scan", "comes_next"),
+        "aliases": [asdict(a) for a in judged.aliases],
+        "noise": _as_dict(report.noise, "nuisances"),
         "next_measurement": None
         if plan is None
         else {
@@ -423,37 +427,34 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,
         },
     }
-    remainder, formula = diagnosis.report.remainder, diagnosis.report.formula
     if remainder is not None:
-        document["remainder"] = {key: value for key, value in asdict(remainder).items() if key != "formula"}
-        if remainder.formula is not None:
-            document["remainder"]["formula"] = _formula_json(remainder.formula)
+        document["remainder"] = _without_empty_formula(remainder)
     if formula is not None:
-        document["formula"] = _formula_json(formula)
-    if diagnosis.report.weighings:
-        document["thorough"] = [_weighing_json(w) for w in diagnosis.report.weighings]
-    return document
+        document["formula"] = asdict(formula)
+    if report.weighings:
+        document["thorough"] = [
+            {
+                "effects": _public_names(twice.effects),
+                "n_gaussians": twice.n_gaussians,
+                "log_evidence_laplace": twice.laplace,
+                "log_evidence_nested": twice.nested,
+                "error": twice.error,
+                "agree": twice.agree,
+                "doubts": twice.doubts,
+            }
+            for twice in report.weighings
+        ]
+    plain: dict[str, Any] = json.loads(json.dumps(document))  # with lists for tuples
+    return plain
 
 
 def _public_names(effects: Iterable[str]) -> list[str]:
     return sorted(map(name_without_copy_suffix, effects))
 
 
-def _weighing_json(twice: Weighing) -> dict[str, Any]:
-    return {
-        "effects": _public_names(twice.effects),
-        "n_gaussians": twice.n_gaussians,
-        "log_evidence_laplace": twice.laplace,
-        "log_evidence_nested": twice.nested,
-        "error": twice.error,
-        "agree": twice.agree,
-        "doubts": list(twice.doubts),
-    }
+def _as_dict(value: Any, *without: str) -> dict[str, Any]:
+    return {key: own for key, own in asdict(value).items() if key not in without}
 
 
-def _formula_json(formula: Formula) -> dict[str, Any]:
-    return asdict(formula) | {"parameters": [_parameter_json(p) for p in formula.parameters]}
-
-
-def _parameter_json(found: ParameterFound) -> dict[str, Any]:
-    return asdict(found) | {"interval95": list(found.interval95)}
+def _without_empty_formula(found: EffectFound | Remainder, *without: str) -> dict[str, Any]:
+    return _as_dict(found, *without, *(() if found.formula else ("formula",)))

@@ -268,7 +268,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     found = search(prepared, max_order=MAX_ORDER, depth=max(len(names), 1))
     on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
     on_noise = tuple(sorted(set(names) - set(on_mean)))
-    noise = on_noise if on_noise in found.noise_models else found.certain
+    noise = on_noise if on_noise in found.refits.noises.models else found.certain
     best = found.best_refit_of(on_mean, noise) or found.best_refit_of((), noise)
     assert best is not None  # the calibrated sensor is always fitted
     if not np.isfinite(best.evidence[noise].log_z):

@@ -265,15 +265,11 @@ class OrthonormalBlocks:
     @classmethod
     def of(cls, problem: Linearised, templates: Sequence[FloatArray]) -> OrthonormalBlocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
-        return cls.of_projected_templates(scale_and_project(problem, templates), [t.shape[1] for t in templates])
-
-    @classmethod
-    def of_projected_templates(cls, projected: FloatArray, widths: Sequence[int]) -> OrthonormalBlocks:
-        """Orthonormalise each of the concatenated templates from `scale_and_project`, (n_rows, n_columns)."""
-        starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
+        projected, widths = scale_and_project(problem, templates), np.array([t.shape[1] for t in templates])
+        starts = np.cumsum(widths) - widths
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])
-        for width in set(widths):  # all templates of one width at a time
-            columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
+        for width in set(widths.tolist()):  # all templates of one width at a time
+            columns = (starts[widths == width, None] + np.arange(width)).ravel()
             u[:, columns], gain[columns] = orthonormalise_groups(projected[:, columns], width)
         return cls(u, gain, starts)
 
@@ -302,25 +298,6 @@ def orthonormalise_groups(
     per_length = np.where(there, 1 / np.sqrt(np.maximum(squares, least)), 0.0)
     u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
     return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
-
-
-def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_kept: int) -> FloatArray:
-    """Return the log Bayes factor of each block against the null, with amplitude and noise sd integrated out.
-
-    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
-    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
-
-    `residuals`: projected residuals, shape (n_rows, n_draws). Returns log Bayes factors, shape (n_blocks, n_draws).
-    """
-    scores = (blocks.u.T @ residuals) ** 2
-    scores /= np.maximum(np.sum(residuals**2, axis=0), 1e-300)
-    out = np.empty((len(blocks.starts), residuals.shape[1]))
-    widths = np.diff(blocks.starts, append=len(scores))
-    for width in np.unique(widths):  # all blocks of one width at a time
-        members = np.flatnonzero(widths == width)
-        columns = blocks.starts[members, None] + np.arange(width)
-        out[members] = average_over_amplitude_scales(scores[columns], blocks.gain[columns], n_kept)
-    return out
 
 
 def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_kept: int) -> FloatArray:
@@ -356,39 +333,29 @@ _NODES = _REACH * np.array([0.0, -1.0, 1.0])
 _LOG_WEIGHTS = np.log([2 / 3, 1 / 6, 1 / 6]) + 0.5 * _NODES**2 + 0.5 * math.log(2 * math.pi)
 
 
-@dataclass(frozen=True, eq=False)
-class _CoarseParameters:
-    """Parameters of a noise model whose nodes lie further apart than a fit determines them.
+def _coarse_parameters(evidence: NoiseEvidence) -> tuple[IntArray, FloatArray, FloatArray, float]:
+    """Find parameters of a noise model whose nodes lie further apart than a fit determines them.
 
-    `columns` numbers them among the settings of the nodes; `peak` are their values at the likeliest node, and
-    `spacing` the distances of nodes, in the unit cube of the prior, (n_coarse,) all. `gain`: nats by which the evidence
-    may rise between the nodes.
+    Returns their numbers among the settings of the nodes, their values at the likeliest node and the distances of
+    nodes, in the unit cube of the prior, (n_coarse,) all; and the nats by which the evidence may rise between nodes.
     """
-
-    columns: IntArray
-    peak: FloatArray
-    spacing: FloatArray
-    gain: float
-
-    @classmethod
-    def of(cls, evidence: NoiseEvidence) -> _CoarseParameters:
-        weights, found = evidence.weights, []
-        for effect, part in effects_with_columns(evidence.noise.effects):
-            settings = evidence.nodes.settings[:, part]
-            if len(effect.nodes_per_parameter) != settings.shape[1] or np.all(settings == settings[0]):
-                continue  # without nodes of the prior, or known
-            unit = effect.prior.to_unit_cube(settings)
-            for k, n in enumerate(effect.nodes_per_parameter):
-                own, node_of = np.unique(np.round(unit[:, k] / _SAME), return_inverse=True)
-                marginal = np.bincount(node_of.ravel(), weights).astype(np.float64)
-                own = own * _SAME
-                spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
-                mean = float(marginal @ own)
-                if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
-                    at = unit[int(np.argmax(weights)), k]
-                    found.append((part.start + k, float(at), spacing, _rise_between(marginal)))
-        columns, peak, spacings, gains = zip(*found, strict=True) if found else ((), (), (), ())
-        return cls(np.array(columns, dtype=np.int64), np.array(peak), np.array(spacings), float(sum(gains)))
+    weights, found = evidence.weights, []
+    for effect, part in effects_with_columns(evidence.noise.effects):
+        settings = evidence.nodes.settings[:, part]
+        if len(effect.nodes_per_parameter) != settings.shape[1] or np.all(settings == settings[0]):
+            continue  # without nodes of the prior, or known
+        unit = effect.prior.to_unit_cube(settings)
+        for k, n in enumerate(effect.nodes_per_parameter):
+            own, node_of = np.unique(np.round(unit[:, k] / _SAME), return_inverse=True)
+            marginal = np.bincount(node_of.ravel(), weights).astype(np.float64)
+            own = own * _SAME
+            spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
+            mean = float(marginal @ own)
+            if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
+                at = unit[int(np.argmax(weights)), k]
+                found.append((part.start + k, float(at), spacing, _rise_between(marginal)))
+    columns, peak, spacings, gains = zip(*found, strict=True) if found else ((), (), (), ())
+    return np.array(columns, dtype=np.int64), np.array(peak), np.array(spacings), float(sum(gains))
 
 
 def _rise_between(marginal: FloatArray) -> float:
@@ -414,12 +381,11 @@ def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) ->
     """
     if not np.isfinite(evidence.log_z):
         return evidence
-    coarse = _CoarseParameters.of(evidence)
-    if not coarse.columns.size or evidence.log_z + coarse.gain < least:
+    columns, start, spacing, gain = _coarse_parameters(evidence)
+    if not columns.size or evidence.log_z + gain < least:
         return evidence
     model, best = evidence.noise, evidence.nodes.settings[int(np.argmax(evidence.log_z_nodes))]
     parts = [(effect, part) for effect, part in effects_with_columns(model.effects) if effect.nodes_per_parameter]
-    columns, peak, spacing = coarse.columns, coarse.peak, coarse.spacing
 
     def log_density(points: FloatArray) -> FloatArray:
         settings = np.repeat(best[None, :], len(points), axis=0)
@@ -432,12 +398,12 @@ def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) ->
         return log_evidence_under(found, model.laws_at(settings, found.predicted))
 
     while columns.size:
-        peak, sd = _peak_and_sds(log_density, peak, spacing)
+        peak, sd = _peak_and_sds(log_density, start, spacing)
         inside = (peak - _REACH * sd > 0) & (peak + _REACH * sd < 1)
         if inside.all():
             break
         # At an end of its prior a parameter keeps the nodes that it has.
-        columns, peak, spacing = columns[inside], coarse.peak[np.isin(coarse.columns, columns[inside])], spacing[inside]
+        columns, start, spacing = columns[inside], start[inside], spacing[inside]
     nodes = dict(model.likely)
     for effect, part in parts:
         about = {int(c) - part.start: (peak[k], sd[k]) for k, c in enumerate(columns) if part.start <= c < part.stop}

@@ -61,17 +61,22 @@ class HypothesisProblem:
     """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
 
     `model`, `recording`: model and data; `noise`: evidence of a fit by node of the noise model (a set of its
-    parameters); the probable nodes are averaged over.
+    parameters); the probable nodes are averaged over; `near`: a point, (n_params,), such as its best fit, onto the
+    nearest order of whose Gaussians the prior is folded. Predictions do not depend on the order, nor does the evidence.
     """
 
     model: Model
     recording: Recording
     noise: NoiseEvidence
+    near: FloatArray | None = None
 
     @cached_property
     def prior(self) -> StandardNormal:
-        """The prior of the model's coordinates."""
-        return StandardNormal(self.model.n_params)
+        """The prior of the model's coordinates, folded only if its sensor has exchangeable Gaussians."""
+        sensor, n_params = self.model.sensor, self.model.n_params
+        if self.near is None or not sensor.has_exchangeable_gaussians or sensor.n_gaussians < 2:
+            return StandardNormal(n_params)
+        return FoldedNormal(n_params, cast(CalibratedSensor, sensor), self.near)
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood, averaged over the kept noise nodes: (n_samples, n_params) -> (n_samples,)."""
@@ -155,25 +160,3 @@ class FoldedNormal(StandardNormal):
         images, far = self._reordered_with_distances(theta)
         density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
         return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class FoldedProblem(HypothesisProblem):
-    """A `HypothesisProblem` with the prior folded onto the order of its Gaussians that is nearest to a point.
-
-    `near`: the point, (n_params,), such as its best fit. Predictions do not depend on the order, nor does the evidence.
-    """
-
-    near: FloatArray
-
-    @cached_property
-    def prior(self) -> StandardNormal:
-        return FoldedNormal(self.model.n_params, cast(CalibratedSensor, self.model.sensor), self.near)
-
-
-def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProblem:
-    """Fold a problem as `FoldedProblem` does; return it as it is if its sensor has no exchangeable Gaussians."""
-    sensor = problem.model.sensor
-    if not sensor.has_exchangeable_gaussians or sensor.n_gaussians < 2:
-        return problem
-    return FoldedProblem(problem.model, problem.recording, problem.noise, near)

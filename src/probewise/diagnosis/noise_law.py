@@ -274,7 +274,7 @@ class NoiseLaw:
         """
         number, nearest, carry = np.cumsum(rows) - 1, np.full(len(rows), -1), np.zeros(len(rows))
         for k in np.flatnonzero(self.carry).tolist():  # a reading comes after the one before it
-            above = self.before[k] if self.before.size else k - 1
+            above = self._number_before[k]
             if rows[above]:
                 nearest[k], carry[k] = number[above], self.carry[k]
             elif nearest[above] >= 0:
@@ -289,18 +289,14 @@ class NoiseLaw:
             y = self._whiten_with_walk(y)
             return y[:, 0] if flat else y
         y = y * (self.kept / self._whitening_sd)[:, None]
-        if self.before.size:
+        if np.any(self.carry):
             carry = self.carry[:, None]
-            y = (y - carry * y[self.before]) / np.sqrt(1 - carry**2)
-        elif np.any(self.carry):
-            carry = self.carry[1:, None]
-            innovation = np.empty_like(y)
-            innovation[0] = y[0]
-            np.multiply(carry, y[:-1], out=innovation[1:])
-            np.subtract(y[1:], innovation[1:], out=innovation[1:])
-            innovation[1:] /= np.sqrt(1 - carry**2)
-            y = innovation
+            y = (y - carry * y[self._number_before]) / np.sqrt(1 - carry**2)
         return y[:, 0] if flat else y
+
+    @cached_property
+    def _number_before(self) -> IntArray:
+        return self.before if self.before.size else np.maximum(np.arange(len(self.sd)) - 1, 0)
 
     def _whiten_with_walk(self, columns: FloatArray) -> FloatArray:
         """Whiten columns (n_points, n_columns) with a random walk: differences correlate only with their neighbours."""

@@ -169,11 +169,6 @@ class NoiseModel:
     rounding: float = 0.0
     least_sd: float = 0.0
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its effects; () for white noise."""
-        return tuple(effect.name for effect in self.effects)
-
     def columns_of_effect(self, name: str) -> slice:
         """Return the slice of one effect's parameters in the settings of nodes."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]

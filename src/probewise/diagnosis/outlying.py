@@ -170,7 +170,7 @@ def find_lost_readings(
     far = aside & (size > LARGEST_SIZE * by_chance)
     readings = recording.readings[usable]
     far |= aside & (size > by_chance) & np.isin(readings, readings[far])  # lost to one value, nearer to what was there
-    if not far.any() or _cluster(far, readings, [*covariates(found), *_row_order(run)]):
+    if not far.any() or _cluster(far, readings, covariates(found)):
         return None
     squares = residual**2
     return LostReadings(usable[far], size[far], float(squares[far].sum() / squares.sum()))
@@ -233,15 +233,6 @@ def _cluster(far: BoolArray, readings: FloatArray, covariates: Sequence[Covariat
         far = far & ~(again & np.append(False, far[:-1]))
     scores = clustering_log_bayes_factors(far.astype(np.float64), covariates)
     return max(scores.values(), default=-math.inf) > _CLUSTERED
-
-
-def _row_order(run: IntArray) -> list[Covariate]:
-    """Return the rows' places in the table, and in their run, as covariates."""
-    everything, n_runs = np.arange(len(run)), int(run.max()) + 1
-    first = np.full(n_runs, len(run))
-    np.minimum.at(first, run, everything)
-    within = Covariate("row of the run", (everything - first[run]).astype(np.float64), everything)
-    return [Covariate("row", everything.astype(np.float64), everything), *([within] if n_runs > 1 else [])]
 
 
 def note_on_improbable_rows(found: Fit, recording: Recording) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Sensors calibrated over known patterns as nulls: mixtures of Gaussians and a free form of the SSF, and their priors.
+"""Calibrated sensors as nulls: mixtures of Gaussians and a free form of the SSF, their priors; over an unknown shape.
 
 The sensor's natural coordinates are the logits of the Gaussians' shares, their means, the logs of their widths, the
 inverse hyperbolic tangents of their correlations, and the two levels: all unbounded, with a normal prior. (They are not
@@ -13,12 +13,13 @@ each with a normal prior, so that the evidence penalises only those used.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
+from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise._kinds import require_like
@@ -26,8 +27,9 @@ from probewise.calibration import FittedSensor, mixture_moments
 from probewise.diagnosis.fit import FARTHEST, Model, Null
 from probewise.effects import Extent, NamedEffect
 from probewise.errors import ParameterError
-from probewise.recordings.plan import Plan
-from probewise.scene import KnownScene, Scene
+from probewise.priors import Prior
+from probewise.recordings.plan import Plan, Recording
+from probewise.scene import AnyOf, KnownScene, Region, Scene, Shape
 from probewise.sensor import (
     FAST_NODES,
     N_BENDS,
@@ -64,8 +66,6 @@ class CalibratedSensor:
     is_free_form: bool = False
     calibrated_height_mm: float | None = None
     predicts_in_bulk = predicts_dearly = may_be_far_off = False
-    nuisance_names: ClassVar[tuple[str, ...]] = ()
-    least_readings: ClassVar[int] = LEAST_READINGS
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", read_only_floats(self.center))
@@ -84,6 +84,14 @@ class CalibratedSensor:
         if self.is_free_form:
             return "an SSF of free form"
         return f"an SSF of {self.n_gaussians} Gaussians" if self.n_gaussians > 1 else "an SSF of one Gaussian"
+
+    @property
+    def nuisance_names(self) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def least_readings(self) -> int:
+        return LEAST_READINGS
 
     @property
     def starts(self) -> FloatArray:
@@ -284,6 +292,114 @@ def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
         sensor, height_mm = sensor.with_leading_effects(), sensor.instrumentation.height_mm
     samples = np.asarray(sensor.samples, dtype=np.float64)
     return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T), height_mm=height_mm)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SensorAndShape(CalibratedSensor):
+    """A null model: a calibrated sensor over an unknown shape of known prior, which is every pattern not described.
+
+    `found` (n_starts, n_params of the shape) are coordinates of shapes from which it is fitted; `of` finds them.
+    """
+
+    shape: Shape
+    found: FloatArray
+    may_be_far_off = True  # without a missing effect the shape may be found at another place
+
+    @classmethod
+    def over(cls, sensor: CalibratedSensor, shape: Shape, found: FloatArray) -> Self:
+        """Build from a calibrated sensor, a shape and the coordinates at which to start."""
+        own = {of.name: getattr(sensor, of.name) for of in fields(CalibratedSensor)}
+        return cls(**own, shape=shape, found=read_only_floats(found))
+
+    @classmethod
+    def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:
+        """Build from a calibrated sensor's posterior and a shape's prior, and search for shapes that fit the readings.
+
+        Of a set of shapes (`AnyOf`), only the best-fitting one is kept. Raises ParameterError if no reading is usable.
+        """
+        if not recording.usable.any():
+            raise ParameterError("usable readings", 0, "at least one; the recording holds none")
+        known = sensor_from_samples(sensor)
+        members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
+        found = [_search_for_shapes(cls.over(known, member, np.empty((0, 0))), recording, rng) for member in members]
+        best = min(range(len(members)), key=lambda k: found[k][0])
+        return cls.over(known, members[best], found[best][1])
+
+    @property
+    def n_params(self) -> int:
+        return super().n_params + len(self.shape.prior.names)
+
+    @property
+    def starts(self) -> FloatArray:
+        return np.pad(self.found, ((0, 0), (super().n_params, 0)))
+
+    @property
+    def nuisance_names(self) -> tuple[str, ...]:
+        return self.shape.prior.names
+
+    @property
+    def least_readings(self) -> int:
+        return 3 * len(self.shape.prior.names) + 3
+
+    def theta(self, z: FloatArray) -> FloatArray:
+        """Map coordinates, (n_samples, n_params), to parameters: the sensor's columns, then the shape's."""
+        k = super().n_params
+        return np.concatenate([super().theta(z[:, :k]), self.shape.prior.from_unit_cube(ndtr(z[:, k:]))], axis=1)
+
+    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+        return self.chain_over(_ShapeAmongPatterns(self.shape, plan), effects, n_nodes=n_nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class _ShapeAmongPatterns:
+    """A scene of a plan's described patterns, and of one unknown shape under every other name."""
+
+    shape: Shape
+    plan: Plan
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.shape.prior.names
+
+    @property
+    def prior(self) -> Prior:
+        return self.shape.prior
+
+    def regions(self, theta: FloatArray) -> Mapping[str, Region]:
+        """Return the region of each pattern by name, for theta (n_samples, n_params of the shape)."""
+        known = cached_known_scene(self.plan).regions(theta)
+        unknown = self.shape.region(theta)
+        return {name: known.get(name, unknown) for name in self.plan.pattern_names}
+
+
+_N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
+
+
+def _search_for_shapes(
+    null: SensorAndShape, recording: Recording, rng: np.random.Generator
+) -> tuple[float, FloatArray]:
+    """Search for shapes that fit the readings, with the sensor at its prior mean.
+
+    Shapes are drawn from the prior, then repeatedly about the best ones. Returns the least sum of squares, and the
+    coordinates of the best shapes.
+    """
+    usable, chain = recording.usable, null.chain(recording.plan, (), n_nodes=FAST_NODES)
+    n_shape = len(null.nuisance_names)
+
+    def sums_of_squares(own: FloatArray) -> FloatArray:
+        z = np.pad(own, ((0, 0), (null.n_params - n_shape, 0)))
+        predicted = chain.predict(null.theta(z), recording.plan)[:, usable]
+        return np.asarray(np.sum((recording.readings[usable] - predicted) ** 2, axis=1))
+
+    own = rng.standard_normal((_N_DRAWS, n_shape))
+    values = sums_of_squares(own)
+    for shrink in 0.5 ** np.arange(_N_ROUNDS):
+        elite = np.argsort(values)[:_N_ELITE]
+        near = own[elite[rng.integers(_N_ELITE, size=_N_DRAWS)]]
+        near = np.clip(near + 0.5 * shrink * rng.standard_normal(near.shape), -FARTHEST, FARTHEST)
+        own, values = np.concatenate([own[elite], near]), np.concatenate([values[elite], sums_of_squares(near)])
+    best = np.argsort(values)[:4]
+    return float(values[best[0]]), own[best]
 
 
 def starts_of_one_gaussian(sensor: CalibratedSensor) -> FloatArray:

@@ -10,19 +10,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import (
     Linearised,
-    OrthonormalBlocks,
     average_over_amplitude_scales,
-    block_log_bayes_factors,
     scale_and_project,
 )
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
@@ -32,12 +30,12 @@ from probewise.effects import NamedEffect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
-_ABSENT = {8: 1e-9, 4: 1e-5}  # share of a template's squares below which its projection is rounding, by bytes
-_REMEMBERED = 5  # most recent noise models of which whitened templates are cached, up to `_MOST_BYTES`
-_MOST_BYTES = 2**28
-_MOST_GRAMS = 64  # noise models of which the Gram matrices are
+_ABSENT = 1e-9  # share of a template's squares below which its projection is rounding
+_REMEMBERED = 5  # most recent noise models of which whitened templates are cached, unless in groups
 _MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
-_LONG = 2**13  # rows from which templates are kept in single precision: rounding is far below the noise of a score
+
+_Whitened: TypeAlias = tuple[FloatArray, dict[int, FloatArray]]
+"""Templates, whitened, of unit rms each, (n_points, n_columns), and by width Gram matrices, (n, width, width)."""
 
 
 @dataclass(eq=False)
@@ -51,7 +49,7 @@ class TemplateBank:
     templates: tuple[FloatArray, ...]
     labels: tuple[str, ...]
     which: IntArray
-    _whitened: dict[tuple[bytes, ...], list[_Whitened | None]] = field(default_factory=dict, repr=False)
+    _whitened: dict[tuple[bytes, ...], _Whitened] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str]) -> TemplateBank:
@@ -64,10 +62,6 @@ class TemplateBank:
     def __getitem__(self, at: int) -> FloatArray:
         """Return the template of entry number `at`, (n_points, k)."""
         return self.templates[int(self.which[at])]
-
-    @property
-    def _precision(self) -> np.dtype[Any]:
-        return self.templates[0].dtype if self.templates else np.dtype(np.float64)
 
     @cached_property
     def widths(self) -> IntArray:
@@ -95,7 +89,7 @@ class TemplateBank:
         return [slice(first, end) for first, end in itertools.pairwise(bounds)]
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
-        """Return the log Bayes factor of adding each entry to a fit, as `block_log_bayes_factors` does.
+        """Return the log Bayes factor of adding each entry to a fit, amplitude and noise sd integrated out.
 
         `residuals`: projected residuals, (n_rows, n_draws); the fit's own by default. Returns log Bayes factors,
         (n_entries, n_draws).
@@ -104,81 +98,72 @@ class TemplateBank:
         n, n_kept = problem.n_points, problem.n_kept
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.templates), own.shape[1]))
-        basis, rows = (a[:n].astype(self._precision, copy=False) for a in (problem.basis, own))
-        for group, whitened in self._whitened_under(problem.law):
-            taken = np.asarray(basis.T @ whitened.templates, dtype=np.float64)  # what the fit absorbs
-            along = np.asarray(whitened.templates.T @ rows, dtype=np.float64)
+        for group, (whitened, grams) in self._whitened_under(problem.law):
+            taken, along = problem.basis[:n].T @ whitened, whitened.T @ own[:n]  # what the fit absorbs, and the rest
             widths = self.widths[group]
-            for width, products in whitened.products.items():  # all templates of one width at a time
+            for width, products in grams.items():  # all templates of one width at a time
                 members = np.flatnonzero(widths == width)
                 at = (np.cumsum(widths) - widths)[members, None] + np.arange(width)
                 absorbed = taken[:, at].transpose(1, 0, 2)
                 left = products - absorbed.transpose(0, 2, 1) @ absorbed
-                gain, axes = _gram_eigensystems(left)
-                gain = np.where(gain > _ABSENT[self._precision.itemsize] * n_kept, gain, 0.0)
-                turned = axes.transpose(0, 2, 1) @ along[at]
-                explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
-                out[group.start + members] = average_over_amplitude_scales(explained, gain, n_kept)
+                out[group.start + members] = _log_bayes_factors_of_grams(left, along[at], total, n_kept)
         return out[self.which]
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
         """Return the share of each entry's norm that a fit does not absorb, (n_entries,)."""
-        out, basis = [np.zeros(0)], problem.basis[: problem.n_points].astype(self._precision, copy=False)
-        for group, whitened in self._whitened_under(problem.law):
-            taken = basis.T @ whitened.templates
+        out, basis = [np.zeros(0)], problem.basis[: problem.n_points]
+        for group, (whitened, _) in self._whitened_under(problem.law):
+            taken = basis.T @ whitened
             starts = np.cumsum(self.widths[group]) - self.widths[group]
-            whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), starts) for a in (whitened.templates, taken))
+            whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), starts) for a in (whitened, taken))
             out.append(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
         return np.concatenate(out)[self.which]
 
     def _whitened_under(self, law: NoiseLaw) -> Iterator[tuple[slice, _Whitened]]:
         """Yield all groups of templates, whitened and scaled to unit rms each, with Gram matrices.
 
-        They are cached for the last few noise models, but those of a long table without the templates.
+        They are cached for the last few noise models if they are one group.
         """
-        key, n_numbers = law.whitening_key, sum(template.size for template in self.templates)
-        known = self._whitened.pop(key, [None] * len(self.groups))
-        kept_whole = len(self.groups) == 1
-        room = min(max(_MOST_BYTES // max(8 * n_numbers, 1), 1), _REMEMBERED) if kept_whole else _MOST_GRAMS
-        while len(self._whitened) >= room:
+        if len(self.groups) != 1:
+            yield from ((group, _whitened_with_grams(self.templates[group], law)) for group in self.groups)
+            return
+        key = law.whitening_key
+        self._whitened[key] = self._whitened.pop(key, None) or _whitened_with_grams(self.templates, law)
+        if len(self._whitened) > _REMEMBERED:
             self._whitened.pop(next(iter(self._whitened)))
-        self._whitened[key] = known
-        for number, group in enumerate(self.groups):
-            whitened = known[number]
-            if whitened is None:
-                whitened = _Whitened.of(self.templates[group], law)
-                known[number] = whitened if kept_whole else replace(whitened, templates=np.zeros((0, 0)))
-            elif not kept_whole:
-                again = law(np.concatenate(self.templates[group], axis=1))
-                again *= whitened.scale
-                whitened = replace(whitened, templates=again.astype(self._precision, copy=False))
-            yield group, whitened
+        yield self.groups[0], self._whitened[key]
 
 
-@dataclass(frozen=True, eq=False)
-class _Whitened:
-    """Templates, whitened, (n_points, n_columns), the scale of each, and by width Gram matrices, (n, width, width)."""
+def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
+    widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
+    firsts = np.cumsum(widths) - widths
+    whitened = law(np.concatenate(templates, axis=1))
+    norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
+    whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+    ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
+    products: dict[int, list[FloatArray]] = {}
+    for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
+        width, begin = int(widths[first]), int(firsts[first])
+        columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
+        products.setdefault(width, []).append(_gram_matrices(columns))
+    grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
+    return whitened, grams
 
-    templates: FloatArray
-    scale: FloatArray
-    products: dict[int, FloatArray]
 
-    @classmethod
-    def of(cls, templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
-        widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
-        firsts = np.cumsum(widths) - widths
-        whitened = law(np.concatenate([np.zeros((len(templates[0]), 0), templates[0].dtype), *templates], axis=1))
-        norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-        scale = np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
-        whitened *= scale
-        ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
-        products: dict[int, list[FloatArray]] = {}
-        for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
-            width, begin = int(widths[first]), int(firsts[first])
-            columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
-            products.setdefault(width, []).append(_gram_matrices(columns))
-        grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
-        return cls(whitened.astype(templates[0].dtype, copy=False), scale, grams)
+def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int) -> FloatArray:
+    """Return the log Bayes factors of templates of one width, (n, n_draws), with amplitude and noise sd integrated out.
+
+    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
+    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
+
+    `grams`: products of a projected template's columns, (n, width, width); `along`: their products with the residuals,
+    (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,).
+    """
+    gain, axes = _gram_eigensystems(grams)
+    gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
+    turned = axes.transpose(0, 2, 1) @ along
+    explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
+    return average_over_amplitude_scales(explained, gain, n_kept)
 
 
 def _gram_matrices(columns: FloatArray) -> FloatArray:
@@ -301,7 +286,7 @@ def templates_of_effect(
     gates = effect.variant_masks(found.model.plan)
     if gates is not None:
         (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
-        columns = [everywhere * gates.opened[k][usable, None].astype(everywhere.dtype) for k in choice]
+        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
@@ -328,9 +313,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     at = np.searchsorted(inside, usable[kept])
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
-    largest = np.abs(found.predicted).max(initial=0.0)
-    none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
-    change = np.zeros((n_rows, len(usable)), dtype=np.float32 if len(usable) > _LONG else np.float64)
+    change = np.zeros((n_rows, len(usable)))
     step = max(AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
         rows = slice(first, min(first + step, n_rows))
@@ -349,12 +332,6 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
     columns[:, np.abs(columns).max(axis=0) < none] = 0.0
     return np.split(columns, len(bank), axis=1)
-
-
-def combinations_up_to(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
-    """List every combination of up to `most` names, each sorted, the empty one first."""
-    for size in range(most + 1):
-        yield from itertools.combinations(sorted(names), size)
 
 
 _BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
@@ -385,18 +362,22 @@ def log_bayes_factors_of_pairs(
     if not pairs:
         return {}
     columns = [templates[name].columns[i] for name, i in entries]
-    widths = [c.shape[1] for c in columns]
-    # In a basis of their joint span, with one more axis for the rest of the residual.
-    axes, turned = np.linalg.qr(scale_and_project(problem, columns))
-    along = axes.T @ problem.residual
-    rest = math.sqrt(max(float(problem.residual @ problem.residual - along @ along), 0.0))
-    turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
-    own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
+    widths = np.array([c.shape[1] for c in columns])
+    projected = scale_and_project(problem, columns)
+    products, along = projected.T @ projected, projected.T @ problem.residual[:, None]
+    own = dict(zip(entries, np.split(np.arange(len(along)), np.cumsum(widths)[:-1]), strict=True))
     asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
-    parts = [(own[first], own[second]) for first, second in asked]
-    both = [np.hstack([t * math.sqrt(t.shape[1] / (a.shape[1] + b.shape[1])) for t in (a, b)]) for a, b in parts]
-    blocks = OrthonormalBlocks.of_projected_templates(np.concatenate(both, axis=1), [c.shape[1] for c in both])
-    together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_kept)[:, 0]
+    both = [np.concatenate([own[first], own[second]]) for first, second in asked]
+    together = np.empty(len(both))
+    total = np.maximum(np.sum(problem.residual[:, None] ** 2, axis=0), 1e-300)
+    per_column = np.sqrt(np.repeat(widths, widths))
+    for width in {len(at) for at in both}:
+        members = [k for k, at in enumerate(both) if len(at) == width]
+        at = np.array([both[k] for k in members])
+        scale = (per_column[at] / math.sqrt(width))[:, :, None]  # both together of unit rms
+        grams = products[at[:, :, None], at[:, None, :]] * scale * scale.transpose(0, 2, 1)
+        scores = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept)
+        together[members] = scores[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])
     gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)

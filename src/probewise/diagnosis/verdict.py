@@ -195,11 +195,8 @@ class Judged:
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
 
-def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) -> Judged:
-    """Return the verdict, with probabilities and aliases, from a search and the global test.
-
-    The probability of what is out of vocabulary counts `unknown_weight` times against all others.
-    """
+def judge(searched: Searched, test: GlobalTest) -> Judged:
+    """Return the verdict, with probabilities and aliases, from a search and the global test."""
     prepared, prior = searched.prepared, searched.prior
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
     on_noise, certain, half = prepared.pure_noise_effect_names, frozenset(searched.certain), prior.named_needs_half
@@ -222,19 +219,7 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
             named_needs_half=half,
         )
 
-    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
-        searched, test.p_value, verdict_on, unknown_weight=unknown_weight
-    )
-    if (
-        verdict == "unknown"
-        and half
-        and credible_labels(hypotheses) != ("unknown",)  # otherwise nothing named is left to lead instead
-        and searched.evidences.one_name_outweighs_unnamed()
-    ):
-        # It leads by what was believed before alone. For a light sensor it stays the verdict: of 431 in 5,988 concealed
-        # recordings at most seven would be withdrawn, all of them right.
-        named = [h.effects for h in hypotheses if h.effects not in ((), ("unknown",))]
-        verdict, combination = "cannot_tell", named[0] if named else ()
+    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(searched, test.p_value, verdict_on)
     judged = Judged(
         verdict,
         combination,
@@ -249,29 +234,25 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
 
 
 def hypotheses_with_verdict(
-    searched: Searched,
-    p_value: float,
-    verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
-    *,
-    unknown_weight: float = 1.0,
+    searched: Searched, p_value: float, verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]]
 ) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
     """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
 
     A combination with effects out of vocabulary counts as unknown, unless these are rare effects that are decided (see
     `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
     """
-    posterior, shares = searched.posterior, searched.evidences.reported_shares
-    unknown = {mean: p * shares(mean).get(("unknown",), 0.0) for mean, p in posterior.marginal_over_noise.items()}
+    posterior, reported_as = searched.posterior, searched.evidences.reported_as
+    unknown = {mean: p for mean, p in posterior.marginal_over_noise.items() if reported_as(mean) == ("unknown",)}
     rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
     if rare:
         hypotheses = ranked_hypotheses(
             posterior.probabilities,
-            lambda mean: {mean: 1.0} if effects_out_of_vocabulary(mean) == rare else shares(mean),
+            lambda mean: mean if effects_out_of_vocabulary(mean) == rare else reported_as(mean),
         )
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
             return hypotheses, rare, (verdict, combination)
-    hypotheses = ranked_hypotheses(posterior.probabilities, shares, unknown_weight=unknown_weight)
+    hypotheses = ranked_hypotheses(posterior.probabilities, reported_as)
     return hypotheses, (), verdict_on(hypotheses)
 
 
@@ -326,26 +307,18 @@ def _leader_on_mean(
     return max(likeliest, key=lambda names: physics[names], default=())
 
 
-def _unknown_if_out_of_vocabulary(mean: Names) -> Mapping[Names, float]:
-    return {("unknown",) if effects_out_of_vocabulary(mean) else mean: 1.0}
-
-
 def ranked_hypotheses(
-    probabilities: Mapping[tuple[Names, Names], float],
-    reported_as: Callable[[Names], Mapping[Names, float]] = _unknown_if_out_of_vocabulary,
-    *,
-    unknown_weight: float = 1.0,
+    probabilities: Mapping[tuple[Names, Names], float], reported_as: Callable[[Names], Names]
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
-    `probabilities` are by the effects on the mean and those on the noise; `reported_as` maps the former to the
-    combinations under which they count, with the share of their probability that each gets.
+    `probabilities` are by the effects on the mean and those on the noise; `reported_as` gives the name of the former.
     """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
-        for known, share in reported_as(mean).items():
-            key = known if known == ("unknown",) else tuple(sorted((*known, *noise_effects_in_vocabulary(noise))))
-            joined[key] = joined.get(key, 0.0) + p * share * (unknown_weight if key == ("unknown",) else 1.0)
+        key = reported_as(mean)
+        key = key if key == ("unknown",) else tuple(sorted((*key, *noise_effects_in_vocabulary(noise))))
+        joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)
@@ -367,28 +340,19 @@ def verdict_and_combination(
     effects on the mean count whatever effects on the noise are beside them, and need half the probability; otherwise
     the verdict is `cannot_tell`, with the combination.
     """
-    if named_needs_half:
-        by_mean, fullest = _joined_over_noise(hypotheses, noise_names)
-        verdict, combination = verdict_from_probabilities(by_mean, noise_names, aliases, aliased_with)
-        if verdict == "named" and max(h.probability for h in by_mean if h.effects == combination) < 0.5:
-            verdict = "cannot_tell"
-        combination = fullest.get(combination, combination)
-    else:
-        verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
+    by_mean, fullest = dict[Names, float](), dict[Names, Names]()
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        mean = hypothesis.effects
+        if named_needs_half:  # those with effects on the noise alone stay apart
+            mean = tuple(name for name in mean if name not in noise_names) or mean
+        by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
+        fullest.setdefault(mean, hypothesis.effects)
+    verdict, top = _verdict_by_probability(by_mean, noise_names, aliases, aliased_with)
+    if named_needs_half and verdict == "named" and by_mean[top] < 0.5:
+        verdict = "cannot_tell"
+    combination = fullest.get(top, top)
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
-
-
-def _joined_over_noise(
-    hypotheses: tuple[Hypothesis, ...], noise_names: frozenset[str]
-) -> tuple[tuple[Hypothesis, ...], dict[Names, Names]]:
-    """Join hypotheses with the same effects on the mean; those with effects on the noise alone stay apart."""
-    joined, fullest = dict[Names, float](), dict[Names, Names]()
-    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
-        mean = tuple(name for name in hypothesis.effects if name not in noise_names) or hypothesis.effects
-        joined[mean] = joined.get(mean, 0.0) + hypothesis.probability
-        fullest.setdefault(mean, hypothesis.effects)
-    return tuple(Hypothesis(mean, p) for mean, p in joined.items()), fullest
 
 
 def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
@@ -402,8 +366,8 @@ def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def verdict_from_probabilities(
-    hypotheses: tuple[Hypothesis, ...],
+def _verdict_by_probability(
+    probability: Mapping[Names, float],
     noise_names: frozenset[str],
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
@@ -417,7 +381,6 @@ def verdict_from_probabilities(
     - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
     - with less, if clean or unknown is more probable, or if there is no combination: then none is named.
     """
-    probability = {h.effects: h.probability for h in hypotheses}
     if probability.get(("unknown",), 0.0) >= 0.5:
         return "unknown", ("unknown",)
     if probability.get((), 0.0) >= 0.5:

@@ -13,6 +13,8 @@ from probewise.diagnosis.search.searched import Evidences, Searched, posterior_o
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 
+REFITS = SimpleNamespace(noises=SimpleNamespace(certain=()))
+
 
 class Fit(SimpleNamespace):
     """As much of a weighed fit as its evidence."""
@@ -83,42 +85,10 @@ def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_sta
 
 def test_too_few_readings_leave_no_second_copy_of_an_effect_alone():
     prepared = SimpleNamespace(effects=dict.fromkeys(("lag", "wave", "wave~again")), noise_effect_names=frozenset())
-    searched = Searched(prepared, PRIOR, {}, (), {}, None, None, EVIDENCES, posterior()).with_prior_probabilities()
+    searched = Searched(prepared, PRIOR, {}, None, REFITS, EVIDENCES, posterior()).with_prior_probabilities()
     by_mean = searched.posterior.marginal_over_noise
     assert set(by_mean) == {(), ("unknown",), ("lag",), ("wave",)}
     assert sum(by_mean.values()) == pytest.approx(1.0)
-
-
-def _fit(**log_z):
-    """Fit under noise models, by name; white is the plain one."""
-    evidence = {
-        () if noise == "white" else tuple(noise.split("__")): SimpleNamespace(log_z=z) for noise, z in log_z.items()
-    }
-    return SimpleNamespace(evidence=evidence, log_z=max(log_z.values()))
-
-
-def _evidences(unknown, *, mean=None, formula=-50.0, **null):
-    fits = {(0, ()): _fit(white=-413.0, **null)}
-    fits |= {(0, names): _fit(white=z) for names, z in (mean or {}).items()}
-    fits[0, ("formula:reading:y:t^2",)] = _fit(white=-413.0 + formula)
-    return Evidences(fits, unknown={(0, (), ()): unknown})
-
-
-@pytest.mark.parametrize(
-    ("evidences", "expected"),
-    [
-        (_evidences(-398.0, correlated_noise=-397.0), True),
-        (_evidences(-396.0, correlated_noise=-397.0), False),
-        (_evidences(-398.0, mean={("lag",): -390.0}), True),
-        (_evidences(-398.0, mean={("lag", "offset_drift"): -390.0}), False),
-        (_evidences(-398.0, correlated_noise__outliers=-390.0), False),
-        (_evidences(-398.0, drifting_noise=-390.0), False),
-        (_evidences(-398.0, correlated_noise=-397.0, formula=20.0), False),
-    ],
-    ids=["noise", "unknown", "mean", "pair", "two faults", "no name of a noise", "formula"],
-)
-def test_a_single_name_explains_more_than_what_has_none_or_does_not(evidences, expected):
-    assert evidences.one_name_outweighs_unnamed() is expected
 
 
 FORMULA = "formula:reading:temp_c:a while |(t / period + phase) mod 1| < share / 2"
@@ -129,31 +99,10 @@ def of(log_z):
     return Evidences({(0, names): SimpleNamespace(log_z=value) for names, value in {(): 0.0, **log_z}.items()})
 
 
-@pytest.mark.parametrize(
-    ("wave", "known"),
-    [(91.0, ("interference",)), (89.0, ("unknown",))],
-    ids=["nine tenths of its gain", "less than nine tenths"],
-)
-def test_a_formula_counts_as_the_one_effect_that_explains_nearly_as_much(wave, known):
-    evidences = of({("interference",): wave, ("offset_drift",): 3.0, (FORMULA,): 100.0})
-    shares = evidences.reported_shares((FORMULA,))
-    assert max(shares, key=shares.get) == known
-    assert sum(shares.values()) == pytest.approx(1.0)
-
-
-def test_two_names_together_stand_in_for_a_formula_that_the_readings_cannot_tell_from_them():
-    """Exact twins, drag and a square law of a state that keeps its sign, share its probability: neither leads."""
-    drag, square, third = (tuple(sorted(("depends", name))) for name in ("drag", "quadratic", "settling"))
-    evidences = of({("depends",): 55.0, drag: 98.0, square: 98.0, third: 96.0, (FORMULA,): 100.0})
-    shares = evidences.reported_shares((FORMULA,))
-    assert shares == {drag: pytest.approx(0.5), square: pytest.approx(0.5)}
-    assert of({drag: 96.0, (FORMULA,): 100.0}).reported_shares((FORMULA,)) == {("unknown",): 1.0}
-
-
 @pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
 def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
     evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
-    assert evidences.reported_shares((FORMULA, "offset_drift")) == {known: 1.0}
+    assert evidences.reported_as((FORMULA, "offset_drift")) == known
 
 
 def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formulas_alone():

@@ -27,7 +27,6 @@ from probewise.diagnosis.templates import (
     EffectTemplates,
     TemplateBank,
     TemplateCache,
-    combinations_up_to,
     log_bayes_factors_by_label,
     log_mean_exp,
 )
@@ -200,7 +199,7 @@ class NoiseModels:
         self.certain = tuple(sorted(self._known))
         self._hidden = sd < HIDDEN * self._step
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
-        single = [tuple(sorted({*names, *self.certain})) for names in combinations_up_to(others, 1)]
+        single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in sorted(others)))]
         self.models = {names: self._build_model(names) for names in single}
 
     def _build_model(
@@ -328,8 +327,6 @@ class Refits:
     templates: TemplateCache
     known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
-    plain: dict[WeighedFit, WeighedFit | None] = field(default_factory=dict, repr=False)
-    """Nulls as fitted under the plainest noise, where they predict otherwise."""
     scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
     """Log Bayes factors of the templates of a bank, by label."""
 
@@ -375,29 +372,6 @@ class Refits:
         detectable = log_probability_effects_detectable(found, law, self.templates.usable)
         return WeighedFit.of(found, law, evidence, detectable)
 
-    def fits_better_at_z(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
-        """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""
-        found = candidate.found
-        left = found.predicted + found.residuals - model.predict(z[None, :])[0, self.templates.usable]
-        with np.errstate(all="ignore"):  # of predictions that ran away: no number is less
-            there = _minus_log_likelihood(candidate.law, left) + 0.5 * float(z @ z)
-        return there < found.objective - SAME_MODE
-
-    def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit | None:
-        """Return the given null refitted under the simplest noise, with no effects but those beyond doubt.
-
-        None if that predicts the same, if the most probable noise has no memory, or if no null is given.
-        """
-        if self.sensor is None or not self.likeliest_law(null).has_memory:
-            return None
-        if null not in self.plain:
-            law = null.evidence[self.noises.certain].likeliest_law
-            found = self._fit_from_best_start(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
-            apart = float(np.sum(law(found.residuals - null.found.residuals) ** 2))
-            alike = apart < 2 * ALIASED_NATS * found.sd**2
-            self.plain[null] = None if alike else WeighedFit.of(found, law, self.noises.evidence_by_noise(found), 0.0)
-        return self.plain[null]
-
     def refit_with_effect(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
 
@@ -410,10 +384,6 @@ class Refits:
         if key not in self.known:
             self.known[key] = self._refit_with_likely_variants(parent, effect, against)
         return self.known[key]
-
-    def replace_fit(self, held: WeighedFit, better: WeighedFit) -> None:
-        """Use the fit `better` in place of `held`, of the same combination, in later calls of `refit_with_effect`."""
-        self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)

@@ -11,7 +11,6 @@ from scipy.special import logsumexp
 
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
@@ -30,9 +29,8 @@ from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.effects.noise import Outliers
 from probewise.sensor import Stage
 
-_TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gains less than half of it
 _BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
-_NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
+_TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gains less than half of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,35 +62,17 @@ class Evidences:
         gained = self.fits[order, named].evidence[noise].log_z - self.fits[order, ()].evidence[noise].log_z
         return gained > self.unknown[order, names, noise] - self.fits[order, named].evidence[noise].log_z
 
-    def reported_shares(self, mean: Names) -> dict[Names, float]:
-        """Return by which names a combination is reported, with shares of its probability that sum to one.
+    def reported_as(self, mean: Names) -> Names:
+        """Return the names by which a combination is reported: ("unknown",) if any of its effects has no name.
 
-        Those are its own names, or ("unknown",) if any is out of vocabulary, with two exceptions. The combination's
-        named part is reported if it alone has over half of the gain over the null. A formula alone is shared out among
-        the named effects that explain as much, by their evidence (`_stand_ins_for_formula`).
+        Its named part is reported instead if that alone has over half of the gain over the null.
         """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
-            return {mean: 1.0}
-        if not named and mean[0].startswith(PROPOSAL):
-            log_z = {names: self._largest_log_z(names) for names in self._stand_ins_for_formula(mean)}
-            total = logsumexp(list(log_z.values())) if log_z else 0.0
-            return {names: math.exp(value - total) for names, value in log_z.items()} or {("unknown",): 1.0}
+            return mean
         nothing = self._largest_log_z(())
         explains_more = self._largest_log_z(named) - nothing > 0.5 * (self._largest_log_z(mean) - nothing)
-        return {named if named and explains_more else ("unknown",): 1.0}
-
-    def _stand_ins_for_formula(self, formula: Names) -> list[Names]:
-        """List the named effects that a formula counts as, since they explain as much; [] if there are none.
-
-        Single effects explain as much with nine tenths of its gain over the null. Without any, combinations do, which
-        were chosen from many more, if their evidence is at most three nats below: the readings cannot tell which.
-        """
-        nothing, its_own = self._largest_log_z(()), self._largest_log_z(formula)
-        named = dict.fromkeys(names for _, names in self.fits if names and not effects_out_of_vocabulary(names))
-        gains = {names: self._largest_log_z(names) - nothing for names in named}
-        alike = [names for names in gains if gains[names] > its_own - nothing - ALIASED_NATS]
-        return [k for k in gains if len(k) == 1 and gains[k] > _NEARLY_ALL * (its_own - nothing)] or alike
+        return named if named and explains_more else ("unknown",)
 
     def best_formula_beside(self, fit: WeighedFit, noise: Names) -> WeighedFit | None:
         """Return the refit of largest evidence that adds formulas alone to the effects of another fit, if any."""
@@ -104,21 +84,6 @@ class Evidences:
             and all(name.startswith(PROPOSAL) for name in {*names} - {*fit.names})
         ]
         return max(options, key=lambda more: more.evidence[noise].log_z, default=None)
-
-    def one_name_outweighs_unnamed(self) -> bool:
-        """Return whether some named effect, on mean or noise, has more evidence alone than any unnamed effect alone.
-
-        Unnamed are unknown effects and formulas; without any, False. Combinations do not count: they were chosen from
-        too many for their evidence alone to decide.
-        """
-        plain = min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
-        nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]
-        alone: dict[bool, list[float]] = {True: [], False: nameless}
-        for (_, names), fit in self.fits.items():
-            for noise, evidence in fit.evidence.items():
-                if len(names) + len(noise) - len(plain) == 1 and noise_effects_in_vocabulary(noise) == noise:
-                    alone[not effects_out_of_vocabulary(names)].append(evidence.log_z)
-        return max(alone[True], default=-math.inf) > max(alone[False], default=math.inf)
 
     def only_outlying_readings_differ(self, prior: PriorOdds, certain: Names) -> bool:
         """Return whether effects on the mean that beat outlying readings change no other readings than those.
@@ -250,20 +215,22 @@ class MisfitTemplates:
 class Searched:
     """Result of a search.
 
-    `noise_models`, `certain`: noise models by the names of their effects; names of the noise effects beyond doubt;
     `nulls`: the null by SSF order (number of Gaussians), without fits; `refits`: all refits, for another search of the
     same recording.
     """
 
     prepared: Prepared
     prior: PriorOdds
-    noise_models: Mapping[Names, NoiseModel]
-    certain: Names
     nulls: Mapping[int, Null]
     misfit_templates: MisfitTemplates
     refits: Refits
     evidences: Evidences
     posterior: Posterior
+
+    @property
+    def certain(self) -> Names:
+        """Names of the noise effects beyond doubt, which are part of every noise model."""
+        return self.refits.noises.certain
 
     def with_evidences(self, evidences: Evidences) -> Searched:
         """Return the result with other evidences, and the probabilities that follow from them."""
@@ -328,8 +295,8 @@ class Searched:
         """Return, by effect on the noise, the probability that it acts, given that what acts on the mean is unknown."""
         unknown: dict[Names, float] = {}
         for (mean, noise), p in self.posterior.probabilities.items():
-            share = self.evidences.reported_shares(mean).get(("unknown",), 0.0)
-            unknown[noise] = unknown.get(noise, 0.0) + p * share
+            if self.evidences.reported_as(mean) == ("unknown",):
+                unknown[noise] = unknown.get(noise, 0.0) + p
         total, out = sum(unknown.values()) or 1.0, dict[str, float]()
         for noise, p in unknown.items():
             for name in noise:

@@ -7,7 +7,6 @@ over the whole prior, there for one Gaussian mode.
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.diagnosis.evidence import covariance_root
 from probewise.diagnosis.fit import FARTHEST
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem, fold_problem
+from probewise.diagnosis.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched
@@ -88,13 +87,6 @@ _N_SAMPLES = 2000  # posterior samples that define such a prior
 _SHARP = 0.3  # nats: largest error with which a difference of one nat can be resolved
 _APART = 3.3  # standard errors: one in a thousand
 
-# Calls of a run for each live point and parameter (39 to 47 were counted), and runs of a hypothesis: most often two
-# to five, at most the first, four about its samples and four about Laplace's peak.
-_CALLS = 43
-_FEWEST_RUNS, _MOST_RUNS_IN_ALL = 2, 1 + 2 * _MOST_RUNS
-_USUAL_RUNS = 5  # usual number of runs, for the progress bar
-_TIMED = 100  # hypotheses whose evaluation is timed
-_STEPS = 100  # steps of the bar per hypothesis
 Run = Callable[..., nested.NestedResult]
 
 
@@ -121,7 +113,7 @@ def weigh_thoroughly(
         posterior; further runs, from priors near it (`probewise.nested.repartition`), estimate the evidence until its
         error is small.
     progress
-        Called first with an estimate of the minutes, from timed evaluations of the hypotheses; then after every round.
+        Called after every round of every run, with the number and the name of the hypothesis.
 
     Returns
     -------
@@ -130,12 +122,10 @@ def weigh_thoroughly(
     require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
     leaders = _leading_hypotheses(searched)
-    minutes = _least_and_most_minutes(leaders, searched, n_live, rng=np.random.default_rng(0))
-    bar = _ProgressBar(progress, len(leaders), minutes)
     for k, ((candidate, noise), own) in enumerate(zip(leaders, rng.spawn(len(leaders)), strict=True)):
-        key = candidate.n_gaussians, candidate.names
-        weighings[key] = _weigh_by_nested_sampling(
-            candidate, noise, searched, rng=own, n_live=n_live, rounds=partial(bar.show_round, k)
+        show = partial(progress, "weighing hypotheses again", k, len(leaders))
+        weighings[candidate.n_gaussians, candidate.names] = _weigh_by_nested_sampling(
+            candidate, noise, searched, rng=own, n_live=n_live, show=show
         )
     told = tuple(weighings.values())
     if all(w.agree for w in told) or any(w.doubts for w in told):
@@ -178,21 +168,20 @@ def _weigh_by_nested_sampling(
     *,
     rng: np.random.Generator,
     n_live: int,
-    rounds: Callable[[str, nested.RoundSummary], None],
+    show: Callable[[str], None],
 ) -> Weighing:
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *noise_effects_in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = _hypothesis_problem(candidate, noise, searched)
-    once = fold_problem(problem, candidate.found.z)
+    once = HypothesisProblem(candidate.found.model, searched.prepared.recording, evidence, candidate.found.z)
     # Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
     log_factor = candidate.log_prior_factor - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
-    n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
+    n_live = max(n_live, nested.LIVE_PER_PARAM * once.model.n_params)
     run = partial(
         nested.run,
         rng=rng,
         n_live=n_live,
-        progress=lambda state: rounds(weighing.label, state),
+        progress=lambda _: show(weighing.label),
         max_cost=1.0,  # each run here is checked against the next
         return_interrupted=False,
     )
@@ -217,49 +206,6 @@ def _weigh_by_nested_sampling(
         return told
     doubt = f"the whole prior holds more evidence than was found near the posterior, by {apart:.1f} standard errors"
     return replace(told, doubts=(*told.doubts, doubt))
-
-
-def _hypothesis_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> HypothesisProblem:
-    return HypothesisProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
-
-
-def _least_and_most_minutes(
-    leaders: Sequence[tuple[WeighedFit, Names]], searched: Searched, n_live: int, *, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Estimate the least and the most minutes of all runs, from the measured time of one likelihood."""
-    seconds = 0.0
-    for candidate, noise in leaders:
-        problem = _hypothesis_problem(candidate, noise, searched)
-        n_params, z = problem.model.n_params, candidate.found.z
-        theta = np.clip(z + 1e-3 * rng.standard_normal((_TIMED, len(z))), -FARTHEST, FARTHEST)
-        began = time.perf_counter()
-        problem.log_likelihood(theta)
-        each = (time.perf_counter() - began) / _TIMED
-        seconds += each * _CALLS * max(n_live, nested.LIVE_PER_PARAM * n_params) * n_params
-    return _FEWEST_RUNS * seconds / 60, _MOST_RUNS_IN_ALL * seconds / 60
-
-
-class _ProgressBar:
-    """A progress bar over the runs of all hypotheses, with the estimated duration in its title."""
-
-    def __init__(self, progress: Progress, n: int, minutes: tuple[float, float]) -> None:
-        self._progress, self._n, self._runs = progress, n, 0
-        self._at, self._depth = -1, 0.0
-        least, most = minutes
-        said = "a minute" if most < 1 else f"{max(least, 1):.0f} to {math.ceil(most):.0f} minutes"
-        self._stage = f"weighing {n} hypotheses again, about {said}"
-        progress(self._stage, 0, n * _STEPS)
-
-    def show_round(self, k: int, label: str, state: nested.RoundSummary) -> None:
-        """Show the progress after one round of a run for hypothesis number `k`, from 0, with the name `label`."""
-        depth = -state.log_volume
-        if k != self._at or depth < self._depth:  # a new run starts from the whole prior
-            self._runs = 1 if k != self._at else self._runs + 1
-        self._at, self._depth = k, depth
-        to_come = max(state.log_z_remaining - state.log_z, 0.0)  # remaining nats, about
-        share = (self._runs - 1 + depth / (depth + to_come + 1.0)) / _USUAL_RUNS
-        done = int((k + min(share, 0.99)) * _STEPS)
-        self._progress(self._stage, done, self._n * _STEPS, f"{label}, run {self._runs}")
 
 
 def _evidence_near_posterior(

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
-from probewise.nested.check import doubts_of_missed_parts
+from probewise.nested.check import doubts_of_missed_peaks
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     HeldOutSamples,
@@ -108,7 +108,7 @@ def refine(
     doubts = _inherited_doubts(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
         # A generator of its own: the refined evidence is the same with and without the look.
-        missed, n_calls = doubts_of_missed_parts(result, found, problem, run_once, rng=rng.spawn(1)[0])
+        missed, n_calls = doubts_of_missed_peaks(result, found, Evaluator(problem), run_once, rng=rng.spawn(1)[0])
         found, doubts = replace(found, n_calls=found.n_calls + n_calls), (*doubts, *missed)
     return replace(found, inherited=doubts)
 

@@ -80,7 +80,7 @@ def test_a_refinement_of_a_run_that_was_not_checked_looks_for_lost_modes_itself(
     )
     assert found.log_z == without.log_z
     assert without.sound
-    assert "that the live points have lost or never met has a log Z of about" in found.doubts[-1]
+    assert "that the live points have lost or never met has a log Z of about" in found.warnings[-1]
     assert 0 < found.n_calls - without.n_calls < 2 * robbed.n_calls
 
 

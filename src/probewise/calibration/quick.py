@@ -158,7 +158,7 @@ def _sample(nearby: Repartitioned, n_live: int, rng: np.random.Generator, progre
         n_eff=found.n_eff,
         n_calls=found.n_calls,
         pareto_k=-math.inf,
-        inherited=found.warnings,
+        warnings=found.warnings,
     )
 
 

@@ -65,8 +65,8 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _pooled_log_possible_share(parts)
     log_likelihood = joined["log_likelihood"]
-    evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
-    log_z, error = evidence.log_z, evidence.log_z_error(remembered)
+    evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start)
+    log_z, error = evidence.log_z, math.hypot(math.sqrt(remembered) * evidence.spread, log_start_error)
     # Fisher's method combines independent p values.
     fisher = -2.0 * float(np.log(np.maximum([r.insertion_p_value for r in parts], 1e-300)).sum())
     p_value = float(chdtrc(2 * len(parts), fisher))

@@ -20,13 +20,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError, message_of
-from probewise.nested.clusters import Clusters, find_clusters
+from probewise.nested.clusters import Clusters
 from probewise.nested.evidence import warning_of_few_lineages, warning_of_few_possible_draws
-from probewise.nested.moves import HoppingMove, Move, SliceMove
+from probewise.nested.moves import Move, SliceMove
 from probewise.nested.peaks import find_missed_peaks
 from probewise.nested.problem import Evaluator, Samplable
 from probewise.nested.repartition import repartitioned
-from probewise.nested.result import Check, NestedResult, Samples
+from probewise.nested.result import Check, NestedResult
 
 DISAGREE = 2.5
 """Difference of two estimates of log Z, in combined standard errors, above which they disagree."""
@@ -35,8 +35,8 @@ _N_SAMPLES = 2000
 _GAIN = 0.8  # share of the first run's nats, below which the second estimate is one from near the posterior
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
-_SAMPLES_IN_CLUSTER = 20  # per parameter: with fewer, repeated samples look like a cluster
 _MET = 0.5  # of the share of a peak: with more, a run has met it
+_AGAIN = 2.2  # times the first run's evaluations: what it costs to repeat it with chains twice as long
 _MISSING = 1.0  # errors by which a missed peak raises log Z, above which it is a doubt
 
 Search = Callable[..., NestedResult]
@@ -56,65 +56,57 @@ class _Budget:
     def left(self) -> int:
         return int(self.limit - self.spent)
 
-    def run(self, problem: Samplable, n_live: int, chain: SliceMove, parts: Clusters | None) -> NestedResult | None:
-        """Run nested sampling, with hops between `parts`; None if too few evaluations are left for a complete run."""
+    def run(self, problem: Samplable, n_live: int, chain: SliceMove) -> NestedResult | None:
+        """Run nested sampling; None if too few evaluations are left for a complete run."""
         # A run is worth a start with its first live points, and twice the evaluations of one round.
         if self.left < n_live * (1 + chain.n_steps(len(problem.prior.names)) * chain.target):
             return None
-        move: Move = chain if parts is None else HoppingMove(chain, parts)
-        found = self.search(problem, n_live=n_live, move=move, max_calls=self.left, rng=self.rng)
+        found = self.search(problem, n_live=n_live, move=chain, max_calls=self.left, rng=self.rng)
         self.spent += found.n_calls
         return found if found.complete else None
 
 
 @dataclass(frozen=True, eq=False)
 class _SecondEstimate:
-    """A `run` by the method `name`, whose posterior says how much each part of the posterior holds.
+    """A `run` by the method `name`, whose posterior says how much each missed peak holds.
 
-    `parts`: clusters of the first run's samples, `n_met` of them, then of missed peaks, in the coordinates into which
-    `enter` maps parameters; None if no peak was missed.
+    `parts`: the first run's samples and then the missed peaks as clusters, in the coordinates into which `enter` maps
+    parameters; None if no peak was missed.
     """
 
     name: str
     run: NestedResult
     parts: Clusters | None
-    n_met: int
     enter: Callable[[FloatArray], FloatArray]
 
     def distance(self, run: NestedResult) -> float:
         """Return a run's log Z minus this estimate's, in combined standard errors."""
         return (run.log_z - self.run.log_z) / max(math.hypot(run.log_z_error, self.run.log_z_error), 1e-12)
 
-    def doubts(self, run: NestedResult) -> tuple[str, ...]:
+    def doubts(self, run: NestedResult) -> list[str]:
         """Return doubts about a run in words: missed peaks, and evidences that disagree or do not tell."""
-        notes = self.doubts_of_missed_peaks(run)
+        notes, log_z = list[str](), f"{run.log_z:.2f} ± {run.log_z_error:.2f}"
+        share = 0.0
+        if self.parts is not None:
+            has, wanted = (
+                np.bincount(self.parts.assign(self.enter(each.theta)), each.weight, len(self.parts))[1:]
+                for each in (run, self.run)
+            )
+            share = float(wanted[has < _MET * wanted].sum())
+        if -math.log1p(-min(share, 1 - 1e-15)) > _MISSING * run.log_z_error:
+            notes.append(
+                "a part of the posterior that the live points have lost or never met has a log Z of about "
+                f"{self.run.log_z + math.log(share):.2f}, this run's is {log_z}; use more n_live, or a prior about it"
+            )
         if abs(self.distance(run)) > DISAGREE:
-            notes += (
-                f"{self.name} gives log Z = {self.run.log_z:.2f} ± {self.run.log_z_error:.2f}, this run "
-                f"{run.log_z:.2f} ± {run.log_z_error:.2f}: {abs(self.distance(run)):.1f} errors apart; chains are too "
-                "short or a part of the posterior was lost; use a greater steps_per_param, more n_live, or a greater "
-                "max_cost",
+            notes.append(
+                f"{self.name} gives log Z = {self.run.log_z:.2f} ± {self.run.log_z_error:.2f}, this run {log_z}: "
+                f"{abs(self.distance(run)):.1f} errors apart; chains are too short or a part of the posterior was "
+                "lost; use a greater steps_per_param, more n_live, or a greater max_cost"
             )
         elif self.run.warnings:
-            notes += (f"{self.name}, which checks the evidence, is itself doubtful: {self.run.warnings[0]}",)
+            notes.append(f"{self.name}, which checks the evidence, is itself doubtful: {self.run.warnings[0]}")
         return notes
-
-    def doubts_of_missed_peaks(self, run: Samples) -> tuple[str, ...]:
-        """Return a doubt in words where peaks of which a run has less than half would raise its log Z by its error."""
-        if self.parts is None:
-            return ()
-        has, wanted = (
-            np.bincount(self.parts.assign(self.enter(each.theta)), each.weight, len(self.parts))[self.n_met :]
-            for each in (run, self.run)
-        )
-        share = float(wanted[has < _MET * wanted].sum())
-        if not -math.log1p(-min(share, 1 - 1e-15)) > _MISSING * run.log_z_error:
-            return ()
-        return (
-            "a part of the posterior that the live points have lost or never met has a log Z of about "
-            f"{self.run.log_z + math.log(share):.2f}, this run's is {run.log_z:.2f} ± {run.log_z_error:.2f}; use more "
-            "n_live, a greater max_cost, or a prior about that part",
-        )
 
 
 def check_and_repeat(
@@ -127,15 +119,16 @@ def check_and_repeat(
     max_calls: int | None,
     least_live: int,
     rng: np.random.Generator,
+    repeat: bool = True,
 ) -> NestedResult:
-    """Check a run that its stopping rule ended; repeat it with longer chains where there are doubts.
+    """Check a run that its stopping rule ended; `repeat` it with longer chains where there are doubts.
 
     Limits on all evaluations, those of `first` included: `max_cost` times those of `first`, and `max_calls`, if not
     None. `least_live`: fewest live points allowed for the problem. `evaluate`: of the problem, for the search of missed
     peaks; `search` brings its own.
 
-    Return the first run, or a repetition, with hops to missed peaks, if only that has no doubts. `check` holds the
-    second estimate; None if it failed or did not end, which adds a warning. `n_calls` counts all evaluations.
+    Return the first run, or a repetition if only that has no doubts. `check` holds the second estimate; None if it
+    failed or did not end, which adds a warning. `n_calls` counts all evaluations.
     """
     limit = min(max_cost * first.n_calls, math.inf if max_calls is None else max_calls)
     budget, now, check = _Budget(search, limit, first.n_calls, rng), first, None
@@ -144,16 +137,16 @@ def check_and_repeat(
         second = _second_estimate(first, evaluate, budget, chain, least_live)
         if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
-            notes: tuple[str, ...] = (
+            notes = [
                 "a second estimate, which checks the evidence, did not end within max_cost and max_calls "
-                f"({int(limit)} evaluations in all); use a greater limit, or max_cost=1 for no check",
-            )
+                f"({int(limit)} evaluations in all); use a greater limit, or max_cost=1 for no check"
+            ]
         else:
             n_check, notes = budget.spent - first.n_calls, second.doubts(first)
-            if notes and not second.run.warnings:
-                again = budget.run(evaluate.problem, first.n_live, chain, second.parts)
+            if notes and repeat and not second.run.warnings:
+                again = budget.run(evaluate.problem, first.n_live, chain)
                 if again is not None and not again.warnings and not second.doubts(again):
-                    now, notes = again, ()
+                    now, notes = again, []
             log_z, error = second.run.log_z, second.run.log_z_error
             check = Check(second.name, log_z, error, second.distance(now), n_check)
             if not notes:
@@ -165,44 +158,21 @@ def check_and_repeat(
         # A second estimate may evaluate hypotheses that the first run never met. Whatever a check meets, a posterior
         # narrower than floats among it, the run that ended is kept.
         why = str(error) if isinstance(error, NotConvergedError) else message_of(error)
-        notes = (f"a second estimate, which checks the evidence, failed: {why}",)
+        notes = [f"a second estimate, which checks the evidence, failed: {why}"]
     return replace(now, n_calls=budget.spent, check=check, warnings=(*now.warnings, *notes))
 
 
-def doubts_of_missed_peaks(
-    run: NestedResult, judged: Samples, evaluate: Evaluator, search: Search, *, rng: np.random.Generator
-) -> tuple[tuple[str, ...], int]:
-    """Look for peaks that a run has missed; where there are any, weigh them by a second estimate.
-
-    Return doubts about `judged`, such as a refinement of the run, in words; and the number of evaluations, at most
-    twice those of the run.
-    """
-    budget = _Budget(search, 3 * run.n_calls, run.n_calls, rng)
-    chain = _with_longer_chains(SliceMove())
-    second = _second_estimate(run, evaluate, budget, chain, run.n_live, only_if_missed=True)
-    return (() if second is None else second.doubts_of_missed_peaks(judged)), budget.spent - run.n_calls
-
-
 def _second_estimate(
-    first: NestedResult,
-    evaluate: Evaluator,
-    budget: _Budget,
-    chain: SliceMove,
-    least_live: int,
-    *,
-    only_if_missed: bool = False,
+    first: NestedResult, evaluate: Evaluator, budget: _Budget, chain: SliceMove, least_live: int
 ) -> _SecondEstimate | None:
     """Run from near the posterior and the missed peaks, or a small run; None if it did not end.
 
-    Where the two estimates disagree it is repeated with more live points. `only_if_missed`: None, too, if no peak was
-    missed.
+    Where the two estimates disagree it is repeated with more live points.
     """
     problem, enter, n_before = evaluate.problem, evaluate.space.enter, evaluate.n_calls
     invertible = hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")
     peaks = find_missed_peaks(first, evaluate, max_calls=budget.left, rng=budget.rng) if invertible else []
     budget.spent += evaluate.n_calls - n_before
-    if only_if_missed and not peaks:
-        return None
     theta = first.samples(_N_SAMPLES, rng=budget.rng)
     least = max(least_live, min(_LEAST_LIVE, first.n_live))
     name, posed, n_live = "a second run with longer chains", problem, max(first.n_live // 8, least)
@@ -218,23 +188,16 @@ def _second_estimate(
                 enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
                 name, posed = "a second pass from near the posterior", near
                 n_live = int(max(min(wanted, enough, first.n_live / 2), least))
-    parts, met = None, list[FloatArray]()
-    if peaks:
-        u, fewest = enter(theta), _SAMPLES_IN_CLUSTER * theta.shape[1]
-        clusters = find_clusters(u, least=fewest)
-        home = clusters.assign(u)
-        met = [u[home == k] for k in range(len(clusters))]
-        if min(map(len, met)) < fewest:  # the last division of space may leave a cluster with fewer
-            met = [u]
-        parts = Clusters.from_groups([*met, *map(enter, peaks)])
-    found = budget.run(posed, n_live, chain, None)
+    found = budget.run(posed, n_live, chain)
     if found is None:
         return None
-    second = _SecondEstimate(name, found, parts, len(met), enter)
-    n_more = int(min(first.n_live, n_live * budget.left / (2 * found.n_calls)))  # half of what is left
-    if not only_if_missed and second.doubts(first) and n_more > n_live:
-        found = budget.run(posed, n_more, chain, None) or found
-    return replace(second, run=found)
+    parts = Clusters.from_groups([*map(enter, (theta, *peaks))]) if peaks else None
+    second, again = _SecondEstimate(name, found, parts, enter), _AGAIN * first.n_calls
+    room = budget.left - again if budget.left > again else budget.left
+    n_more = int(min(first.n_live, n_live * room / found.n_calls))
+    if second.doubts(first) and n_more > n_live:
+        second = replace(second, run=budget.run(posed, n_more, chain) or found)
+    return second
 
 
 def _with_longer_chains(move: Move) -> SliceMove:

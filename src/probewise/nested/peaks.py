@@ -24,33 +24,26 @@ from probewise.nested.repartition import covariance_root_of_points, root_of_cova
 from probewise.nested.result import NestedResult
 
 _SAMPLES_PER_PARAM, _FEWEST_SAMPLES = 20, 200  # of peaks that are returned
-# Of a climb:
-_PER_PARAM, _LEAST_DRAWS = 10, 60  # draws of a generation
-_BEST, _FEWEST_BEST = 0.25, 2  # of them
-_LEARNT = 0.3  # share of the covariance that a generation replaces
-_MOST_GENERATIONS = 80
-_LEVEL = 0.02  # nats between the best draws at the top: a gentle slope is followed, too
-_AS_DRAWN = 0.2  # nats between the best draws of the distribution that is returned
+# Of a climb: draws of a generation, the best of them, the share of the covariance that a generation replaces.
+_PER_PARAM, _LEAST_DRAWS, _BEST, _FEWEST_BEST, _LEARNT, _MOST_GENERATIONS = 10, 60, 0.25, 2, 0.3, 80
+# Nats between the best draws: at the top, since a gentle slope is followed, too; and of the distribution returned.
+_LEVEL, _AS_DRAWN = 0.02, 0.2
 # Of early dead points:
 _BULK = 0.1  # of the posterior's mass, up to which points count as early
-_LINES_SHARE = 1 / 20  # of the run's evaluations, for the lines from them
-_CLIMBS_SHARE = 1 / 6  # of the run's evaluations, up to which another climb begins
-_NEXT_DEAD = 600  # points that give the scale of lines, and the metric of a climb
-_BEGIN = 0.3  # of their sds, in which a climb begins
+_LINES_SHARE, _CLIMBS_SHARE = 1 / 20, 1 / 6  # of the run's evaluations, for lines, and for climbs from them
+_NEXT_DEAD, _BEGIN = 600, 0.3  # points that give the scale of lines and of a climb, which begins in so many sds
 _N_KNOWN = 200  # samples of the posterior: so few that a mode of which it has nearly nothing is not among them
 _ON_LINE = np.array([0.2, 0.3, 0.4, 0.5])  # places where a line is looked at: the dip lies nearer to the narrow mode
-_DIP = 1.0  # nats
-_NEAREST = 3  # samples from which a top lies apart
+_DIP, _NEAREST = 1.0, 3  # nats of a dip, and samples from which a top lies apart
 _MOST_CLIMBS = 8
 _FROM_TOP = 3.0  # nats a parameter below the early points' end, down to which a top matters
 # Of the top of the last live points' peak, and draws about it:
-_ASCENT_SHARE = 1 / 20  # of the run's evaluations, at most
+_ASCENT_SHARE, _DRAWS_SHARE = 1 / 20, 1 / 8  # of the run's evaluations, at most
 # Nats a parameter by which a top lies above all points of a run: of a normal posterior it is below half of that.
 _FAR_ABOVE = 0.5
 _HIGHER = 0.2  # nats by which a draw lies above the known top, so that it belongs to another peak
 _SCALES = (1.5, 1.2, 0.95)  # of the draws, in sds at the top
 _PER_LIVE = 0.1  # draws of a scale, for each live point and each parameter squared: a cone is the rarer, the more
-_DRAWS_SHARE = 1 / 8  # of the run's evaluations, for these draws
 _MOST_PEAKS = 5
 
 
@@ -113,12 +106,11 @@ def climb_to_top(
 ) -> Peak:
     """Climb from a normal distribution to the top of a peak; return the distribution about the top.
 
-    As in CMA-ES (Hansen & Ostermeier 2001), every generation is drawn from a normal distribution. The mean of its best
-    quarter becomes the next mean, and their scatter about the old mean updates the covariance. The distribution so
-    stretches along a direction in which the likelihood keeps rising: the arm of a heavy tail, a hundred times as long
-    as wide, is climbed in some thousand evaluations. The climb ends when the best draws differ by less than 0.02 nats,
-    after 80 generations, or before `max_calls` evaluations would be exceeded. Draws below the log likelihood `known`
-    are ignored: they may belong to another peak. At the end it is widened until the best quarter spans 0.2 nats.
+    As in CMA-ES (Hansen & Ostermeier 2001), the mean of the best quarter of each generation becomes the next mean, and
+    their scatter about the old mean updates the covariance, which so stretches along a direction in which the
+    likelihood keeps rising. The climb ends when the best draws differ by less than 0.02 nats, after 80 generations, or
+    before `max_calls` evaluations would be exceeded. Draws below the log likelihood `known` are ignored: they may
+    belong to another peak. At the end the distribution is widened until the best quarter spans 0.2 nats.
     """
     now, n_draws, spread = start, max(_PER_PARAM * len(start.centre), _LEAST_DRAWS), math.inf
     covariance, most = start.root @ start.root.T, evaluate.n_calls + max_calls

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.priors import Empty, Joint, LogNormal, LogUniform, Normal, Prior, Product, Uniform
+from probewise.priors import Joint, LogNormal, LogUniform, Normal, Prior, Product, Uniform
 
 MARGINALS = [Uniform(-2.0, 5.0), LogUniform(0.01, 30.0), LogNormal(3.0, 0.6), Normal(1.0, 2.5)]
 
@@ -35,7 +35,7 @@ def test_a_value_outside_the_support_is_impossible_and_never_nan():
 
 
 def test_joined_priors_keep_names_and_columns_in_order():
-    joint = Joint((Product({"a": Uniform(0, 1)}), Empty(), Product({"b": Normal(0, 1), "c": LogUniform(1, 2)})))
+    joint = Joint((Product({"a": Uniform(0, 1)}), Product({}), Product({"b": Normal(0, 1), "c": LogUniform(1, 2)})))
     assert isinstance(joint, Prior)
     assert joint.names == ("a", "b", "c")
     u = np.random.default_rng(0).random((7, 3))
@@ -62,7 +62,7 @@ def test_improper_priors_are_refused(make):
         make()
 
 
-@pytest.mark.parametrize("prior", [Product({}), Joint(()), Joint((Empty(),))])
+@pytest.mark.parametrize("prior", [Product({}), Joint(()), Joint((Product({}),))])
 def test_a_prior_of_no_parameters_draws_none(prior):
     nothing = np.zeros((3, 0))
     assert prior.names == ()

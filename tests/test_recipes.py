@@ -9,13 +9,13 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+from mixtures import mean_albedo_under_gaussians
 
 from probewise import nested
 from probewise.priors import Uniform
 from probewise.proof.systems.cases import draw_system
 from probewise.recordings import paper_plan
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
-from probewise.sensor.gaussian import mean_albedo_under_gaussians
 from probewise.systems import Noise, RunTable, Simulator, System, read_simulator
 from probewise.systems.forms import ReferenceFit
 

@@ -429,7 +429,7 @@ def test_lists_are_taken_where_arrays_are_meant():
         expected = likelihood.log_prob(np.array([10.0, 60.0]), np.array([[10.0, 60.0]]))
         assert likelihood.log_prob([10, 60], [[10, 60]]).tolist() == expected.tolist()
     assert ARM.reachable([[500, 200]]).tolist() == [True]
-    moved, _ = diversify([[0.1, 0.2], [0.3, 0.4]], Bell(), rng=np.random.default_rng(0), n_steps=2)
+    moved = diversify([[0.1, 0.2], [0.3, 0.4]], Bell(), rng=np.random.default_rng(0), n_steps=2)
     assert moved.shape == (2, 2)
 
 

@@ -87,7 +87,7 @@ def merged(kept: Path, together: int = 4) -> Iterator[dict[str, Any]]:
         if number < len(files[name]):
             result = NestedResult.load(files[name][number])
             found = refine(result, known(name), rng=np.random.default_rng([29, number]))
-            yield _told(name, found, found.doubts, what="refine", files=[files[name][number].stem])
+            yield _told(name, found, found.warnings, what="refine", files=[files[name][number].stem])
 
 
 def _told(name: str, found: NestedResult | Weighted, doubts: Sequence[str], **more: Any) -> dict[str, Any]:

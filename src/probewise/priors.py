@@ -19,7 +19,6 @@ from probewise._kinds import checked_number, require_kind, require_like
 from probewise.errors import ParameterError, ShapeError
 
 __all__ = [
-    "Empty",
     "Joint",
     "LogNormal",
     "LogUniform",
@@ -217,7 +216,10 @@ class LogNormal:
 
 @dataclass(frozen=True)
 class Product:
-    """Joint distribution of independent parameters: `marginals`, a mapping of name to the distribution of one."""
+    """Joint distribution of independent parameters: `marginals`, a mapping of name to the distribution of one.
+
+    `Product({})` is the prior of a model without free parameters.
+    """
 
     marginals: Mapping[str, Marginal]
 
@@ -297,28 +299,6 @@ class Joint:
         """Return pairs of a part and its columns, (n_samples, n_params of the part)."""
         ends = np.cumsum([len(p.names) for p in self.parts])
         return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]
-
-
-@dataclass(frozen=True)
-class Empty:
-    """The prior of a model without free parameters."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The empty tuple."""
-        return ()
-
-    def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Return the points, (n_samples, 0), unchanged."""
-        return u
-
-    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Return the parameters, (n_samples, 0), unchanged."""
-        return theta
-
-    def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return zero for each sample, (n_samples,): the density of the only point is 1."""
-        return np.zeros(len(theta))
 
 
 def require_prior(name: str, prior: object, *more: str) -> None:

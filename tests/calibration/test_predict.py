@@ -168,18 +168,6 @@ def test_the_mean_field_and_the_parameters_predict_alike(sensor: FittedSensor) -
         assert np.abs(by_field - by_samples.mean(axis=0)).max() < 1e-3
 
 
-def test_chi_square_of_fresh_readings_is_one(
-    make_sensor: Callable[..., FittedSensor], truth: FloatArray, noise_sd: float
-) -> None:
-    """408 readings: the mean of z^2 has sd sqrt(2 / 408) = 0.07; four of these fail once in 16 000."""
-    plan = paper_plan()
-    narrow = make_sensor(spread=1e-3)
-    clean = _chain(plan).predict(truth[None], plan)[0]
-    readings = clean + noise_sd * np.random.default_rng(15).standard_normal(len(plan))
-    found = predict(narrow, plan, readings)
-    assert abs(np.mean(((readings - found.mean) / found.sd) ** 2) - 1) < 4 * math.sqrt(2 / len(plan))
-
-
 def test_another_unit_is_warned_of(sensor: FittedSensor) -> None:
     plan = replace(_disc_plan(), instrumentation=Instrumentation(unit="mW"))
     with pytest.warns(DoubtfulResultWarning, match="'mW'"):

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from mixtures import mean_albedo_under_gaussians
 from scipy.special import ndtr
 
 from probewise.effects import EFFECTS, Extent, Known, Origin
 from probewise.effects.optics import RegionWithGradient, RegionWithPatch
-from probewise.priors import Empty
+from probewise.priors import Product
 from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform, paper_plan
 from probewise.scene import KnownScene, edge_distance
 from probewise.scene.regions import (
@@ -33,7 +34,6 @@ from probewise.sensor import (
     Poses,
     Stage,
     mean_albedo_by_pixels,
-    mean_albedo_under_gaussians,
     mean_ssf_field,
 )
 
@@ -451,7 +451,7 @@ class InTurn:
 
     name = "in_turn"
     stage = Stage.FOOTPRINT
-    prior = Empty()
+    prior = Product({})
 
     def apply(self, value, theta, plan):
         for effect in self.effects:

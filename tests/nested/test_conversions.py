@@ -12,7 +12,7 @@ from nested_sampling import problems
 
 from probewise.errors import ParameterError
 from probewise.nested import NestedResult, merge, run
-from probewise.priors import Empty, Product, Uniform
+from probewise.priors import Product, Uniform
 
 WHY = "{0} is an optional package: pip install {0}"
 
@@ -102,6 +102,6 @@ def test_a_missing_package_is_named_with_its_install_line(
 
 
 def test_a_result_without_parameters_has_no_samples_to_hand_over() -> None:
-    fixed = run(problems.Known(Empty(), lambda t: np.zeros(len(t)), 0.0), rng=np.random.default_rng(0))
+    fixed = run(problems.Known(Product({}), lambda t: np.zeros(len(t)), 0.0), rng=np.random.default_rng(0))
     with pytest.raises(ParameterError, match="without any there are no samples"):
         fixed.to_arviz(rng=np.random.default_rng(0))

@@ -17,9 +17,8 @@ def test_replicated_samples_become_independent() -> None:
     clouds = []
     for _ in range(8):
         copies = np.repeat(np.array([[0.5, 0.2, 0.4], [-0.3, -0.1, 0.0]]), 25, axis=0)
-        theta, tally = diversify(copies, problem, rng=rng, n_steps=600)
-        assert tally.n_distinct == 50
-        assert 0.1 < tally.acceptance < 0.9
+        theta = diversify(copies, problem, rng=rng, n_steps=600)
+        assert len(np.unique(theta, axis=0)) == 50
         clouds.append(theta)
     everything = np.concatenate(clouds)
     assert everything.mean(axis=0) == pytest.approx(np.zeros(3), abs=0.25)
@@ -34,17 +33,18 @@ def test_exact_draws_stay_exact_draws_and_forget_where_they_began() -> None:
     problem = problems.gaussian(2, correlation=0.9)
     rng = np.random.default_rng(12)
     start = rng.multivariate_normal([0, 0], [[1, 0.9], [0.9, 1]], size=2000)
-    end, tally = diversify(start, problem, rng=rng, n_steps=150)
+    end = diversify(start, problem, rng=rng, n_steps=150)
     assert np.cov(end, rowvar=False) == pytest.approx(np.array([[1, 0.9], [0.9, 1]]), abs=0.12)
     assert abs(np.corrcoef(start[:, 0], end[:, 0])[0, 1]) < 0.1
-    assert tally.mixing == pytest.approx(1.0, abs=0.15)
+    # Of independent samples the mean square difference is twice the variance.
+    assert ((end - start) ** 2).mean() / 2 == pytest.approx(1.0, abs=0.15)
 
 
 def test_samples_pass_between_modes() -> None:
     problem = problems.mixture_of_far_peaks(2)
     rng = np.random.default_rng(13)
     start = np.concatenate([rng.normal(0.3, 0.02, (150, 2)), rng.normal(0.7, 0.02, (50, 2))])
-    end, _ = diversify(start, problem, rng=rng, n_steps=500)
+    end = diversify(start, problem, rng=rng, n_steps=500)
     assert (end[:, 0] > 0.5).mean() == pytest.approx(0.75, abs=0.14)
 
 
@@ -54,16 +54,13 @@ def test_the_likelihood_is_never_asked_outside_the_prior() -> None:
         return np.zeros(len(theta))
 
     rng = np.random.default_rng(14)
-    end, tally = diversify(rng.random((30, 2)), problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng)
-    assert tally.n_steps == 1000
+    end = diversify(rng.random((30, 2)), problems.Known(problems.box(2, 0, 1), function, 0.0), rng=rng)
     assert ((end >= 0) & (end <= 1)).all()
 
 
 def test_no_steps_change_nothing() -> None:
     theta = np.full((4, 2), 0.5)
-    end, tally = diversify(theta, problems.plateau(), rng=np.random.default_rng(0), n_steps=0)
-    assert np.array_equal(end, theta)
-    assert (tally.n_calls, tally.n_distinct) == (0, 1)
+    assert np.array_equal(diversify(theta, problems.plateau(), rng=np.random.default_rng(0), n_steps=0), theta)
 
 
 def test_an_impossible_sample_or_a_wrong_shape_is_refused() -> None:

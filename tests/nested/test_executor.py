@@ -32,7 +32,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.errors import ParameterError
 from probewise.priors import Product, Uniform
 
 
@@ -50,16 +49,8 @@ class Slope:
     def log_likelihood(self, theta):
         over = theta[:, 0] > self.edge
         if over.any():
-            if self.what == "raise":
-                raise ArithmeticError("too steep")
-            if self.what == "own error":
-                raise ParameterError("x", float(theta[over][0, 0]), "less")
             if self.what == "die":
                 os.kill(os.getpid(), signal.SIGKILL)
-            if self.what == "shape":
-                return np.zeros(3)
-            if self.what == "nan":
-                return np.where(over, np.nan, 0.0)
         return 30 * theta[:, 0] - 5 * theta[:, 1]
 '''
 
@@ -174,29 +165,6 @@ def test_parts_of_a_batch_are_evaluated_at_the_same_time() -> None:
     problem = problems.Known(problems.box(2, 0, 1), function, 0.0)
     with ThreadPoolExecutor(3) as pool:
         assert run(problem, rng=rng(), n_live=30, executor=pool, n_workers=3).complete
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ("raise", r"raised ArithmeticError: too steep; at x = 0\.9\d+, y = 0\.\d+"),
-        ("own error", r"raised ParameterError: x is 0\.9\d+; allowed: less; at x = 0\.9\d+, y = 0\.\d+"),
-        ("nan", r"log likelihood is nan at x = 0\.9\d+, y = 0\.\d+"),
-        ("shape", r"returned shape \(3,\); allowed: \(\d+,\).*first of the \d+ hypotheses asked for: x = 0\.\d+"),
-    ],
-)
-def test_a_failure_in_a_worker_is_told_with_its_parameters_and_mended(
-    what: str, message: str, executor: Executor, slopes: ModuleType, tmp_path: Path
-) -> None:
-    path = tmp_path / "run.npz"
-    options = {"n_live": 50, "executor": executor, "n_workers": 3, "checkpoint": path}
-    with pytest.raises(NotConvergedError, match=message) as caught:
-        run(slopes.Slope(0.9995, what), rng=rng(), **options)
-    assert isinstance(caught.value.partial, NestedResult)
-    assert caught.value.partial.stop_reason == "the likelihood failed"
-    assert path.exists()
-    assert_same(run(slopes.Slope(), rng=rng(), **options), run(slopes.Slope(), rng=rng(), n_live=50))
 
 
 def test_the_part_that_failed_is_the_one_that_is_told() -> None:

@@ -47,21 +47,6 @@ def test_held_back_samples_see_the_mode_that_the_draws_are_blind_to() -> None:
     assert np.sum(np.square(z)) < chi2.isf(FALSE_ALARM, len(z))
 
 
-def test_no_single_draw_decides_where_samples_say_what_it_stands_for() -> None:
-    """A weight of 10,000 times the others' doubles plain importance sampling's answer; the bridge cuts it."""
-    log_ratio = np.zeros(10_000)
-    log_ratio[0] = math.log(1e4)
-    plain, plain_error, missed, _ = _bridge_sampling_estimate(log_ratio, 10_000, np.empty(0), 0.0)
-    assert plain == pytest.approx(math.log(2.0), abs=1e-3)
-    assert plain_error == pytest.approx(0.5, abs=0.01)
-    assert missed == 0.0
-    log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, 10_000, np.zeros(300), 300.0)
-    assert abs(log_z) < 0.02
-    assert error < 0.02
-    assert missed == 0.0
-    assert np.exp(log_weight).sum() == pytest.approx(1.0)
-
-
 def test_a_lattice_of_modes_is_parted_and_a_gaussian_is_not() -> None:
     rng = np.random.default_rng(1)
     lattice = 6.0 * np.stack(np.meshgrid(np.arange(6), np.arange(3)), axis=-1).reshape(-1, 2)
@@ -80,8 +65,7 @@ def test_a_part_followed_by_few_lines_of_descent_may_be_lost() -> None:
     even = np.full(1000, -math.log(1000))
     found = Weighted(("x", "y"), theta, np.zeros(1000), even, 0.0, 0.01, 1000.0, 1000, 0.1)
     told = with_error_of_lost_parts(found, 20.0, space, rng)
-    assert told.lost == pytest.approx(0.1 * math.exp(-2.0), rel=0.01)
-    assert told.log_z_error == pytest.approx(math.hypot(0.01, told.lost))
+    assert told.log_z_error == pytest.approx(math.hypot(0.01, 0.1 * math.exp(-2.0)), rel=0.01)
     assert told.sound
     hopeless = with_error_of_lost_parts(found, 0.5, space, rng)
     assert not hopeless.sound

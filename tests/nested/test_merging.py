@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from nested_sampling import problems
-from scipy.stats import chi2, combine_pvalues
+from scipy.stats import combine_pvalues
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested import Check, NestedResult, merge, run
@@ -69,19 +69,6 @@ def test_merged_runs_are_one_run_with_the_live_points_of_all(
     assert merged.agreement is not None
     assert merged.agreement.log_z == tuple(r.log_z for r in terraces)
     assert "8, ln Z agree" in merged.summary()
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
-def test_the_error_of_merged_runs_is_their_scatter() -> None:
-    """Mean square of 40 standardised residuals: chi-square's 1e-4 and 1 - 1e-4 quantiles over 40."""
-    problem = problems.plateau()
-    low, high = chi2.ppf([1e-4, 1 - 1e-4], 40) / 40
-    z = []
-    for k in range(40):
-        merged = merge(several(problem, 4, n_live=40, seed=100 + k, max_cost=1.0), rng=np.random.default_rng(k))
-        z.append((merged.log_z - problem.log_z) / merged.log_z_error)
-    assert low < np.mean(np.square(z)) < high
 
 
 def test_runs_of_different_live_points_and_ends_are_merged(rng: np.random.Generator) -> None:

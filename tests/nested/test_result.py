@@ -70,12 +70,7 @@ def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names
         parts = {name: file[name] for name in file.files}
     head = json.loads(str(parts.pop("head")))
     del head["log_z"]
-    changed = {"head": np.array(json.dumps({**head, "mood": 1})), **parts}
-    np.savez(path, **changed)
-    with pytest.raises(FileError, match="it holds something else than was written"):
-        NestedResult.load(path)
-    del changed["sha256"]  # as files of earlier versions
-    np.savez(path, **changed)
+    np.savez(path, head=np.array(json.dumps({**head, "mood": 1})), **parts)
     with pytest.raises(FileError, match="log_z, mood missing or unknown"):
         NestedResult.load(path)
 
@@ -106,11 +101,3 @@ def test_quantiles_of_equal_weights_are_the_plain_ones(result: NestedResult) -> 
         plain.mean(lambda t: t[:3])
     with pytest.raises(ShapeError, match=r"shape \(\)"):
         plain.mean(lambda t: t.sum())
-
-
-def test_arrays_of_other_lengths_are_refused(result: NestedResult) -> None:
-    for name in ("label", "birth_label", "n_at_death", "log_weight"):
-        with pytest.raises(ShapeError, match=rf"{name} has shape \(1,\).*one per row of theta"):
-            dataclasses.replace(result, **{name: np.ones(1, dtype=int)})
-    with pytest.raises(ShapeError, match=r"insertion_n_ranked.*one per inserted point"):
-        dataclasses.replace(result, insertion_n_ranked=np.ones(1, dtype=int))

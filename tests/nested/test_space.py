@@ -8,7 +8,6 @@ import pytest
 from probewise.calibration import SSFPrior, default_prior
 from probewise.nested.problem import space_of, unbounded_space_of
 from probewise.priors import (
-    Empty,
     HeavyTailedPrior,
     Joint,
     LogHeavyTailedPrior,
@@ -38,7 +37,7 @@ PRIORS = {
     "heavy-tailed": Product({"a": HeavyTailedPrior(2.0)}),
     "positive heavy-tailed": Product({"a": HeavyTailedPrior(0.1, positive=True)}),
     "log heavy-tailed": Product({"a": LogHeavyTailedPrior(0.2)}),
-    "joint": Joint((Product({"a": Uniform(0, 1)}), Empty(), Product({"b": Normal(0, 1), "c": LogUniform(1, 2)}))),
+    "joint": Joint((Product({"a": Uniform(0, 1)}), Product({}), Product({"b": Normal(0, 1), "c": LogUniform(1, 2)}))),
     "circle": Circle().prior,
     "circle inside": Circle(inside=True).prior,
     "ellipse": Ellipse().prior,

@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from probewise.errors import ParameterError
 from probewise.nested import NestedResult, run
-from probewise.priors import Empty, Product, Uniform
+from probewise.priors import Product, Uniform
 from probewise.report import plots
 from probewise.report.plots.nested import _centres_and_smoothed_density, _new_points_per_bar
 
@@ -24,7 +24,7 @@ class Bell:
 
 
 class Fixed:
-    prior = Empty()
+    prior = Product({})
 
     def log_likelihood(self, theta):
         return np.zeros(len(theta))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mixtures import mean_albedo_under_gaussians
 
 from probewise.scene import edge_distance, outlines, regions
 from probewise.scene.regions import (
@@ -16,7 +17,7 @@ from probewise.scene.regions import (
     UniformRegion,
 )
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
-from probewise.sensor.gaussian import mean_albedo_under_gaussians, mean_albedo_under_one_gaussian
+from probewise.sensor.gaussian import mean_albedo_under_one_gaussian
 
 ELLIPSE = EllipseRegion([[3.0, 1.0]], [[14.0, 9.0]], [0.4])
 POLYGON = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]]]))

@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from mixtures import mean_albedo_under_gaussians
 from scipy.special import ndtr, owens_t
 
 from probewise.recordings import paper_plan
 from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene, region_of
-from probewise.sensor import Chain, FixedLevels, FreeMixture, footprint_of, mean_albedo_under_gaussians
+from probewise.sensor import Chain, FixedLevels, FreeMixture, footprint_of
 from probewise.sensor.gaussian import moments_in_lab_frame, probabilities_beyond_corner_and_sides
 
 EDGES = {
@@ -77,7 +78,7 @@ def test_the_papers_scans_from_both_sides_are_half_as_many_views():
     chain = Chain(FreeMixture(1), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
     edges = chain._layout_under_poses(thetas(1, 1), plan).straight_batches[0]
     assert len(edges.rows) == 404
-    assert len(edges._distinct_views.distance_mm) == 202
+    assert len(edges.distance_mm) == 202
 
 
 def test_what_lies_beyond_a_corner_is_owens_function():

@@ -13,7 +13,7 @@ from probewise.calibration.fields import (
     ssf_quantities,
 )
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
-from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan
+from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,
@@ -42,7 +42,6 @@ __all__ = [
     "calibrate",
     "choose_pixel_mm",
     "default_prior",
-    "draw_pooled_sd",
     "draw_sd",
     "mixture_moments",
     "noise_by_scan",

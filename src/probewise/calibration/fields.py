@@ -15,7 +15,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.sensor import Footprint, SSFField, footprint_of, mean_ssf_field
 
 _SIGMAS = 5.0
-_MAX_PIXELS_A_SIDE = 301
+_MOST_PIXELS_A_SIDE = 301
 _SERIES = (1.0, 0.5, 0.2, 0.1)
 # The sum over pixels of width p is a trapezoidal or midpoint rule in the distance to an edge (depending on whether the
 # edge halves a pixel or lies between two): its error is at most p^2 / 12 times the greatest slope of the profile of a
@@ -86,7 +86,6 @@ def posterior_mean_ssf_field(
     *,
     pixel_mm: float = 1.0,
     weight: FloatArray | None = None,
-    max_pixels: int = _MAX_PIXELS_A_SIDE,
 ) -> SSFField:
     """Average the SSF fields of weighted samples on square pixels, centred on multiples of their width.
 
@@ -97,11 +96,9 @@ def posterior_mean_ssf_field(
     n_gaussians
         Order N.
     pixel_mm
-        Width of a pixel; enlarged for a footprint that would need more than `max_pixels` per side.
+        Width of a pixel; enlarged for a footprint that would need more than 301 per side.
     weight
         Posterior weights, (n_samples,); by default equal. The samples with the last thousandth are left out.
-    max_pixels
-        Largest number of pixels per side, 3 or more.
 
     Returns
     -------
@@ -111,8 +108,6 @@ def posterior_mean_ssf_field(
     """
     if not (pixel_mm > 0 and math.isfinite(pixel_mm)):
         raise ParameterError("pixel_mm", pixel_mm, "greater than 0")
-    if max_pixels < 3:
-        raise ParameterError("max_pixels", max_pixels, "3 or more")
     weight = np.full(len(theta), 1 / len(theta)) if weight is None else weight / weight.sum()
     if weight.shape != (len(theta),):
         raise ShapeError(f"weight has shape {weight.shape}; allowed: ({len(theta)},), one per sample")
@@ -127,8 +122,8 @@ def posterior_mean_ssf_field(
         for centre, sd in ((f.u_mm, np.sqrt(f.var_u)), (f.v_mm, np.sqrt(f.var_v)))
     ]
     widest = max(high - low for low, high in ends)
-    if widest / pixel_mm > max_pixels - 2:
-        wanted = widest / (max_pixels - 2)
+    if widest / pixel_mm > _MOST_PIXELS_A_SIDE - 2:
+        wanted = widest / (_MOST_PIXELS_A_SIDE - 2)
         decade = 10.0 ** math.floor(math.log10(wanted))
         pixel_mm = next(k * decade for k in (1.0, 2.0, 5.0, 10.0) if k * decade >= wanted * (1 - 1e-9))
     u_mm, v_mm = (

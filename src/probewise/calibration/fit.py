@@ -23,8 +23,8 @@ from probewise.calibration.fields import (
     mixture_moments,
     posterior_mean_ssf_field,
 )
-from probewise.calibration.noise import draw_pooled_sd, noise_by_scan
-from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
+from probewise.calibration.noise import draw_sd, noise_by_scan
+from probewise.calibration.priors import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.quick import fit_orders_quickly
 from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
@@ -96,17 +96,6 @@ class Calibration(ShowsItself):
     def fields(self) -> dict[int, SSFField]:
         """Mean SSF field of each fit, in a dict by order."""
         return {fit.n_gaussians: fit.field for fit in self.fits}
-
-    @property
-    def priors(self) -> tuple[PriorRow, ...]:
-        """The table of priors of the chosen order, one row per kind of parameter."""
-        return self.chosen.prior.table_rows()
-
-    def order_probabilities(self) -> dict[int, float]:
-        """Return the posterior probability by order, with equal prior probabilities."""
-        log_z = np.array([fit.log_z for fit in self.fits])
-        weight = np.exp(log_z - log_z.max())
-        return {fit.n_gaussians: float(w) for fit, w in zip(self.fits, weight / weight.sum(), strict=True)}
 
     def summary(self) -> str:
         """Describe the calibration in plain text."""
@@ -280,7 +269,7 @@ def _fit_order(
         names=prior.names,
         samples=samples,
         n_gaussians=n_gaussians,
-        noise_sd=draw_pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
+        noise_sd=draw_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
         field=posterior_mean_ssf_field(theta, n_gaussians, pixel_mm=pixel_mm, weight=weight),
         instrumentation=plan.instrumentation,
         scan_noise=noise_by_scan(
@@ -289,7 +278,7 @@ def _fit_order(
         fingerprint=fingerprint(recording),
         source=PurePath(recording.source).name,
         priors=prior.table_rows(),
-        notes=(*notes, *found.doubts),
+        notes=(*notes, *result.warnings),
     )
     return OrderFit(n_gaussians, prior, found, sensor)
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray, floats, own_arithmetic
-from probewise.calibration.search import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import EFFECTS, Origin
 from probewise.effects.noise_distribution import PredictiveMixture
@@ -90,7 +89,6 @@ def predict(
     step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
     there = chain.plan_at_calibrated_height(plan)  # once, so that the chain lays out the scene once for all blocks
-    model = chain if sensor.effects else DeduplicatedModel(chain, there)
     for effect in sensor.effects_on_new_scans:
         kind = EFFECTS[effect.name]
         for column in {*getattr(kind, "reads", ())} - {*plan.covariates}:
@@ -116,7 +114,7 @@ def predict(
         progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
         noise = chain.noise_parameters(theta[block], there, sensor.noise_sd[block, None])
-        mixture.add(model.predict(theta[block], there), noise)
+        mixture.add(chain.predict(theta[block], there), noise)
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)
 
 

@@ -9,51 +9,21 @@ from functools import partial
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import IntArray
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference import SensorProblem, student_t_of
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
-from probewise.recordings import Plan, Recording
+from probewise.nested.importance import MOST_K
+from probewise.recordings import Recording
 from probewise.scene import KnownScene
-from probewise.sensor import COMMANDED, FAST_NODES, Chain, FreeLevels, FreeMixture, SensorModel
+from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
 Progress = Callable[[int, RoundSummary], None]
 
 _N_DRAWS = 8000
 # Two estimates of the evidence this many errors apart disagree: one false alarm in 16 000.
 _DISAGREE = 4.0
-
-
-class DeduplicatedModel:
-    """Wrapper of a model that predicts repeated rows of one plan, as in scans out and back, only once.
-
-    The model's predictions may depend only on a row's position, orientation, pattern, and commanded height and LED, as
-    those of a chain without effects do. The wrapper predicts only the plan that it was made for, else ParameterError.
-    """
-
-    def __init__(self, model: SensorModel, plan: Plan) -> None:
-        commanded = [plan.covariates[name] for name in COMMANDED if name in plan.covariates]
-        pattern = plan.pattern.astype(np.float64)
-        keys = np.stack([plan.x_mm, plan.y_mm, plan.orientation_rad, pattern, *commanded], axis=-1)
-        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        self._model = model
-        self._plan = plan
-        repeats = len(first) < len(plan)
-        self._rows = inverse.reshape(-1) if repeats else None
-        self._distinct = plan.take(first) if repeats else plan
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The model's parameter names."""
-        return self._model.names
-
-    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Predict noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        if plan is not self._plan:
-            raise ParameterError("plan", plan, "the plan that this model was made for; make another for this one")
-        distinct = self._model.predict(theta, self._distinct)
-        return distinct if self._rows is None else np.take(distinct, self._rows, axis=1)
 
 
 def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
@@ -75,7 +45,7 @@ def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | 
     if groups.shape != (len(plan),):
         raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
     chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
-    return SensorProblem(prior, DeduplicatedModel(chain, plan), student_t_of(recording, groups), recording)
+    return SensorProblem(prior, chain, student_t_of(recording, groups), recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +85,6 @@ class OrderPosterior:
         """The result whose log Z is used: `refined` if its error is reliable (`Weighted.sound`), else `result`."""
         return self.refined if self.refined is not None and self.refined.sound else self.result
 
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the samples, in words."""
-        return self.result.doubts if isinstance(self.result, Weighted) else self.result.warnings
-
 
 Search = Callable[[int, np.random.Generator], OrderPosterior]
 """Function that searches the whole prior of an order."""
@@ -144,7 +109,7 @@ def search_prior_of_order(
         return OrderPosterior(result, None, (note,))
     more = refine(result, problem, rng=rng, n_draws=_N_DRAWS, look=False)
     apart = abs(more.log_z - result.log_z) / math.hypot(more.log_z_error, result.log_z_error)
-    if apart <= _DISAGREE or not set(more.doubts) <= set(more.inherited):
+    if apart <= _DISAGREE or not more.pareto_k < MOST_K:
         return OrderPosterior(result, more)
     note = (
         f"two estimates of the evidence of {n_gaussians} Gaussians disagree: {result.log_z:.2f} ± "

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, cast
 
@@ -137,16 +137,16 @@ class FittedSensor(NamedSamples):
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
-        other = [both for both in self.forms.items() if both[0] not in self.effects or both not in OTHER_FORMS]
-        if other:
-            raise ParameterError("forms", other[0], f"effects of the model among {sorted(OTHER_FORMS)}")
-        stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
-        if stray:
-            raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
-        stray = [name for name in self.origins if name not in self.effects or not _counts_from_origin(name)]
-        if stray:
-            counting = [name for name in self.effects if _counts_from_origin(name)]
-            raise ParameterError("origins", stray[0], f"effects of the model that count from an origin: {counting}")
+        can_have: dict[str, Callable[[str], bool]] = {
+            "forms": lambda name: (name, self.forms.get(name)) in OTHER_FORMS,
+            "patterns": _BOUND_TO_PATTERNS.__contains__,
+            "origins": lambda name: bool(getattr(EFFECTS[name], "counts", "")),
+        }
+        for key, able in can_have.items():
+            stray = [name for name in getattr(self, key) if name not in self.effects or not able(name)]
+            if stray:
+                able_ones = [name for name in self.effects if able(name)]
+                raise ParameterError(key, stray[0], f"effects of the model among {able_ones}")
         require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         if not 1 <= self.n_gaussians <= len(self.names) // 6:
             allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
@@ -412,10 +412,6 @@ def require_fitted_sensor(sensor: object, more: str = "") -> None:
     elif hasattr(sensor, "fitted_sensor"):
         allowed = "a FittedSensor: take its .fitted_sensor(recording, rng=rng), of the recording that was diagnosed"
     require_kind("sensor", sensor, FittedSensor, f"{allowed}{', ' if more else ''}{more}")
-
-
-def _counts_from_origin(name: str) -> bool:
-    return bool(getattr(EFFECTS[name], "counts", ""))
 
 
 def _precision_determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:

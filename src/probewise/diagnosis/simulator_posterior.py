@@ -137,11 +137,9 @@ def draw_by_importance(
         height = np.where((np.abs(z) < FARTHEST).all(axis=1), log_prior + log_likelihood, -np.inf)
         log_ratio = height - log_mixture + math.log((1 + 1 / _PER_PRIOR) * len(proposals))
         draws = weighted_draws(problem.prior.names, z, log_likelihood, log_ratio, len(z))
-        weight = np.exp(log_ratio - log_ratio.max())
-        sd = np.sqrt(np.average((z - np.average(z, axis=0, weights=weight)) ** 2, axis=0, weights=weight))
-        now, share = (draws.log_z, sd), draws.n_eff / len(z)
+        weight, now, share = draws.weight, (draws.log_z, draws.sd()), draws.n_eff / len(z)
         is_sound = draws.n_eff >= enough and (draws.pareto_k < _UNSURE_K or share > _UNIFORM)
-        is_still = abs(now[0] - before[0]) < _SETTLED[0] and np.allclose(sd, before[1], rtol=_SETTLED[1])
+        is_still = abs(now[0] - before[0]) < _SETTLED[0] and np.allclose(now[1], before[1], rtol=_SETTLED[1])
         if is_sound and (is_still or (not k and share > _AS_IT_IS)):
             return draws, True
         before = now

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.priors import Empty, Marginal, Prior, Product
+from probewise.priors import Marginal, Prior, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, Stage
 
@@ -53,8 +53,8 @@ class Known(WrappedEffect[V]):
             raise ParameterError("values", self.values, f"one number for each of {self.effect.prior.names}")
 
     @property
-    def prior(self) -> Empty:
-        return Empty()
+    def prior(self) -> Product:
+        return Product({})
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
         """Apply the effect with the fixed values; theta is (n_samples, 0)."""

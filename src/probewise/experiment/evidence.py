@@ -14,15 +14,13 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.experiment.kinds import KindProblem, Posterior, n_samples_of_kind
 from probewise.inquiry.smc import BRIEF, LocalKernels, nested_sampling_from_scratch, particles_from_posterior
-from probewise.nested import Weighted, pareto_k
-from probewise.nested.importance import evenly_weighted
-from probewise.nested.weights import n_effective
+from probewise.nested import Weighted
+from probewise.nested.importance import evenly_weighted, weighted_draws
 
 _MATTERS = 1e-4  # probability, by the raised odds, from which on a kind is solved at a doubt, and wakes
 _HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
@@ -160,19 +158,7 @@ def sampled_about_points(
         return None
     theta, log_likelihood = theta[alive], log_likelihood[alive]
     log_ratio = problem.prior.log_prob(theta) + log_likelihood - density.log_density(theta)
-    log_sum = float(logsumexp(log_ratio))
-    n_eff = n_effective(log_ratio - log_sum)
-    return Weighted(
-        problem.prior.names,
-        theta,
-        log_likelihood=log_likelihood,
-        log_weight=log_ratio - log_sum,
-        log_z=log_sum - math.log(n_draws),
-        log_z_error=math.sqrt(max(1.0 / n_eff - 1.0 / n_draws, 0.0)),
-        n_eff=n_eff,
-        n_calls=n_draws,
-        pareto_k=pareto_k(log_ratio),
-    )
+    return weighted_draws(problem.prior.names, theta, log_likelihood, log_ratio, n_draws)
 
 
 @dataclass(frozen=True, eq=False)

@@ -155,7 +155,7 @@ class NestedSampling:
         for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
             if n_own := int((which == k).sum()):
                 start = particles.weighted.samples(n_own, rng=rng)
-                moved, _ = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
+                moved = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
                 drawn.append(kind.to_whole_theta(moved, rng))
         return np.concatenate(drawn)
 

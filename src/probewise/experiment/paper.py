@@ -78,7 +78,7 @@ def find_shape(
         readings = (*readings, arm.measure(Pose(x_mm, y_mm, float(orientation_rad[place]))))
         problem = SensorProblem(shape.prior, model, likelihood, recording_of(readings))
         posterior = run(problem, n_live=N_LIVE, stop=EvidenceChange(), move=KernelMove(), max_cost=1.0, rng=rng)
-        shapes, _ = diversify(posterior.samples(N_SAMPLES, rng=rng), problem, n_steps=N_STEPS, rng=rng)
+        shapes = diversify(posterior.samples(N_SAMPLES, rng=rng), problem, n_steps=N_STEPS, rng=rng)
         yield readings, posterior, shapes
         known = bool((posterior.sd()[lengths] < stop_sd_mm).all())
 

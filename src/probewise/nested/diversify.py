@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,26 +16,8 @@ _N_PRIOR_DRAWS = 200
 _BLOCK = 100
 
 
-@dataclass(frozen=True)
-class DiversifyTally:
-    """Statistics of the steps; all zero but `n_distinct` where there is nothing to move.
-
-    `n_calls`: likelihood evaluations. `acceptance`: share of accepted proposals. `n_distinct`: number of distinct
-    samples at the end. `mixing`: mean squared displacement over its value for independent samples, averaged over the
-    parameters; near 1 when the samples no longer depend on their start.
-    """
-
-    n_steps: int
-    n_calls: int
-    acceptance: float
-    n_distinct: int
-    mixing: float
-
-
 @own_arithmetic
-def diversify(
-    theta: FloatArray, problem: Samplable, *, rng: np.random.Generator, n_steps: int = 1000
-) -> tuple[FloatArray, DiversifyTally]:
+def diversify(theta: FloatArray, problem: Samplable, *, rng: np.random.Generator, n_steps: int = 1000) -> FloatArray:
     """Run a Metropolis-Hastings chain from every sample, all chains in parallel.
 
     Every step proposes one of three symmetric moves to each sample: a Gaussian with the samples' covariance, a
@@ -45,7 +26,7 @@ def diversify(
     chains' states, so the posterior is left invariant.
 
     `theta` are posterior samples, possibly repeated, (n_samples, n_params); `problem` has a prior with `log_prob`.
-    Return the samples after `n_steps` each (the paper takes about 1000), and statistics of the steps.
+    Return the samples after `n_steps` each; the paper takes about 1000.
 
     Raises
     ------
@@ -62,9 +43,9 @@ def diversify(
     if start.ndim != 2 or start.shape[1] != len(evaluate.names) or len(start) == 0:
         raise ShapeError(f"theta has shape {start.shape}; allowed: (n_samples, {len(evaluate.names)})")
     n_steps = checked_whole("n_steps", n_steps, least=0)
-    n_samples, n_params = start.shape
+    n_params = start.shape[1]
     if n_params == 0 or n_steps == 0:
-        return start, DiversifyTally(0, 0, 0.0, len(np.unique(start, axis=0)), 0.0)
+        return start
     prior = problem.prior
     height = prior.log_prob(start) + evaluate.log_likelihood(start)
     if not np.isfinite(height).all():
@@ -72,7 +53,6 @@ def diversify(
         raise ParameterError(f"theta[{at}]", start[at].tolist(), "a sample with posterior density above zero")
     prior_sd = prior.from_unit_cube(rng.random((_N_PRIOR_DRAWS, n_params))).std(axis=0)
     now = start.copy()
-    n_accepted = 0
     for displacement, threshold in _displacements_and_log_thresholds(start, prior_sd, n_steps, rng):
         proposed = now + displacement
         proposed_height = prior.log_prob(proposed)
@@ -83,12 +63,7 @@ def diversify(
         proposed_height[inside] += evaluate.log_likelihood(proposed[inside])
         accept = threshold < proposed_height - height
         now[accept], height[accept] = proposed[accept], proposed_height[accept]
-        n_accepted += int(accept.sum())
-    spread = now.var(axis=0) + start.var(axis=0) + (now.mean(axis=0) - start.mean(axis=0)) ** 2
-    moved = ((now - start) ** 2).mean(axis=0)
-    mixing = float(np.mean(np.divide(moved, spread, out=np.zeros(n_params), where=spread > 0)))
-    n_distinct = len(np.unique(now, axis=0))
-    return now, DiversifyTally(n_steps, evaluate.n_calls, n_accepted / (n_steps * n_samples), n_distinct, mixing)
+    return now
 
 
 def _displacements_and_log_thresholds(

@@ -35,23 +35,14 @@ _FEWEST_STEPS = 30.0  # between floating-point numbers, from quartile to quartil
 class Evidence:
     """log Z, the information (nats) and normalised log weights, (n_dead,).
 
-    `spread`: sd of log Z from the random shrinkage alone; `log_start_error`: standard error of the log of the share of
-    the prior with a likelihood above zero.
+    `spread`: sd of log Z from the random shrinkage alone; correlated chains multiply its variance, see
+    `relative_lineage_variance`.
     """
 
     log_z: float
     spread: float
-    log_start_error: float
     information: float
     log_weight: FloatArray
-
-    def log_z_error(self, memory: float) -> float:
-        """Return the standard error of log Z.
-
-        `memory`: factor by which correlated chains multiply the variance from shrinkage; see
-        `relative_lineage_variance`.
-        """
-        return math.hypot(math.sqrt(memory) * self.spread, self.log_start_error)
 
 
 def log_volumes(n_at_death: IntArray, log_start: float = 0.0) -> FloatArray:
@@ -65,14 +56,12 @@ def integrate(
     *,
     rng: np.random.Generator,
     log_start: float = 0.0,
-    log_start_error: float = 0.0,
 ) -> Evidence:
     """Estimate the evidence: sum the likelihood over the shells of prior volume between successive deaths.
 
     `log_likelihood` of the dead points in order of death, the last live points included; `n_at_death`: number of points
     alive when each died, itself included, (n_dead,) both. `rng` draws 200 times the shrinkages t = Beta(n, 1), for the
-    `spread` of log Z. `log_start`, `log_start_error`: log of the prior's share with a likelihood above zero, and its
-    standard error.
+    `spread` of log Z. `log_start`: log of the prior's share with a likelihood above zero.
     """
     log_x = log_volumes(n_at_death, log_start)
     log_shell = _log_shell_volumes(np.concatenate([[log_start], log_x]))
@@ -94,7 +83,7 @@ def integrate(
         edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
         simulated[first : first + n] = logsumexp(_log_shell_volumes(edges) + log_likelihood, axis=1)
     spread = float(np.std(simulated, ddof=1))
-    return Evidence(best + log_z, spread, log_start_error, information, log_weight)
+    return Evidence(best + log_z, spread, information, log_weight)
 
 
 def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
@@ -121,6 +110,25 @@ def birth_rows(
     n_dead = np.empty(2 * n, dtype=np.int64)
     n_dead[order] = np.cumsum(born[order] == 0)
     return n_dead[n:] - 1
+
+
+def insertion_ranks(ident: IntArray, n_live: int, n_replaced: int) -> tuple[IntArray, IntArray]:
+    """Return how many of the points alive at the insertion of each new point were worse than it, and their number.
+
+    Both are (n_inserted,), in order of birth. `ident`, (n_dead,), is each point's number in order of birth, rows in
+    order of death; every round replaced the `n_replaced` worst of `n_live` points.
+    """
+    born_in, rows = np.maximum(ident - n_live, -n_replaced) // n_replaced + 1, np.argsort(ident)
+    rank, n_alive = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    for number in range(1, int(born_in.max()) + 1):
+        n_gone = number * n_replaced
+        new, old = (
+            rows[n_live + n_gone - n_replaced : n_live + n_gone],
+            n_gone + np.flatnonzero(born_in[n_gone:] < number),
+        )
+        rank.append(np.searchsorted(old, new) + np.tril(new < new[:, None], -1).sum(axis=1))
+        n_alive.append(len(old) + np.arange(n_replaced))
+    return np.concatenate(rank), np.concatenate(n_alive)
 
 
 def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.random.Generator) -> float:

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray, read_only_floats
+from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters, find_disconnected_clusters
 from probewise.nested.problem import Evaluator, Space
 from probewise.nested.result import NestedResult, Samples
 from probewise.nested.weights import n_effective, student_t_draws, student_t_log_norm
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
-_MOST_K = 0.7
+MOST_K = 0.7
 _FEW_EFFECTIVE = 100.0
-_MOST_LOST = 0.2
+MOST_LOST = 0.2  # of a posterior, from which on the error is not to be trusted
 _BRIDGE_STEPS = 20
 # Heavier tails than a Gaussian's keep the weights bounded where the fit is too narrow.
 _DEGREES_OF_FREEDOM = 8.0
@@ -40,49 +40,17 @@ class Weighted(Samples):
 
     `theta` are the draws with nonzero likelihood, (n, n_params). `pareto_k` is the shape of the weights' tail; above
     0.7 the error is unreliable. `run` is the fallback run, made where the weights were, else None; `n_calls` includes
-    its own. `missed` is the share of the posterior that the draws undersample, estimated from held-out samples: `log_z`
-    includes it, the samples do not. `lost` is the share that the run may have lost undetected, see `refine`; the error
-    includes it. `inherited`: doubts about the refined run, and about a disagreement with it, in words.
+    its own. `warnings` are reasons not to trust the error, in words; empty if there are none.
     """
 
-    names: tuple[str, ...]
-    theta: FloatArray
-    log_likelihood: FloatArray
-    log_weight: FloatArray
-    log_z: float
-    log_z_error: float
-    n_eff: float
-    n_calls: int
     pareto_k: float
     run: NestedResult | None = None
-    missed: float = 0.0
-    lost: float = 0.0
-    inherited: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("theta", "log_likelihood", "log_weight"):
-            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+    warnings: tuple[str, ...] = ()
 
     @property
     def sound(self) -> bool:
-        """Whether there are no `doubts` about the error."""
-        return not self.doubts
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Reasons not to trust the error, in words, or the warnings of the fallback run; empty if there are none."""
-        if self.run is not None:
-            return self.run.warnings
-        reasons = (
-            (not self.pareto_k < _MOST_K, f"Pareto k of the weights is {self.pareto_k:.2f}, not below {_MOST_K}"),
-            (not self.n_eff >= _FEW_EFFECTIVE, f"only {self.n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
-            (not self.missed < _MOST_LOST, f"the draws miss {100 * self.missed:.0f} % of the posterior"),
-            (
-                not self.lost < _MOST_LOST,
-                f"{100 * self.lost:.0f} % of the posterior may be lost: too few live points for its parts",
-            ),
-        )
-        return (*(words for so, words in reasons if so), *self.inherited)
+        """Whether there are no `warnings` about the error."""
+        return not self.warnings
 
     def summary(self) -> str:
         """Describe evidence and posterior in plain text."""
@@ -90,13 +58,23 @@ class Weighted(Samples):
             f"log Z        {self.log_z:.3f} ± {self.log_z_error:.3f}",
             f"samples      {len(self.theta)}, effective sample size {self.n_eff:.0f}",
             f"cost         {self.n_calls} likelihood evaluations",
-            f"weights      Pareto k = {self.pareto_k:.2f}, missed {self.missed:.2g}, possibly lost {self.lost:.2g}",
+            f"weights      Pareto k = {self.pareto_k:.2f}",
         ]
         lines += [
             f"{name:<9}  {mean:>11.5g} ± {sd:.3g}"
             for name, mean, sd in zip(self.names, self.mean(), self.sd(), strict=True)
         ]
-        return "\n".join([*lines, *(f"doubtful: {note}" for note in self.doubts)])
+        return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
+
+
+def _warnings_of_weights(k: float, n_eff: float, missed: float = 0.0) -> tuple[str, ...]:
+    """Return warnings of a heavy tail, of few effective samples, and of a share `missed` of the posterior."""
+    reasons = (
+        (not k < MOST_K, f"Pareto k of the weights is {k:.2f}, not below {MOST_K}"),
+        (not n_eff >= _FEW_EFFECTIVE, f"only {n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
+        (not missed < MOST_LOST, f"the draws miss {100 * missed:.0f} % of the posterior"),
+    )
+    return tuple(words for so, words in reasons if so)
 
 
 def evenly_weighted(
@@ -128,7 +106,8 @@ def weighted_draws(
     error = math.sqrt(max(1.0 / max(n_eff, 1.0) - 1.0 / n_draws, 0.0))
     there, evidence = log_ratio[np.isfinite(log_ratio)], (total - math.log(n_draws), error, n_eff)
     k = pareto_k(there) if len(there) > 1 else math.inf
-    return Weighted(names, theta, log_likelihood, log_ratio - total, *evidence, n_draws, k)
+    told = _warnings_of_weights(k, n_eff)
+    return Weighted(names, theta, log_likelihood, log_ratio - total, *evidence, n_draws, k, warnings=told)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +256,8 @@ def draw_and_weigh(
     if not alive.any():
         nothing = np.empty(0)
         n_calls = evaluate.n_calls
-        return Weighted(evaluate.names, theta[:0], nothing, nothing, -math.inf, math.inf, 0.0, n_calls, math.inf)
+        none, told = (-math.inf, math.inf, 0.0, n_calls, math.inf), _warnings_of_weights(math.inf, 0.0)
+        return Weighted(evaluate.names, theta[:0], nothing, nothing, *none, warnings=told)
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
     k = pareto_k(log_ratio)
     held_ratio, n_held = np.empty(0), 0.0
@@ -288,7 +268,8 @@ def draw_and_weigh(
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
     n_eff, n_calls = n_effective(log_weight), evaluate.n_calls
-    return Weighted(evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, n_calls, k, missed=missed)
+    told = _warnings_of_weights(k, n_eff, missed)
+    return Weighted(evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, n_calls, k, warnings=told)
 
 
 def _bridge_sampling_estimate(

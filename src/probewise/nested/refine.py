@@ -11,20 +11,22 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, own_arithmetic
-from probewise._kinds import checked_number, checked_whole, require_callable, require_rng
+from probewise._kinds import checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
-from probewise.nested.check import doubts_of_missed_parts
+from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
+    MOST_LOST,
     HeldOutSamples,
     Weighted,
     draw_and_weigh,
     fit_wide_and_narrow_proposals,
     mixture_of_proposals,
 )
+from probewise.nested.moves import SliceMove
 from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult
-from probewise.nested.sampler import run_once
+from probewise.nested.sampler import least_live, run_once
 from probewise.nested.weights import n_effective, resampled_rows
 
 _MOST_FITTED = 2000
@@ -33,6 +35,8 @@ _HELD_OUT = 1 / 3
 _MOST_HELD = 1000
 _N_UPDATED = 1000  # samples of the old posterior whose likelihood is evaluated anew
 _APART = 4.0  # errors between the log Z of draws and of the refined run, above which they disagree
+_N_PILOTS = 2
+_PRIOR_SHARE = 0.1  # of an update's draws: they cover regions without samples of the old posterior, and bound weights
 _FIRST = 0.75  # share of the better form of density in the mixture
 
 Posterior: TypeAlias = NestedResult | Weighted
@@ -45,7 +49,6 @@ def refine(
     *,
     rng: np.random.Generator,
     n_draws: int = 5000,
-    n_pilots: int = 2,
     look: bool = True,
 ) -> Weighted:
     """Reduce the error of a run's evidence and posterior by importance sampling; see `Weighted.sound` before its use.
@@ -67,12 +70,10 @@ def refine(
     result
         A run of the same problem, or an earlier refinement.
     n_draws
-        Number of final draws, 100 or more; every pilot round takes a quarter of that, at least 100, in addition.
-    n_pilots
-        Number of pilot rounds, 1 or more.
+        Number of final draws, 100 or more; each of two pilot rounds takes a quarter of that, at least 100, in addition.
     look
-        Whether to look for parts of the posterior that the run has missed, if the run has no check (it was made with
-        `max_cost=1`): for at most about a quarter of the run's evaluations. A part that matters is added to the doubts.
+        Whether to check the run, if it has no check (it was made with `max_cost=1`), for at most as many evaluations
+        again. Parts of the posterior that it has missed are among the warnings.
 
     Raises
     ------
@@ -84,14 +85,13 @@ def refine(
     """
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)
-    n_pilots = checked_whole("n_pilots", n_pilots)
     evaluate, space = _evaluator_and_space(problem, result, "result")
     if not result.names:
         raise ParameterError("result", "a run without parameters", "one with some; the evidence is exact without")
     n_lineages = effective_lineages(result)
     fitted, held = _split_off_held_out(result, n_lineages, space, rng)
     known = [fitted]
-    for _ in range(n_pilots):
+    for _ in range(_N_PILOTS):
         proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
         pilots = [
             draw_and_weigh(p, 0.0, None, space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals
@@ -105,12 +105,20 @@ def refine(
             known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
     found = draw_and_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng)
     found = with_error_of_lost_parts(found, n_lineages, space, rng)
-    doubts = _inherited_doubts(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
-        # A generator of its own: the refined evidence is the same with and without the look.
-        missed, n_calls = doubts_of_missed_parts(result, found, problem, run_once, rng=rng.spawn(1)[0])
-        found, doubts = replace(found, n_calls=found.n_calls + n_calls), (*doubts, *missed)
-    return replace(found, inherited=doubts)
+        checked = check_and_repeat(
+            result,
+            Evaluator(problem),
+            SliceMove(),
+            run_once,
+            max_cost=2.0,
+            max_calls=None,
+            least_live=least_live(len(result.names)),
+            rng=rng.spawn(1)[0],  # of its own: the refined evidence is the same with and without the look
+            repeat=False,
+        )
+        found, result = replace(found, n_calls=found.n_calls + checked.n_calls - result.n_calls), checked
+    return replace(found, warnings=(*found.warnings, *_inherited_warnings(found, result)))
 
 
 @own_arithmetic
@@ -121,7 +129,6 @@ def update(
     rng: np.random.Generator,
     fall_back: Callable[[], NestedResult],
     n_draws: int = 2000,
-    prior_share: float = 0.1,
 ) -> Weighted:
     """Update a posterior with new readings by importance sampling.
 
@@ -141,9 +148,6 @@ def update(
         returned, and its result as `run`.
     n_draws
         Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
-    prior_share
-        Share of the draws that come from the prior, 0 to below 1: they cover regions without samples of the old
-        posterior, and bound the weights.
 
     Raises
     ------
@@ -158,8 +162,6 @@ def update(
         "fall_back", fall_back, "a function that solves the problem, such as lambda: run(problem, rng=rng)"
     )
     n_draws = checked_whole("n_draws", n_draws)
-    if not 0 <= checked_number("prior_share", prior_share) < 1:
-        raise ParameterError("prior_share", prior_share, "0 or more, below 1")
     evaluate, space = _evaluator_and_space(problem, previous, "previous")
     rows = np.unique(previous.draw_rows(_N_UPDATED, rng=rng))
     theta = previous.theta[rows]
@@ -171,7 +173,7 @@ def update(
     if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
         fitted = _resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng)
         proposal = fit_wide_and_narrow_proposals(fitted, rng=rng)[-1]
-        found = draw_and_weigh(proposal, prior_share, None, space, evaluate, n_draws=n_draws, rng=rng)
+        found = draw_and_weigh(proposal, _PRIOR_SHARE, None, space, evaluate, n_draws=n_draws, rng=rng)
         found = with_error_of_lost_parts(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
@@ -179,7 +181,8 @@ def update(
     fallen = fall_back()
     samples = fallen.names, fallen.theta, fallen.log_likelihood, fallen.log_weight
     evidence = fallen.log_z, fallen.log_z_error, fallen.n_eff
-    return Weighted(*samples, *evidence, evaluate.n_calls + fallen.n_calls, k, run=fallen)
+    n_calls = evaluate.n_calls + fallen.n_calls
+    return Weighted(*samples, *evidence, n_calls, k, run=fallen, warnings=fallen.warnings)
 
 
 def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tuple[Evaluator, Space]:
@@ -190,13 +193,13 @@ def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tup
     return evaluate, unbounded_space_of(problem.prior)
 
 
-def _inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
-    """Return the doubts about `result`, which `found` refines, in words.
+def _inherited_warnings(found: Weighted, result: Posterior) -> tuple[str, ...]:
+    """Return the warnings of `result`, which `found` refines.
 
     For a run also where its log Z, or that of its check, is more than four errors from that of `found`.
     """
     if isinstance(result, Weighted):
-        return result.doubts
+        return result.warnings
     routes = [("the run", result.log_z, result.log_z_error)]
     if result.check is not None:
         routes.append((result.check.route, result.check.log_z, result.check.log_z_error))
@@ -246,14 +249,13 @@ def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, 
 
 
 def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
-    """Set `lost`, the share of the posterior that a run of `n_lineages` effective samples may have lost.
-
-    It is added to `log_z_error` in quadrature.
-    """
+    """Add to the error, in quadrature, the share of the posterior that a run of `n_lineages` samples may have lost."""
     if not found.n_eff > 1:
         return found
     n = int(min(found.n_eff, 1000))
     parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.draw_rows(n, rng=rng))]))
     share = parts.size / parts.size.sum()
     lost = float(share @ np.exp(-n_lineages * share))
-    return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
+    doubt = f"{100 * lost:.0f} % of the posterior may be lost: too few live points for its parts"
+    warnings = found.warnings if lost < MOST_LOST else (*found.warnings, doubt)
+    return replace(found, warnings=warnings, log_z_error=math.hypot(found.log_z_error, lost))

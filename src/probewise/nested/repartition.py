@@ -1,10 +1,10 @@
 """Posterior repartitioning: run again from a prior near the posterior, with the same evidence.
 
 Evidence and posterior depend only on the product of prior and likelihood, so any density may replace the prior if the
-likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835; Petrosyan & Handley 2023,
-Phys. Sci. Forum 5, 51). From a density near the posterior there are few nats of compression, which lowers the cost and
-the error of a run. Live points climb to regions that the density undersamples, where importance sampling would depend
-on a few weights. A distant part of the posterior without any sample stays unseen.
+likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835). From a density near the
+posterior there are few nats of compression, which lowers the cost and the error of a run. Live points climb to regions
+that the density undersamples, where importance sampling would depend on a few weights. A distant part of the posterior
+without any sample stays unseen.
 """
 
 from __future__ import annotations
@@ -72,10 +72,6 @@ class _PriorNearPosterior:
     def inverse_root(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.root))
 
-    @cached_property
-    def log_det_of_roots(self) -> FloatArray:
-        return np.asarray(np.linalg.slogdet(self.root)[1])
-
     @property
     def has_invertible_axes(self) -> bool:
         """Whether the matrices of the axes have finite inverses: they have none where samples hardly vary."""
@@ -92,7 +88,7 @@ class _PriorNearPosterior:
 
     def log_prior_ratio(self, theta: FloatArray) -> FloatArray:
         x = self.space.enter(theta)
-        return np.asarray(self.space.leave(x)[1] - np.logaddexp.reduce(self._log_densities(x), axis=0))
+        return np.asarray(self.space.leave(x)[1] - self._log_density(x))
 
     def enter(self, theta: FloatArray) -> FloatArray:
         return self._to_axes(self.space.enter(theta), 0)
@@ -100,19 +96,21 @@ class _PriorNearPosterior:
     def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
         x = self.center[0] + e @ self.root[0].T
         theta, log_plain = self.space.leave(x)
-        log_density = np.logaddexp.reduce(self._log_densities(x), axis=0) + self.log_det_of_roots[0]
-        return theta, np.where(np.isfinite(log_plain), log_density, -np.inf)
+        return theta, np.where(np.isfinite(log_plain), self._log_density(x) + self._log_dets[0], -np.inf)
 
     def _to_axes(self, x: FloatArray, part: int) -> FloatArray:
         # A matrix product would depend, in the last bit, on the batch, which an executor divides.
         return np.asarray(np.einsum("nj,ij->ni", x - self.center[part], self.inverse_root[part]))
 
-    def _log_densities(self, x: FloatArray) -> FloatArray:
-        """Return each part's log density times its share, (n, n_params) -> (n_parts, n)."""
+    def _log_density(self, x: FloatArray) -> FloatArray:
         nu = _DEGREES_OF_FREEDOM
         e = np.stack([self._to_axes(x, part) for part in range(len(self.share))])
         along = (student_t_log_norm(1, nu) - 0.5 * (nu + 1) * np.log1p(e**2 / nu)).sum(axis=2)
-        return np.asarray(along + (np.log(self.share) - self.log_det_of_roots)[:, None])
+        return np.asarray(np.logaddexp.reduce(along + (np.log(self.share) - self._log_dets)[:, None], axis=0))
+
+    @cached_property
+    def _log_dets(self) -> FloatArray:
+        return np.asarray(np.linalg.slogdet(self.root)[1])
 
 
 def repartitioned(problem: Samplable, theta: FloatArray, *, peaks: Sequence[FloatArray] = ()) -> Repartitioned:
@@ -120,22 +118,9 @@ def repartitioned(problem: Samplable, theta: FloatArray, *, peaks: Sequence[Floa
 
     Its log Z is that of the original problem; its `log_likelihood` is not, so that `refine` takes its runs with this
     problem. Along each principal axis the prior is a Student t with five degrees of freedom, 1.4 times as wide as the
-    samples.
-
-    Parameters
-    ----------
-    problem
-        Prior and likelihood.
-    theta
-        Posterior samples, (n_samples, n_params), such as a run's, which determine the new prior.
-    peaks
-        Further groups of points, (n, n_params) each, such as peaks without samples: the new prior is a mixture with a
-        part for each group, by its number of points, and one for the samples.
-
-    Raises
-    ------
-    ParameterError
-        If there are too few distinct samples to determine the axes.
+    samples `theta`, (n_samples, n_params), of the posterior. With `peaks`, further groups of points, it is a mixture
+    with a part for each group, by its number of points. ParameterError if there are too few distinct samples to
+    determine the axes.
     """
     n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * len(problem.prior.names)
     if n_different < max(least, 1):

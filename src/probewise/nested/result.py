@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
 import io
@@ -29,14 +28,13 @@ from probewise.nested.evidence import birth_rows, log_volumes
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
 _FORMAT = "nested-result/4"
-_FLOATS = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
-_COUNTS = ("parent", "n_at_death")
-_PER_INSERTION = ("insertion_rank", "insertion_n_ranked")
-_ARRAYS = ("theta", *_FLOATS, *_COUNTS, *_PER_INSERTION)
+_FLOATS = ("theta", "log_likelihood", "label", "log_weight", "log_birth", "birth_label")
+_COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
 
 
+@dataclass(frozen=True, eq=False)
 class Samples(ShowsItself):
-    """Weighted samples of a posterior: base of results with `names`, `theta` and weights that sum to one.
+    """Weighted samples of a posterior, with weights that sum to one, and the evidence: base of all results.
 
     `theta` (n, n_params) are the parameters of each sample; `log_likelihood` and `log_weight`, (n,), its own; `log_z`
     and `log_z_error` the natural log of the evidence and its standard error; `n_eff` is the effective sample size, of a
@@ -51,6 +49,10 @@ class Samples(ShowsItself):
     log_z_error: float
     n_eff: float
     n_calls: int
+
+    def __post_init__(self) -> None:
+        for name in ("theta", "log_likelihood", "log_weight"):
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
 
     @property
     @own_arithmetic
@@ -153,7 +155,7 @@ class Check:
     n_calls: int
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class NestedResult(Samples):
     """The evidence, the weighted samples and the record of a run of nested sampling; see also `Samples`.
 
@@ -189,23 +191,15 @@ class NestedResult(Samples):
         Agreement of the runs that were merged into this result, and a second estimate of the evidence, or None.
     """
 
-    names: tuple[str, ...]
-    theta: FloatArray
-    log_likelihood: FloatArray
     label: FloatArray
-    log_weight: FloatArray
     log_birth: FloatArray
     birth_label: FloatArray
     parent: IntArray
     n_at_death: IntArray
     log_start: float
     log_start_error: float
-    log_z: float
-    log_z_error: float
     memory: float
     information: float
-    n_eff: float
-    n_calls: int
     n_live: int
     stop_reason: str
     complete: bool
@@ -219,18 +213,10 @@ class NestedResult(Samples):
     check: Check | None = None
 
     def __post_init__(self) -> None:
-        for name in ("theta", *_FLOATS):
+        for name in _FLOATS:
             object.__setattr__(self, name, read_only_floats(getattr(self, name)))
-        for name in (*_COUNTS, *_PER_INSERTION):
+        for name in _COUNTS:
             object.__setattr__(self, name, frozen_int(getattr(self, name)))
-        if self.theta.ndim != 2 or self.theta.shape[1] != len(self.names):
-            allowed = f"(n_dead, {len(self.names)}) for {self.names}"
-            raise ShapeError(f"theta has shape {self.theta.shape}; allowed: {allowed}")
-        for name in _ARRAYS[1:]:
-            per_insertion, shape = name in _PER_INSERTION, getattr(self, name).shape
-            n, one = (self.insertion_rank.size, "inserted point") if per_insertion else (self.n_dead, "row of theta")
-            if shape != (n,):
-                raise ShapeError(f"{name} has shape {shape}; allowed: ({n},), one per {one}")
 
     @property
     def n_dead(self) -> int:
@@ -242,19 +228,9 @@ class NestedResult(Samples):
         """Expected natural log of the prior share (volume X) with a likelihood above each sample's, (n_dead,)."""
         return log_volumes(self.n_at_death, self.log_start)
 
-    @property
-    def calls_per_live_point_and_nat(self) -> float:
-        """Likelihood evaluations per live point and nat of information; infinite without information.
-
-        With the default `n_replaced`, 0.72 n_live deaths compress the volume by one nat (n_live if points are replaced
-        one at a time), and each dead point is replaced. The excess is the cost of drawing above a bound, of the first
-        live points, and of the check.
-        """
-        return self.n_calls / (self.n_live * self.information) if self.information > 0 else math.inf
-
     def summary(self) -> str:
         """Describe the run and its posterior in plain text."""
-        each = self.calls_per_live_point_and_nat
+        each = self.n_calls / (self.n_live * self.information) if self.information > 0 else math.inf
         lines = [
             f"log Z        {self.log_z:.2f} ± {self.log_z_error:.2f}",
             f"information  {self.information:.2f} nats",
@@ -345,10 +321,10 @@ class NestedResult(Samples):
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically; FileError if it cannot be written."""
         path = checked_path("path", path)
-        head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
+        arrays = {name: np.asarray(getattr(self, name)) for name in (*_FLOATS, *_COUNTS)}
+        head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         head["check"] = None if self.check is None else asdict(self.check)
-        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
         write_bytes_atomically(path, archive_bytes({"format": _FORMAT, **head}, arrays, compressed=True))
 
     @classmethod
@@ -371,29 +347,25 @@ class NestedResult(Samples):
 
 
 def archive_bytes(head: Mapping[str, object], arrays: Mapping[str, NDArray[Any]], *, compressed: bool = False) -> bytes:
-    """Return the bytes of an .npz of arrays and of a JSON object, `head`, with a digest of all."""
-    content = {**arrays, "head": np.array(json.dumps(head, default=as_json))}
+    """Return the bytes of an .npz of arrays and of a JSON object, `head`; its zip format holds a checksum of each."""
     buffer = io.BytesIO()
     write = np.savez_compressed if compressed else np.savez
-    write(buffer, allow_pickle=False, sha256=np.array(_digest(content)), **content)
+    write(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=as_json)), **arrays)
     return buffer.getvalue()
 
 
 def read_archive(path: Path, form: str, wanted: str, *, cure: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read the JSON object, without its "format", and the arrays of a file of `archive_bytes`.
 
-    `wanted` is, for messages, what it should be. FileError if it is missing or no such file, its format is not `form`
-    (`cure`: the way out), or it holds anything but what was written.
+    `wanted` is, for messages, what it should be. FileError if it is missing or no such file, or its format is not
+    `form` (`cure`: the way out).
     """
     try:
         # Opened here, since np.load leaves a damaged file open.
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
-        written, head = content.pop("sha256", None), json.loads(str(content["head"]))
+            content = {name: file[name] for name in file.files if name != "sha256"}  # which earlier files have
+        head = json.loads(str(content.pop("head")))
         found = head.pop("format", None) if isinstance(head, dict) else None
-        if found == form and written is not None and str(written) != _digest(content):  # earlier files have none
-            raise ValueError("it holds something else than was written")
-        del content["head"]
     except FileNotFoundError as error:
         raise FileError(path, "there is no such file", wanted) from error
     except Exception as error:  # a damaged archive can raise whatever its parts do
@@ -403,14 +375,6 @@ def read_archive(path: Path, form: str, wanted: str, *, cure: str) -> tuple[dict
     if found != form:
         raise FileError(path, f"format {shown(found)}", f"{form!r}; {cure}")
     return head, content
-
-
-def _digest(content: Mapping[str, NDArray[Any]]) -> str:
-    parts = hashlib.sha256()
-    for name in sorted(content):
-        array = np.ascontiguousarray(content[name])
-        parts.update(f"{name} {array.dtype.str} {array.shape};".encode() + array.tobytes())
-    return parts.hexdigest()
 
 
 def as_json(value: object) -> object:

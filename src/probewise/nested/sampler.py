@@ -39,6 +39,7 @@ from probewise.nested.evidence import (
     DOUBTFUL_P_VALUE,
     birth_rows,
     insertion_p_value,
+    insertion_ranks,
     integrate,
     n_independent,
     relative_lineage_variance,
@@ -49,7 +50,7 @@ from probewise.nested.evidence import (
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import AnyPrior, Bound, Evaluator, OutOfCallsError, Points, Samplable, as_problem
 from probewise.nested.result import NestedResult, as_json, software_versions
-from probewise.nested.save import CheckpointFile, DeadPoints, LivePoints, RunState, settings_of_run
+from probewise.nested.save import CheckpointFile, LivePoints, RunState, settings_of_run
 from probewise.nested.weights import n_effective
 
 LIVE_PER_PARAM = 2
@@ -243,15 +244,13 @@ def run(
         try:
             result = check_and_repeat(
                 result,
-                posed,
+                Evaluator(posed, executor=executor, n_parts=n_workers),
                 moving,
                 partial(once, return_interrupted=False),
                 max_cost=max_cost,
                 max_calls=max_calls,
                 least_live=least_live(len(result.names)),
                 rng=checking,
-                executor=executor,
-                n_workers=n_workers,
             )
         except KeyboardInterrupt:
             if not return_interrupted:
@@ -270,31 +269,23 @@ def least_live(n_params: int) -> int:
 
 def replace_worst_live_points(
     live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
-) -> tuple[LivePoints, DeadPoints, Tally]:
+) -> tuple[LivePoints, LivePoints, Tally]:
     """Replace the `n_replaced` worst live points by new ones above the best of the replaced.
 
-    Return the new live points, the dead ones, and the statistics of the move.
+    Return the new live points, the dead ones, worst first, and the statistics of the move.
 
     The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is counted
     exactly; the new points are drawn together.
     """
-    n_live = len(live)
     order = live.rows_by_rising_likelihood()
     doomed, survivors = live.take_rows(order[:n_replaced]), live.take_rows(order[n_replaced:])
     bound = Bound(float(doomed.log_likelihood[-1]), float(doomed.label[-1]))
-    begin = rng.permutation(len(survivors))[:n_replaced]
-    start = survivors.take_rows(begin)
+    start = survivors.take_rows(rng.permutation(len(survivors))[:n_replaced])
     new, tally = move.draw(start.without_births(), bound, survivors.u, evaluate, rng)
     ident = live.ident.max() + 1 + np.arange(n_replaced)
     level = {"log_birth": np.full(n_replaced, bound.log_likelihood), "birth_label": np.full(n_replaced, bound.label)}
-    after = LivePoints.join(survivors, LivePoints(**vars(new), **level, ident=ident, parent=start.ident))
-    place = np.empty(n_live, dtype=np.int64)
-    place[after.rows_by_rising_likelihood()] = np.arange(n_live)
-    n_ranked = len(survivors) + np.arange(n_replaced)
-    worse = place[None, :] < place[len(survivors) :, None]
-    rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
-    n_at_death = n_live - np.arange(n_replaced)
-    return after, DeadPoints(**vars(doomed), n_at_death=n_at_death, rank=rank, n_ranked=n_ranked), tally
+    born = LivePoints(**vars(new), **level, ident=ident, parent=start.ident)
+    return LivePoints.join(survivors, born), doomed, tally
 
 
 def run_once(
@@ -363,7 +354,7 @@ def run_once(
         # the generator's seed sequence, which its state does not include.
         rng.bit_generator.state = now.rng_state
         summing = np.random.default_rng(rng.integers(2**63, size=4))
-        return _final_result(evaluate, now, n_live, reason, seed_state, summing, notes)
+        return _final_result(evaluate, now, n_live, n_replaced, reason, seed_state, summing, notes)
 
     try:
         while now.ended is None:
@@ -430,7 +421,7 @@ def _do_round(
     chains = volume <= _PRIOR_VOLUME  # else new points are drawn from the whole prior
     move = now.moving if chains else PriorRejection(volume)
     live, gone, tally = replace_worst_live_points(now.live, move, evaluate, n_replaced=n_replaced, rng=rng)
-    edges = now.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
+    edges = now.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / (len(live) - np.arange(n_replaced)))])
     log_volume = float(edges[-1])
     # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(live.log_likelihood.max())
@@ -520,6 +511,7 @@ def _final_result(
     evaluate: Evaluator,
     now: RunState,
     n_live: int,
+    n_replaced: int,
     reason: str,
     seed_state: str,
     rng: np.random.Generator,
@@ -529,12 +521,9 @@ def _final_result(
     n_dead = sum(map(len, now.dead))
     last = now.live.take_rows(now.live.rows_by_rising_likelihood())
     points = LivePoints.join(*now.dead, last)
-    of_dead = {name: [getattr(each, name) for each in now.dead] for name in ("n_at_death", "rank", "n_ranked")}
-    n_at_death = np.concatenate([*of_dead["n_at_death"], np.arange(len(last), 0, -1)])
-    rank, n_ranked = (np.concatenate([np.empty(0, dtype=np.int64), *of_dead[name]]) for name in ("rank", "n_ranked"))
-    evidence = integrate(
-        points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
-    )
+    n_at_death = np.concatenate([len(last) - np.arange(n_dead) % n_replaced, np.arange(len(last), 0, -1)])
+    rank, n_ranked = insertion_ranks(points.ident, len(last), n_replaced)
+    evidence = integrate(points.log_likelihood, n_at_death, rng=rng, log_start=now.log_start)
     parent = np.where(points.parent >= 0, np.argsort(points.ident)[points.parent], -1)
     born = birth_rows(points.log_likelihood, points.label, points.log_birth, points.birth_label)
     weight = np.exp(evidence.log_weight)
@@ -568,7 +557,7 @@ def _final_result(
         log_start=now.log_start,
         log_start_error=now.log_start_error,
         log_z=evidence.log_z,
-        log_z_error=evidence.log_z_error(remembered),
+        log_z_error=math.hypot(math.sqrt(remembered) * evidence.spread, now.log_start_error),
         memory=remembered,
         information=evidence.information,
         n_eff=n_independent(points.theta, weight, parent),
@@ -596,4 +585,4 @@ def _result_of_problem_without_parameters(
     live = LivePoints.drawn_from_prior(Points(only, only, np.zeros(1), log_likelihood, np.zeros(1)))
     reason = "no free parameters: the likelihood is the evidence"
     now = RunState(live, (), move, 0.0, 0.0, 0.0, ended=reason)
-    return _final_result(evaluate, now, n_live, reason, seed_state, np.random.default_rng(0))
+    return _final_result(evaluate, now, n_live, 1, reason, seed_state, np.random.default_rng(0))

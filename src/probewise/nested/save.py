@@ -53,31 +53,18 @@ class LivePoints(Points):
 
 
 @dataclass(frozen=True, eq=False)
-class DeadPoints(LivePoints):
-    """Points that a round removed, worst first, and the insertion ranks of the points that replaced them, (n,) each.
-
-    `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the `n_ranked` points
-    alive at the insertion of each new point were worse than it.
-    """
-
-    n_at_death: IntArray
-    rank: IntArray
-    n_ranked: IntArray
-
-
-@dataclass(frozen=True, eq=False)
 class RunState:
     """The state of the sampler after a round: everything that the rest of the run depends on.
 
-    `moving`: the move as tuned so far. `log_start`, `log_start_error`: log of the share of the prior with nonzero
-    likelihood, and its error; `log_volume`: log of the share that the live points fill. `best`: greatest log likelihood
-    of the live points; `log_z_over_best`: log evidence of the dead points, minus `best`. `n_stuck`: chains that never
-    left their start, so far; `last_cost`: evaluations of the last round; `ended`: the stop reason, None while the run
-    goes on.
+    `dead`: the points that died, worst first, in parts; `moving`: the move as tuned so far. `log_start`,
+    `log_start_error`: log of the share of the prior with nonzero likelihood, and its error; `log_volume`: log of the
+    share that the live points fill. `best`: greatest log likelihood of the live points; `log_z_over_best`: log evidence
+    of the dead points, minus `best`. `n_stuck`: chains that never left their start, so far; `last_cost`: evaluations of
+    the last round; `ended`: the stop reason, None while the run goes on.
     """
 
     live: LivePoints
-    dead: tuple[DeadPoints, ...]
+    dead: tuple[LivePoints, ...]
     moving: Move
     log_start: float
     log_start_error: float
@@ -148,7 +135,7 @@ class CheckpointFile:
         begun = time.monotonic()
         head = {name: value for name, value in vars(now).items() if name not in ("live", "dead", "moving")}
         head |= {"format": _FORMAT, "settings": self.settings, "moving": _numeric_fields_of_move(now.moving)}
-        parts = {"live": now.live, **({"dead": DeadPoints.join(*now.dead)} if now.dead else {})}
+        parts = {"live": now.live, **({"dead": LivePoints.join(*now.dead)} if now.dead else {})}
         arrays = {f"{which}_{name}": array for which, part in parts.items() for name, array in vars(part).items()}
         try:
             write_bytes_atomically(self.path, archive_bytes(head, arrays))
@@ -174,11 +161,12 @@ class CheckpointFile:
         assert is_dataclass(move)  # as settings_of_run requires
         moving = replace(move, **head.pop("moving"))
 
-        def points(kind: type[LivePoints], which: str) -> Any:
-            return kind(*(arrays[f"{which}_{f.name}"] for f in fields(kind)))
-
-        dead = (points(DeadPoints, "dead"),) if "dead_u" in arrays else ()
-        now = RunState(points(LivePoints, "live"), dead, moving, **head)
+        live, *dead = (
+            LivePoints(*(arrays[f"{which}_{f.name}"] for f in fields(LivePoints)))
+            for which in ("live", "dead")
+            if f"{which}_u" in arrays
+        )
+        now = RunState(live, tuple(dead), moving, **head)
         self._require_same_problem(now, evaluate)
         evaluate.n_calls = now.n_calls
         rng.bit_generator.state = now.rng_state

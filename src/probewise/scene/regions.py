@@ -58,32 +58,25 @@ class RegionBatch(Region, Protocol):
 
 
 def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> None:
-    """Broadcast the named arrays of a region to (n_regions, *shape), in place; check that they are finite; freeze them.
+    """Broadcast the named arrays of a region to (n_regions, *shape), -1 for any length, in place; freeze them.
 
-    In a shape, -1 is any length. Raises ShapeError for a shape that does not fit, ParameterError for NaN or infinity.
+    ShapeError for a shape that does not fit, ParameterError for NaN or infinity.
     """
-    arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
-    lengths = set()
+    arrays: dict[str, FloatArray] = {}
     for name, shape in shapes.items():
-        array = arrays[name] = arrays[name][None] if arrays[name].ndim == len(shape) else arrays[name]
-        if array.ndim != len(shape) + 1 or any(
-            want not in (-1, got) for want, got in zip(shape, array.shape[1:], strict=True)
-        ):
+        array = np.asarray(getattr(region, name), dtype=np.float64)
+        array = arrays[name] = array[None] if array.ndim == len(shape) else array
+        fits = array.ndim == len(shape) + 1 and all(
+            want in (-1, got) for want, got in zip(shape, array.shape[1:], strict=True)
+        )
+        if not fits:
             raise ShapeError(f"{name} has shape {array.shape}; allowed: (n_regions, {', '.join(map(str, shape))})")
-        lengths.add(len(array))
-    n_regions = max(lengths, default=1)
+        require_finite(name, array)
+    n_regions = max(map(len, arrays.values()))
     for name, array in arrays.items():
         if len(array) not in (1, n_regions):
             raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other arrays, or 1")
-        require_finite(name, array)
         object.__setattr__(region, name, read_only_floats(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
-
-
-def require_positive(name: str, values: FloatArray) -> None:
-    """Raise ParameterError unless all values are greater than 0."""
-    bad = values <= 0
-    if bad.any():
-        raise ParameterError(name, float(values[bad][0]), "greater than 0")
 
 
 @singledispatch
@@ -368,8 +361,6 @@ class QuadrantRegion(RegionBatch):
 
     def __post_init__(self) -> None:
         broadcast_and_freeze_fields(self, corner_mm=(2,), direction=(2,))
-        if not np.isin(self.direction, (-1.0, 1.0)).all():
-            raise ParameterError("direction", self.direction.tolist(), "+1 or -1")
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         beyond = (points_mm[None] - self.corner_mm[:, None]) * self.direction[:, None] > 0
@@ -409,7 +400,6 @@ class EllipseRegion(RegionBatch):
 
     def __post_init__(self) -> None:
         broadcast_and_freeze_fields(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
-        require_positive("semi_axes_mm", self.semi_axes_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
@@ -481,9 +471,6 @@ class StripesRegion(RegionBatch):
 
     def __post_init__(self) -> None:
         broadcast_and_freeze_fields(self, normal_rad=(), period_mm=(), duty=(), phase_mm=())
-        require_positive("period_mm", self.period_mm)
-        if ((self.duty < 0) | (self.duty > 1)).any():
-            raise ParameterError("duty", self.duty.tolist(), "0 to 1")
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         share = self.position_along_normal_mm(*points_mm.T) / self.period_mm[:, None]
@@ -553,8 +540,6 @@ class ImageRegion:
         if values.ndim != 2 or values.size == 0:
             raise ShapeError(f"image has shape {values.shape}; allowed: (n_rows, n_columns), not empty")
         require_finite("image", values)
-        if not (0 < self.pixel_mm < math.inf):
-            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
         object.__setattr__(self, "values", values)
 
     @property
@@ -623,14 +608,7 @@ class RegionsOfMixedKinds(RegionBatch):
     parts: tuple[Region, ...]
 
     def __post_init__(self) -> None:
-        which = frozen_int(self.which)
-        object.__setattr__(self, "which", which)
-        for k, part in enumerate(self.parts):
-            wanted = int(np.sum(which == k))
-            if wanted and part.n_regions != wanted:
-                raise ShapeError(f"part {k} holds {part.n_regions} regions; allowed: {wanted}, one per {k} in which")
-        if which.ndim != 1 or (which.size and (which.min() < 0 or which.max() >= len(self.parts))):
-            raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one per hypothesis")
+        object.__setattr__(self, "which", frozen_int(self.which))
 
     def rows_and_regions(self) -> list[tuple[IntArray, Region]]:
         """List, for each part that occurs, the row numbers of its hypotheses in `which`, and their region."""

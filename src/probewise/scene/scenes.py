@@ -13,7 +13,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_number, require_kind
 from probewise.errors import ParameterError
-from probewise.priors import Empty, Prior
+from probewise.priors import Prior, Product
 from probewise.recordings.columns import require_patterns
 from probewise.recordings.patterns import Pattern
 from probewise.scene.regions import PolygonRegion, Region, edge_distance, outlines, region_of
@@ -49,7 +49,7 @@ class KnownScene:
 
     @property
     def prior(self) -> Prior:
-        return Empty()
+        return Product({})
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         return self._region_by_name

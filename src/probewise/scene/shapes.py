@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -51,24 +51,14 @@ Bounds = tuple[float, float]
 
 @dataclass(frozen=True)
 class SymmetryTurn:
-    """A symmetry: a shape is the same after a turn `by_rad`, added to parameter `angle`, with the two sides `swapped`.
+    """The `symmetry_turn` of a shape with an angle: it is the same after a turn `by_rad` with two sides `swapped`.
 
-    `angle` and `swapped` are indices of parameters; `swapped` None: no sides are swapped.
+    The turn is added to parameter `angle`; that and `swapped` are indices, `swapped` None if no sides are.
     """
 
     by_rad: float
     angle: int
     swapped: tuple[int, int] | None = None
-
-
-@runtime_checkable
-class HasSymmetryTurn(Protocol):
-    """A shape with an angle, which looks the same after some turn."""
-
-    @property
-    def symmetry_turn(self) -> SymmetryTurn:
-        """The smallest turn after which the shape is the same."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -502,14 +492,10 @@ def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) ->
 
 def _rows_columns_and_turns(shape: Shape, theta: FloatArray) -> list[tuple[IntArray, IntArray, SymmetryTurn]]:
     """List (row numbers, column numbers, symmetry) of each shape among the samples that has an angle."""
+    found = [(np.arange(len(theta)), np.arange(theta.shape[1]), shape)]
     if isinstance(shape, AnyOf):
         which = shape.shape_index(theta)
         parts = zip(shape.shapes.values(), shape.prior.columns_by_shape, strict=True)
         found = [(np.flatnonzero(which == k), columns, part) for k, (part, columns) in enumerate(parts)]
-    else:
-        found = [(np.arange(len(theta)), np.arange(theta.shape[1]), shape)]
-    return [
-        (rows, columns, part.symmetry_turn)
-        for rows, columns, part in found
-        if rows.size and isinstance(part, HasSymmetryTurn)
-    ]
+    turns = [(rows, columns, getattr(part, "symmetry_turn", None)) for rows, columns, part in found if rows.size]
+    return [(rows, columns, turn) for rows, columns, turn in turns if turn is not None]

@@ -8,7 +8,7 @@ from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, respo
 from probewise.sensor.commanded import COMMANDED, with_declared_height_commanded
 from probewise.sensor.discrete import mean_albedo_by_pixels
 from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bend_coefficients, free_form_theta, is_free_form
-from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians
+from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
     DiscreteSSF,
@@ -64,7 +64,6 @@ __all__ = [
     "free_form_theta",
     "is_free_form",
     "mean_albedo_by_pixels",
-    "mean_albedo_under_gaussians",
     "mean_ssf_field",
     "merged_mean_mixture",
     "mixture_of_field",

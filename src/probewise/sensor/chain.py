@@ -323,9 +323,9 @@ class RegionsAndPoses:
     def straight_batches(self) -> tuple[StraightEdges | StraightCorners, ...]:
         """Straight edges and corners of all patterns that are the same for all hypotheses, in a batch of each kind.
 
-        Empty where orientations differ between hypotheses.
+        Empty where poses differ between hypotheses.
         """
-        if self.poses.orientation_rad.shape[0] > 1:
+        if any(len(a) > 1 for a in (self.poses.x_mm, self.poses.y_mm, self.poses.orientation_rad)):
             return ()
         known = [(rows, region) for rows, region in self.rows_and_regions if region.n_regions == 1]
         edges = [(rows, region) for rows, region in known if isinstance(region, HalfPlaneRegion)]
@@ -336,13 +336,11 @@ class RegionsAndPoses:
         )
 
     @cached_property
-    def rows_and_regions_outside_batches(self) -> list[tuple[IntArray, Region]]:
-        """The other regions, not in `straight_batches`, as pairs of row indices and region, split by orientation."""
-        taken = [row for part in self.straight_batches for row in part.rows.tolist()]
+    def rows_and_regions_by_orientation(self) -> list[tuple[IntArray, Region]]:
+        """As `rows_and_regions`, but split by orientation."""
         return [
             (group, region)
             for rows, region in self.rows_and_regions
-            if not np.isin(rows, taken).any()
             for group in _split_by_orientation(rows, self.poses.orientation_rad)
         ]
 
@@ -361,10 +359,13 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
     out = np.zeros(
         (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
     )
-    poses = layout.poses
-    for part in layout.straight_batches:
-        part.write_response(footprint, out)
-    for rows, region in layout.rows_and_regions_outside_batches:
+    poses, varies = layout.poses, any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
+    batches = () if varies else layout.straight_batches
+    for part in batches:
+        out[:, part.rows] = part.response(footprint)
+    for rows, region in layout.rows_and_regions_by_orientation:
+        if any((part.rows == rows[0]).any() for part in batches):
+            continue
         if isinstance(region, UniformRegion):  # whatever the footprint
             level = region.level[:, None]
             for g in range(footprint.weight.shape[2]):

@@ -89,37 +89,6 @@ def moments_in_lab_frame(
     )
 
 
-def mean_albedo_under_gaussians(
-    region: Region,
-    x_mm: FloatArray,
-    y_mm: FloatArray,
-    var_x: FloatArray,
-    var_y: FloatArray,
-    cov_xy: FloatArray,
-    *,
-    n_nodes: int = ACCURATE_NODES,
-) -> FloatArray:
-    """Return the mean albedo under each Gaussian footprint (paper, eq. RwithSSF for one Gaussian).
-
-    A kind of region without a closed form is summed over pixels: error about 1e-3, with a `SlowWarning`.
-
-    Returns mean albedo, shape (n_samples, n_points, n_gaussians).
-
-    `region`: albedo field of each hypothesis (n_regions of them, n_samples or 1); `x_mm`, `y_mm`: centres of the
-    Gaussians, lab frame, broadcasting to (n_samples, n_points, n_gaussians); `var_x`, `var_y`, `cov_xy`: their
-    covariances in the lab frame, mm^2, broadcasting likewise; `n_nodes`: nodes of the quadrature over curved edges.
-    """
-    arrays = np.broadcast_arrays(x_mm, y_mm, var_x, var_y, cov_xy)
-    zero = np.zeros((1, 1))
-    layers = []
-    for g in range(arrays[0].shape[2]):
-        x, y, var1, var2, cov = (a[:, :, g] for a in arrays)
-        gaussian = LabGaussian(x, y, zero, zero, var_x=var1, var_y=var2, cov_xy=cov)
-        shape = np.broadcast_shapes(x.shape, (region.n_regions, 1))
-        layers.append(np.broadcast_to(mean_albedo_under_one_gaussian(region, gaussian, n_nodes), shape))
-    return np.stack(layers, axis=-1)
-
-
 @singledispatch
 def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
@@ -130,7 +99,7 @@ def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_node
     kind = type(region).__name__
     warnings.warn(
         f"{kind} has no closed form: each footprint over it is summed over pixels, in milliseconds; register one with "
-        f"probewise.sensor.gaussian.seen_by_one.register({kind})",
+        f"probewise.sensor.gaussian.mean_albedo_under_one_gaussian.register({kind})",
         SlowWarning,
         stacklevel=2,
     )

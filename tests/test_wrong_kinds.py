@@ -29,7 +29,7 @@ from probewise.investigation import investigate
 from probewise.nested import NestedResult, RemainingEvidence, diversify, run
 from probewise.priors import Joint, Product, Uniform
 from probewise.recordings import HalfPlane, Plan, Recording, read_recording, write_plan, write_recording
-from probewise.report.plots import corner_plot, spatial_sensitivity
+from probewise.report.plots import spatial_sensitivity
 from probewise.scene import AnyOf, Circle, Field, HypothesisScene, KnownScene, RegularPolygon
 from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture
 from probewise.systems import Law, Simulator, predict_system
@@ -379,7 +379,6 @@ MISTAKES = {
         lambda: spatial_sensitivity(SENSOR.field, ax=Figure()),
         "ax is <Figure.*; allowed: axes of mat",
     ),
-    "a figure as many": (lambda: corner_plot(found(), axes=Figure()), r"axes have shape \(\)"),
     "a sensor to draw": (lambda: spatial_sensitivity(SENSOR), "field is .*; allowed: an SSFField"),
     # recordings and plans
     "arrays as plan": (lambda: Recording(np.zeros(3), np.zeros(3)), f"plan is .*; {A_PLAN}"),

@@ -90,6 +90,7 @@ def _run_demo(
         for done, future in enumerate(as_completed(parts), start=2):
             future.result()
             progress(doing, done, 8)
+    progress("writing the results")
     diagnosis, recording = diagnosing.result(), read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
     searches, started_alike, doubted = (

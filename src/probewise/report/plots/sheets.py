@@ -120,7 +120,7 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
         ax.text(x, y - 5.0, sheet.name, fontsize=11, fontweight="bold", va="baseline")
         for k, line in enumerate(lines):
             ax.text(x, y - 10.5 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
-        y -= _THUMB_MM + 6.0
+        y -= max(_THUMB_MM, 10.5 + 4.6 * len(lines)) + 6.0
     _draw_ruler(ax, LEFT_MM, 11.0)
     ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
     return ax.figure  # type: ignore[return-value]

@@ -268,7 +268,7 @@ def spread_by_level(
     """
     ax = canvas.axes_or_panel(ax)
     ok = np.flatnonzero(np.isfinite(residuals) & np.isfinite(predicted))
-    parts = np.array_split(ok[np.argsort(predicted[ok], kind="stable")], max(1, min(_STEPS, len(ok) // 8)))
+    parts = [ok[group] for group in groups_of_neighbours(predicted[ok], max(1, min(_STEPS, len(ok) // 8)))]
     at = np.array([predicted[p].mean() for p in parts])
     rms = np.array([np.sqrt(np.mean(residuals[p] ** 2)) for p in parts])
     # The sd of an rms of n normal values is close to sd / sqrt(2 n).

@@ -153,7 +153,7 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     made there, or one of the entries is a symbolic link, a device or a pipe.
     """
     for name, results in _MAIN_FILES.items():
-        if main not in ("", name) and (path / name).exists():
+        if main not in ("", name) and os.path.exists(path / name):
             allowed = f"another folder: this one holds {results} ({name}), with which these results would mix"
             raise ParameterError("--out", str(path), allowed)
     nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))

@@ -132,6 +132,14 @@ SAID = [
     ),
     (rivalled("named", ("lag",), ("glint",)), f"The model leaves out {SLOW}; less likely, a glint at one place."),
     (rivalled("named", ("lag",), ()), f"The model leaves out {SLOW}; less likely, nothing is missing."),
+    (
+        rivalled("named", ("lag", "outliers"), ("glint",), shared=("lag",), leader=("lag", "outliers")),
+        f"The model leaves out {SLOW}; less likely, a glint at one place.",
+    ),
+    (
+        rivalled("named", ("lag", "outliers"), ("lag", "glint"), shared=("lag",), leader=("lag", "outliers")),
+        f"The model leaves out {SLOW}.",
+    ),
     (rivalled("named", ("lag",), ("lag", "outliers")), f"The model leaves out {SLOW}."),
     (
         rivalled("unknown", ("unknown",), ("lag",)),

@@ -55,14 +55,14 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
 
 def _with_rivals(diagnosis: Diagnosis, versions: Sequence[tuple[str, str]]) -> list[str]:
     """Add the hypotheses that remain possible to the first sentence of each version; without them where none fits."""
-    stated = frozenset(diagnosis.combination)
+    stated = frozenset(diagnosis.judged.stated)
     rivals = [
         h.effects
         for h in diagnosis.hypotheses
         if h.probability > _RIVAL
         and not (bool(stated) == bool(h.effects) and (stated <= {*h.effects} or stated >= {*h.effects}))
     ]
-    live = [] if diagnosis.judged.leader or not rivals else [*_rival_versions(rivals), "others are possible"]
+    live = [*_rival_versions(rivals), "others are possible"] if rivals else []
     told = [f"; {'' if one.startswith('others') else 'less likely, '}{one}." for one in live]
     return [f"{first[:-1]}{rival}{rest}" for rival in (*told, ".") for first, rest in versions]
 

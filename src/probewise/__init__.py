@@ -28,7 +28,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from probewise._display import before_first_display
 from probewise._version import __version__
 from probewise.verbs import audit, calibrate, diagnose, explore, fit, predict
 
@@ -114,11 +113,3 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return __all__
-
-
-def _load_renderers() -> None:
-    """Import the module by which results display themselves as pictures; it is the first to load matplotlib."""
-    import probewise.report.notebook  # noqa: F401
-
-
-before_first_display(_load_renderers)

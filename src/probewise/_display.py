@@ -1,21 +1,14 @@
 """Display of results in a notebook; the packages that define the results need not import plotting.
 
-A result's class derives from `ShowsItself`; `report.notebook`, higher in the layers, registers its renderer.
-The first display of a result loads `report.notebook`.
+A result's class derives from `ShowsItself`; `report.notebook`, higher in the layers, registers its renderer. It is
+found by its name when a result is first displayed, since it loads plotting.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import importlib
 from typing import Protocol
-
-_waiting: list[Callable[[], object]] = []
-
-
-def before_first_display(load: Callable[[], object]) -> None:
-    """Register `load`, to be called once, before a result is first displayed: plotting is imported only then."""
-    _waiting.append(load)
 
 
 @functools.singledispatch
@@ -61,10 +54,7 @@ class ShowsItself:
         return said if said.startswith("<") else f"<{type(self).__name__}: {_first_line(said)}>"
 
     def _repr_html_(self) -> str:
-        # Each stays until it has ended, for Ctrl-C may come in between, and another thread may show a value too.
-        for load in list(_waiting):
-            load()
-        _waiting.clear()
+        importlib.import_module("probewise.report.notebook")
         import numpy as np  # it is loaded by the time there is a result
 
         with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"):  # whatever np.seterr says

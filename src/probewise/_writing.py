@@ -30,6 +30,7 @@ PAGE = "report.html"
 _STAGED, _COMPLETE = ".writing", ".complete"
 _OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
 _MOST_FAILED = 3  # drawings that a message names
+_MAIN_FILES = {"diagnosis.json": "a diagnosis", "fit.json": "a fit", "audit.json": "an audit"}
 _WRITABLE = "a file in an existing, writable folder, on a disk with room"
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 _NO_LOCKS = "flock not supported"  # newer versions of the library warn so, and make a file that a killed process leaves
@@ -144,12 +145,17 @@ def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Itera
         lock.release()
 
 
-def checked_output_directory(path: Path, *entries: str) -> Path:
+def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     """Check before any work that results can be written there, and return the path.
 
-    `entries` are files and folders of it that the run writes as it goes. Raises ParameterError if a file is in the way,
-    FileError if no directory can be made there, or one of the entries is a symbolic link, a device or a pipe.
+    `entries` are files and folders of it that the run writes as it goes, `main` the file by which its results are
+    known. Raises ParameterError if a file is in the way, or results of another verb, FileError if no directory can be
+    made there, or one of the entries is a symbolic link, a device or a pipe.
     """
+    for name, results in _MAIN_FILES.items():
+        if main not in ("", name) and os.path.exists(path / name):
+            allowed = f"another folder: this one holds {results} ({name}), with which these results would mix"
+            raise ParameterError("--out", str(path), allowed)
     nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
         what = "is no directory" if nearest.is_symlink() else "is a file"
@@ -181,10 +187,13 @@ def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out")
 
 
 class StagedFiles:
-    """Files written into an empty directory, `folder`; `kept` has the new path of each input file that they replace."""
+    """Files written into an empty directory, `folder`, and what they replace where they are moved.
+
+    `kept` has the new path of each input file; `replaces` is True if a file of an earlier run is replaced.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self.replaces = folder, False
         self.kept: dict[Path, Path] = {}
 
     def __truediv__(self, name: str) -> Path:
@@ -245,6 +254,7 @@ def _complete(out: Path, stage: StagedFiles, inputs: set[str], outdated: Sequenc
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
     replaced = [out / name for name in names if os.path.realpath(out / name) in inputs]
+    stage.replaces = any(os.path.lexists(out / name) for name in names if out / name not in replaced)
     for ending in itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2))):
         stage.kept = {path: path.with_stem(path.stem + ending) for path in replaced}
         if not any(os.path.lexists(path) for path in stage.kept.values()):
@@ -359,12 +369,15 @@ class Drawings:
     ) -> list[str]:
         """Write the files of a run, all or none, by a function of the `StagedFiles`; then figures and page.
 
-        Files of an earlier run, of the patterns `outdated`, are removed. Return lines on inputs that got another name.
+        Files of an earlier run, of the patterns `outdated`, are removed. Return lines on inputs that got another name,
+        and on results that were replaced.
         """
+        progress("writing the results")
         with staged_output(self.out, inputs=inputs, outdated=(*outdated, *drawers, PAGE)) as stage:
             files(stage)
         self.write_report(drawers, page, inputs=inputs, progress=progress)
-        return [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
+        replaced = ["note: the results of an earlier run there were replaced"] * stage.replaces
+        return [f"note: what was {path} is now {now}" for path, now in stage.kept.items()] + replaced
 
     def raise_if_any_failed(self) -> None:
         """Raise NotDrawnError, in one line, if something could not be drawn."""

@@ -105,9 +105,12 @@ def calibrate(
     >>> import probewise
     >>> from probewise.recordings import shipped
     >>> recording = probewise.read_recording(shipped("paper"))
-    >>> calibration = probewise.calibrate(recording, orders=[1], rng=np.random.default_rng(1))
-    >>> calibration.sensor.n_gaussians
-    1
+    >>> sensor = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1)).sensor
+    >>> len(probewise.predict(sensor, recording))
+    408
+    >>> run = probewise.explore(sensor, truth=(500, 250, 90), max_readings=2, rng=np.random.default_rng(1))
+    >>> len(run.readings)
+    2
     """
     from probewise import calibration
     from probewise._progress import progress_or_bar, sampler_progress
@@ -167,16 +170,6 @@ def predict(
     -----
     DoubtfulResultWarning
         If the plan's unit is not that of the calibration, or a column that an effect reads is missing.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import probewise
-    >>> from probewise.recordings import shipped
-    >>> recording = probewise.read_recording(shipped("paper"))
-    >>> found = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1))
-    >>> len(probewise.predict(found.sensor, recording))
-    408
     """
     from probewise import calibration, diagnosis, systems
     from probewise._kinds import require_rng
@@ -278,17 +271,6 @@ def explore(
     See Also
     --------
     probewise.experiment.explore : The same for any experiment and any arm, one step at a time.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import probewise
-    >>> from probewise.recordings import shipped
-    >>> recording = probewise.read_recording(shipped("paper"))
-    >>> found = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1))
-    >>> run = probewise.explore(found.sensor, truth=(500, 250, 90), max_readings=2, rng=np.random.default_rng(1))
-    >>> len(run.readings)
-    2
     """
     from dataclasses import replace
 

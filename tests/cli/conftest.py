@@ -4,16 +4,14 @@ import signal
 
 import numpy as np
 import pytest
+from hand_made import TRUTH, sensor_of
 from mixtures import fixed_mixture
 
 from probewise._signals import ENDING
-from probewise.calibration import FittedSensor, write_sensor
-from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
+from probewise.calibration import write_sensor
+from probewise.recordings import Recording, paper_plan, write_recording
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, footprint_of, mean_ssf_field
-
-NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
-TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
+from probewise.sensor import Chain, FixedLevels
 
 
 @pytest.fixture(autouse=True)
@@ -23,20 +21,6 @@ def signals_are_heard():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
-
-
-def hand_made_sensor() -> FittedSensor:
-    rng = np.random.default_rng(0)
-    spread = np.array([0.1, 0.02, 0.02, 0.0005, 0.001, 0.001, 0.03, 0.03])
-    axis = np.arange(-20.0, 20.5)
-    return FittedSensor(
-        names=NAMES,
-        samples=TRUTH + spread * rng.standard_normal((500, 8)),
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.6),
-        field=mean_ssf_field(footprint_of(TRUTH[None, :6], 1), u_mm=axis, v_mm=axis),
-        instrumentation=Instrumentation(),
-    )
 
 
 def small_recording() -> Recording:
@@ -50,8 +34,8 @@ def small_recording() -> Recording:
 
 @pytest.fixture
 def sensor_file(tmp_path):
-    path = tmp_path / "sensor.json"
-    write_sensor(hand_made_sensor(), path)
+    path, spread = tmp_path / "sensor.json", np.array([0.1, 0.02, 0.02, 0.0005, 0.001, 0.001, 0.03, 0.03])
+    write_sensor(sensor_of(TRUTH + spread * np.random.default_rng(0).standard_normal((500, 8))), path)
     return path
 
 

@@ -28,6 +28,7 @@ TEXTS = {
     "a list": b"[1]",
     "nothing": b"",
 }
+SOME_TEXTS = ("an integer of 5000 digits", "lists a million deep", "NaN", "random bytes", "a list", "nothing")
 TABLES = {
     "a million cells in one line": b",".join([b"a"] * 1_000_000),
     "ten thousand columns": b",".join(b"c%d" % k for k in range(10_000)) + b"\n" + b",".join([b"1"] * 10_000),
@@ -98,13 +99,13 @@ def test_a_sensor_that_is_no_sensor_is_refused(what, refused, recording_file, tm
     assert "bad.json" in said
 
 
-@pytest.mark.parametrize("what", TEXTS)
+@pytest.mark.parametrize("what", SOME_TEXTS)
 def test_a_description_that_is_none_is_refused(what, refused, recording_file, tmp_path):
     recording_file.with_suffix(".json").write_bytes(TEXTS[what])
     assert "small.json" in refused("audit", recording_file)
 
 
-@pytest.mark.parametrize("what", TEXTS)
+@pytest.mark.parametrize("what", SOME_TEXTS)
 @pytest.mark.parametrize("first", [b"", b'{"format": "journal/1"}\n'])
 def test_a_journal_that_is_none_is_refused(what, first, refused, sensor_file, tmp_path):
     (tmp_path / "bad.jsonl").write_bytes(first + TEXTS[what] + b"\n")
@@ -112,7 +113,7 @@ def test_a_journal_that_is_none_is_refused(what, first, refused, sensor_file, tm
     assert "bad.jsonl" in said
 
 
-@pytest.mark.parametrize("what", TEXTS)
+@pytest.mark.parametrize("what", SOME_TEXTS)
 @pytest.mark.parametrize("first", [b"", b'{"format": "campaign/1", "settings": {}}\n'])
 @pytest.mark.parametrize(("verb", "name"), [("challenge", "cases.jsonl"), ("study", "trials.jsonl")])
 def test_a_campaign_that_is_none_is_refused(verb, name, first, what, refused, tmp_path):

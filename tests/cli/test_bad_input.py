@@ -49,9 +49,13 @@ def test_a_cell_that_cannot_be_used_is_named_with_its_row_and_column(
     assert column in said
 
 
-@pytest.mark.parametrize("verb", ["calibrate", "diagnose", "audit"])
 @pytest.mark.parametrize(
-    "harm", ["no file", "no json", "torn json", "unknown kind", "no x_mm", "no rows", "empty", "binary"]
+    ("verb", "harm"),
+    [
+        *(("diagnose", harm) for harm in ("no file", "no json", "torn json", "unknown kind", "no rows", "binary")),
+        ("calibrate", "no x_mm"),
+        ("audit", "empty"),
+    ],
 )
 def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, tmp_path, capsys):
     description = recording_file.with_suffix(".json")
@@ -75,6 +79,13 @@ def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, 
         case "binary":
             recording_file.write_bytes(bytes(range(256)))
     refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
+
+
+def test_a_table_without_places_is_perhaps_one_for_a_simulator(tmp_path, capsys):
+    (tmp_path / "swings.csv").write_text("t_s,angle\n0,1\n1,2\n")
+    said = refused(capsys, tmp_path / "out", "diagnose", tmp_path / "swings.csv", "--out", tmp_path / "out")
+    assert "column x_mm: no such column" in said
+    assert "a table of anything else needs --simulator FILE.py" in said
 
 
 EXPLORE = ("explore", "--sensor", "sensor.json")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probewise._writing import staged_output
+from probewise._writing import Drawings, staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
 from probewise.cli._common import holds_readings
@@ -54,6 +54,39 @@ def test_a_directory_in_the_way_leaves_everything_as_it_was(tmp_path):
     with pytest.raises(FileError, match="a directory of that name is in the way"):
         write()
     assert sorted(p.name for p in tmp_path.iterdir()) == [".results.lock", "b"]
+
+
+@pytest.mark.parametrize(
+    ("held", "words"),
+    [
+        ("diagnosis.json", "fit data.csv --simulator heater.py"),
+        ("fit.json", "diagnose data.csv --simulator heater.py"),
+        ("fit.json", "investigate --plan paper"),
+        ("diagnosis.json", "calibrate data.csv"),
+        ("diagnosis.json", "audit data.csv"),
+    ],
+)
+def test_results_of_two_verbs_do_not_mix_in_one_folder(held, words, tmp_path, capsys):
+    (tmp_path / held).write_text("{}")
+    assert main([*words.split(), "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert f"--out is '{tmp_path}'; allowed: another folder: this one holds a {held[:-5]} ({held})" in said
+    assert [path.name for path in tmp_path.iterdir()] == [held]
+
+
+def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
+    said, stages = [], []
+    for _ in range(2):
+        said.append(
+            Drawings(tmp_path).write_results(
+                lambda stage: stage.write("a.json", "{}"),
+                {},
+                lambda drawn: "",
+                progress=lambda *told: stages.append(told),
+            )
+        )
+    assert said == [[], ["note: the results of an earlier run there were replaced"]]
+    assert stages[0] == ("writing the results",)
 
 
 @pytest.mark.parametrize("verb", ["diagnose", "calibrate"])

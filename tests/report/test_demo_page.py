@@ -132,19 +132,20 @@ def test_the_page_shows_every_figure_that_is_drawn(found):
     outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
     truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
     searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("naive", "SSF")]
-    shared = {
-        "prediction": predict(sensor, recording.plan, recording.readings),
-        "searches": searches,
-        "started_alike": searches,
-        "diagnosis": diagnose(recording.take(np.arange(0, 408, 8)), rng=np.random.default_rng(1)),
-        "doubt": searches,
-    }
-    geometry = read_geometry(shipped_geometry_path())
-    drawers = report.figure_drawers(calibration, recording, **shared, geometry=geometry)
-    drawn = {name: draw() for name, draw in drawers.items()}
-    frames = [[drawn["doubt.png"]] * 2] * 2
-    more = {"frames": frames, "drawn": drawn, "concealed": "lag", "seed": 1, "seconds": 2.0}
-    page = report.page_html(calibration, recording, **shared, **more)
+    found = report.DemoRun(
+        calibration,
+        recording,
+        predict(sensor, recording.plan, recording.readings),
+        searches,
+        searches,
+        searches,
+        diagnose(recording.take(np.arange(0, 408, 8)), rng=np.random.default_rng(1)),
+        read_geometry(shipped_geometry_path()),
+        "lag",
+        1,
+    )
+    drawn = {name: draw() for name, draw in report.figure_drawers(found).items()}
+    page = report.page_html(found, drawn, frames=[[drawn["doubt.png"]] * 2] * 2, seconds=2.0)
     assert page.count("<img") == len(drawn) + 1  # two slides, and one figure is a file alone, ssf.png
     assert "could not be drawn" not in page
     assert "The simulated world that made this recording concealed: lag." in page

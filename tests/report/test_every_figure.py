@@ -10,7 +10,6 @@ from matplotlib.text import Text
 from PIL import Image
 
 from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
-from probewise.errors import ShapeError
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 from probewise.proof import plots as plots_of_campaigns
@@ -199,12 +198,8 @@ def hidden_by_keys(figure):
 
 
 @pytest.mark.slow
-def test_drawing_on_given_axes_opens_no_figure(result):
+def test_drawing_on_given_axes_opens_no_figure():
     sheet = plt.figure()
-    cells = sheet.subplots(6, 6)
-    assert plots.corner_plot(result, axes=cells)[5, 0] is cells[5, 0]
-    with pytest.raises(ShapeError, match=r"allowed: \(4, 1\)"):
-        plots.run_plot(result, axes=cells)
     one = sheet.add_subplot()
     assert plots.posterior_widths(WIDTHS, ax=one) is one
     assert plt.get_fignums() == [sheet.number]

@@ -45,6 +45,13 @@ def found(
     )
 
 
+def rivalled(verdict, combination, rival, **more):
+    """A verdict with .6 of the probability, whose rival has .3."""
+    diagnosis = found(verdict, combination, **more)
+    diagnosis.hypotheses = (Hypothesis(combination, 0.6), Hypothesis(rival, 0.3))
+    return diagnosis
+
+
 def several(most):
     return itertools.chain.from_iterable(itertools.combinations(NAMES, k) for k in range(1, most + 1))
 
@@ -113,7 +120,34 @@ SAID = [
     ),
     (
         found("cannot_tell", ("hysteresis",), rivals=[("hysteresis",), ("lag",)]),
-        f"{MISSING}, most likely an offset that depends on the direction; these readings cannot tell.",
+        f"{MISSING}: an offset that depends on the direction or {SLOW}.",
+    ),
+    (
+        found("cannot_tell", rivals=((), ("lag",), ("glint",))),
+        f"These readings cannot tell whether anything is missing; if so, {SLOW} or another.",
+    ),
+    (
+        found("cannot_tell", rivals=[(name,) for name in ("hysteresis", "lag", "battery_sag", "halo")]),
+        f"{MISSING}: an offset that depends on the direction, {SLOW} or 2 others.",
+    ),
+    (rivalled("named", ("lag",), ("glint",)), f"The model leaves out {SLOW}; less likely, a glint at one place."),
+    (rivalled("named", ("lag",), ()), f"The model leaves out {SLOW}; less likely, nothing is missing."),
+    (
+        rivalled("named", ("lag", "outliers"), ("glint",), shared=("lag",), leader=("lag", "outliers")),
+        f"The model leaves out {SLOW}; less likely, a glint at one place.",
+    ),
+    (
+        rivalled("named", ("lag", "outliers"), ("lag", "glint"), shared=("lag",), leader=("lag", "outliers")),
+        f"The model leaves out {SLOW}.",
+    ),
+    (rivalled("named", ("lag",), ("lag", "outliers")), f"The model leaves out {SLOW}."),
+    (
+        rivalled("unknown", ("unknown",), ("lag",)),
+        f"{MISSING} that no known effect explains; less likely, {SLOW}.",
+    ),
+    (
+        rivalled("clean", (), ("hysteresis",), p_value=0.4),
+        "Nothing is missing: the model explains all 408 readings to within their noise; others are possible.",
     ),
     (
         found("cannot_tell", rivals=[(name,) for name in NAMES[:12]]),

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from probewise import _display
 from probewise._display import ShowsItself, render_html
 from probewise.nested import run
 from probewise.priors import Product, Uniform
@@ -47,20 +46,3 @@ def test_the_repr_of_a_result_is_one_short_line():
         assert repr(value).startswith(f"<{type(value).__name__}")
         assert "\n" not in repr(value)
         assert len(repr(value)) < 200
-
-
-def test_a_first_display_that_was_interrupted_loads_its_pictures_at_the_next(monkeypatch):
-    loaded = []
-
-    def load():
-        loaded.append(len(loaded))
-        if len(loaded) == 1:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(_display, "_waiting", [load])
-    value = SSFField(np.ones((5, 5)), 1.0, (-2.0, -2.0))
-    with pytest.raises(KeyboardInterrupt):
-        value._repr_html_()
-    for _ in range(2):
-        value._repr_html_()
-    assert loaded == [0, 1]

@@ -94,7 +94,7 @@ def test_the_label_of_an_axis_whose_ticks_become_finer_in_the_layout_is_within_t
 
 
 def test_a_long_label_of_a_bar_is_broken_into_lines_within_the_axes():
-    long = "a cubic term of x in the rate of v, noise that neighbouring readings share and an offset of u_v"
+    long = "a cubic term of x in the rate of v, noise that grows with the signal and an offset of u_v"
     ax = plots.hypothesis_probabilities([f"{long} and {long}", "b", f"{long}, {long}"], [0.6, 0.3, 0.1])
     ax.figure.canvas.draw()
     frame = ax.figure.bbox
@@ -115,6 +115,6 @@ def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
 @pytest.mark.parametrize("repeats", [1, 2, 5])
 def test_many_long_names_above_a_single_round_leave_room_for_its_bar(repeats):
     """Warnings are errors: matplotlib warns where a legend leaves its axes no width or no height."""
-    long = " and ".join(["noise that neighbouring readings share and an effect with a long name"] * repeats)
+    long = " and ".join(["noise that grows with the signal and an effect with a long name"] * repeats)
     names = [f"{long}, number {k}" for k in range(9)]
     assert plots.png(plots.probabilities_by_round({"round 1: 30 readings": dict.fromkeys(names, 1 / 9)}), dpi=30)

@@ -102,3 +102,24 @@ def test_a_diagnosis_needs_no_plotting_library():
     asked = "import sys, probewise.cli.diagnose, probewise.diagnosis; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True).stdout.split()
     assert not {"matplotlib", "scipy.stats", "scipy.spatial", "scipy.optimize"} & set(loaded)
+
+
+def test_a_covariate_of_few_values_has_points_with_bars_and_no_line():
+    """Neighbours of equal size would give several means at one value: a saw-tooth."""
+    voltage, noise = np.repeat([3.0, 5.0, 12.0], 60), np.random.default_rng(2).standard_normal(180)
+    found = mean_residuals(voltage, noise, None, sd=1.0)
+    np.testing.assert_array_equal(found.at, [3.0, 5.0, 12.0])
+    np.testing.assert_allclose(found.before, [noise[voltage == v].mean() for v in found.at])
+    (running,) = plots.residuals_against_covariates([("voltage (V)", voltage)], [("fitted", noise)], unit="V")
+    for ax in (plots.mean_residuals_along(found, label="voltage (V)", unit="V"), running):
+        means = [line for line in ax.lines if len(line.get_xdata()) == 3]  # and the caps of bars
+        assert means
+        assert all(line.get_linestyle() == "None" for line in means)
+        assert ax.containers
+
+
+def test_rows_of_one_value_are_in_one_group():
+    values = np.r_[np.zeros(150), np.linspace(0.001, 0.02, 30), np.ones(150)]
+    found = mean_residuals(values, values, None, sd=1.0)
+    assert (np.diff(found.at) > 0).all()
+    np.testing.assert_array_equal(found.size, [154, 14, 12, 150])

@@ -6,6 +6,7 @@ import zlib
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_pdf import PdfPages
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
@@ -22,6 +23,7 @@ from probewise.report.sheets import (
     field_sheet,
     marks_sheet,
     pattern_sheets,
+    points_of_lines,
     target_sheet,
     tiles_of,
 )
@@ -207,6 +209,41 @@ def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
         assert any(how == "S" and np.ptp(points, axis=0) == pytest.approx([100, 0], abs=0.01) for how, points in paths)
 
 
+def texts_of(figures, monkeypatch):
+    """Texts of each page, with their places: those drawn while the PDF is made."""
+    drawn = []
+    monkeypatch.setattr(PdfPages, "savefig", lambda pdf, figure: drawn.append(figure.axes[0].texts))
+    sheets_pdf(figures, paper="a4", title="t")
+    return drawn
+
+
+def test_the_cover_tells_of_the_origin_and_the_sensor_only_what_a_pattern_needs(monkeypatch):
+    plan = paper_plan()
+    covers = [
+        " ".join(text.get_text() for text in texts_of(sheets, monkeypatch)[0])
+        for sheets in (
+            pattern_sheets(plan.patterns, plan),
+            arm_home_jig_sheets(read_geometry(shipped_geometry_path())),
+            [target_sheet("circle", CIRCLE)],
+        )
+    ]
+    assert ["arm record" in cover for cover in covers] == [True, False, False]
+    assert ["several pages" in cover for cover in covers] == [False, True, False]
+
+
+def test_no_label_of_a_glue_strip_lies_over_a_line_of_the_jig(monkeypatch):
+    side, _ = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
+    labels = 0
+    for tile, texts in zip(tiles_of(side, "a4"), texts_of([side], monkeypatch)[1:], strict=True):
+        lines = tile.on_page_mm(points_of_lines(side))
+        for text in texts:
+            if text.get_text().endswith("lies here"):
+                labels += 1
+                half = (3.0, 12.0) if text.get_rotation() else (12.0, 3.0)
+                assert not (np.abs(lines - text.get_position()) < half).all(axis=1).any()
+    assert labels
+
+
 def test_words_say_which_side_is_white():
     assert where_white_in_words(HalfPlane(0.0, 0.0)).startswith("white on the right, x > 0 mm")
     assert where_white_in_words(HalfPlane(np.pi, 5.0)).startswith("white on the left, x < -5 mm")
@@ -222,10 +259,14 @@ def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, 
     assert out.read_bytes().startswith(b"%PDF")
     said = capsys.readouterr().out
     assert "cut it out" in said
+    assert "replaced" not in said
+    assert main(["sheets", "target", "--target", "600,250,80", "--out", str(out)]) == 0
+    assert f"note: an earlier {out} was replaced" in capsys.readouterr().out
     for words, told in (
         (["paper", "--paper", "a3"], "--paper is 'a3'; allowed: a4 or letter"),
         (["target"], "--target is missing: give a shape"),
         (["target", "--target", "blob:1,2"], "--target is 'blob:1,2'; allowed: a shape of"),
+        (["target", "--target", "1040,250,80"], "a shape that lies on the field, 1048 x 520 mm"),
         (["paper", "--target", "600,250,80"], "none with paper"),
         (["nothing.csv"], "nothing.csv"),
     ):

@@ -227,6 +227,11 @@ def finish(drawings: Drawings, *lines: str, quiet: bool) -> int:
     return 0
 
 
+def note_if_replaced(out: Path) -> list[str]:
+    """List one line to print after writing a file if it replaces an earlier one; else none."""
+    return [f"note: an earlier {out} was replaced"] if out.is_file() else []
+
+
 def tables_and_descriptions(tables: Sequence[Path]) -> list[Path]:
     """Return each file of a table followed by its description, the JSON beside it."""
     named = [table for table in tables if table.name]  # not "." and "/"

@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.systems import read_table_for
 
     refuse_journal(arguments.plan)
-    drawings = None if arguments.out is None else Drawings(checked_output_directory(arguments.out))
+    drawings = None if arguments.out is None else Drawings(checked_output_directory(arguments.out, main="audit.json"))
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
             refuse_sensor(arguments.sensor)

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     common.refuse_nested_stop(arguments)
     refuse_journal(arguments.recording)
-    drawings = Drawings(checked_output_directory(arguments.out))
+    drawings = Drawings(checked_output_directory(arguments.out, main="sensor.json"))
     orders = tuple(sorted(set(arguments.orders)))
     with progress_shown(quiet=arguments.quiet) as progress:
         recording = read_recording(arguments.recording, progress=progress)

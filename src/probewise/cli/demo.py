@@ -90,24 +90,27 @@ def _run_demo(
         for done, future in enumerate(as_completed(parts), start=2):
             future.result()
             progress(doing, done, 8)
+    progress("writing the results")
     diagnosis, recording = diagnosing.result(), read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
     searches, started_alike, doubted = (
         searches_with_true_circle(sensor, ((name, run.result()) for name, run in runs.items()), truth)
         for runs in (searching, starting, doubting)
     )
-    figures = report.figure_drawers(
+    found = report.DemoRun(
         calibration,
         recording,
-        prediction=prediction,
-        searches=searches,
-        started_alike=started_alike,
-        geometry=read_geometry(shipped_geometry_path()),
-        diagnosis=diagnosis,
-        doubt=doubted,
+        prediction,
+        searches,
+        started_alike,
+        doubted,
+        diagnosis,
+        read_geometry(shipped_geometry_path()),
+        ", ".join(effect.name for effect in world_behind("concealed").concealed),
+        seed,
     )
+    figures = report.figure_drawers(found)
     figures_of_diagnosis = diagnosis_report.figure_drawers(diagnosis)
-    concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     seconds = time.monotonic() - started
     of_diagnosis = (f"{_DIAGNOSIS}/{name}" for name in (*figures_of_diagnosis, PAGE))
     with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
@@ -115,31 +118,18 @@ def _run_demo(
         (stage / _DIAGNOSIS).mkdir()
         *_, rng = diagnose_verb.generators_of_diagnosis(seed)
         diagnose_verb.write_files(diagnosis, StagedFiles(stage / _DIAGNOSIS), rng=rng)
-        answers = report.main_findings_by_key(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
+        answers = report.main_findings_by_key(found)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
 
     def page(drawn: Mapping[str, bytes]) -> str:
-        frames = [
-            [
-                drawings.draw(f"{search.model}, step {step.number}", partial(_frame_png, search, step))
-                for step in search.run.steps
-            ]
-            for search in searches
-        ]
-        return report.page_html(
-            calibration,
-            recording,
-            prediction=prediction,
-            searches=searches,
-            started_alike=started_alike,
-            frames=frames,
-            diagnosis=diagnosis,
-            doubt=doubted,
-            drawn=drawn,
-            concealed=concealed,
-            seed=seed,
-            seconds=seconds,
-        )
+        n, frames = sum(len(search.run.steps) for search in searches), list[list[bytes]]()
+        for search in searches:
+            frames.append([])
+            for step in search.run.steps:
+                progress("drawing every step", sum(map(len, frames)), n, search.model)
+                name = f"{search.model}, step {step.number}"
+                frames[-1].append(drawings.draw(name, partial(_frame_png, search, step)))
+        return report.page_html(found, drawn, frames=frames, seconds=seconds)
 
     drawings_of_diagnosis.write_report(
         figures_of_diagnosis,
@@ -151,7 +141,7 @@ def _run_demo(
         *search_comparison_lines(searches),
         report.summary_sentence(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
-        f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
+        f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {found.concealed}",
         f"a concealed saturation: {report.doubt_sentence(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     )

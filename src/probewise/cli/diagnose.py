@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.diagnosis import NEXT_PLAN, SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
     from probewise.report import diagnosis as report
 
-    drawings = Drawings(checked_output_directory(arguments.out))
+    drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     with progress_shown(quiet=arguments.quiet) as progress:
         recordings, sensor, shape = _read_inputs(arguments, progress=progress)
         diagnosis_rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
@@ -119,7 +119,7 @@ def _diagnose_simulator(arguments: argparse.Namespace) -> int:
     from probewise.report import diagnosis as report
 
     refuse_sensor(arguments.sensor)
-    drawings = Drawings(checked_output_directory(arguments.out))
+    drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
     source = ", ".join(path.name for path in arguments.recordings)
     with (

@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.simulator is None:
         raise CommandError("--simulator FILE.py is missing; to fit a light sensor, use probewise calibrate")
-    drawings = Drawings(checked_output_directory(arguments.out))
+    drawings = Drawings(checked_output_directory(arguments.out, main="fit.json"))
     source = ", ".join(path.name for path in arguments.tables)
     with (
         open_simulator(arguments.simulator, arguments.workers) as simulator,

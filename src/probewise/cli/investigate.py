@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report import diagnosis as of_a_diagnosis
     from probewise.report import investigation as report
 
-    out = checked_output_directory(arguments.out, "rounds")
+    out = checked_output_directory(arguments.out, "rounds", main="diagnosis.json")
     chosen = parse_arm(arguments.arm)
     if arguments.truth is not None and chosen.kind != "simulated":
         raise ParameterError("--truth", arguments.truth, f"none with {arguments.arm}: it is for the simulated arm")

@@ -33,6 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     read += [] if arguments.simulator is None else [arguments.simulator]
     out = checked_output_file(arguments.out, arguments.sensor, *read)
     notes: tuple[str, ...] = ()
+    earlier = common.note_if_replaced(out)
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
             fitted = systems.read_fitted_system(arguments.sensor, arguments.simulator)  # a changed file is not run
@@ -50,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             out.parent.mkdir(parents=True, exist_ok=True)
             recordings.write_prediction(prediction, out)
             summary = prediction.summary()
-    for note in notes:
-        common.print_result(f"note: {note}", quiet=arguments.quiet)
+    for note in (*(f"note: {note}" for note in notes), *earlier):
+        common.print_result(note, quiet=arguments.quiet)
     common.print_result(f"{summary}\nwritten to {out}", quiet=arguments.quiet)
     return 0

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 from probewise._writing import checked_output_file
 from probewise.cli._arm import add_geometry, read_or_shipped_geometry, read_or_shipped_plan
-from probewise.cli._common import CommandError, add, add_quiet, parse_path, print_result
+from probewise.cli._common import CommandError, add, add_quiet, note_if_replaced, parse_path, print_result
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
+    from probewise._arrays import FloatArray
     from probewise.report.sheets import Sheet
 
 FIELD, TARGET, MARKS, JIG = "field", "target", "marks", "jig"
@@ -46,12 +47,15 @@ def run(arguments: argparse.Namespace) -> int:
     out = checked_output_file(arguments.out, *([named] if named.is_file() else []))
     sheets = _sheets_to_draw(arguments)
     drawn = sheets_pdf(sheets, paper=arguments.paper, title=f"probewise sheets: {named.name}")
+    earlier = note_if_replaced(out)
     write_bytes_atomically(out, drawn)
     for sheet in sheets:
         n = len(tiles_of(sheet, arguments.paper))
         width, height = sheet.size_mm
         pages = f"{n} page{'s' if n > 1 else ''}"
         print_result(f"{sheet.name:<12} {width:g} x {height:g} mm, {pages}: {sheet.lines[0]}", quiet=arguments.quiet)
+    for note in earlier:
+        print_result(note, quiet=arguments.quiet)
     print_result(f"print at 100 % on {arguments.paper}, and measure the ruler: {out}", quiet=arguments.quiet)
     return 0
 
@@ -90,7 +94,8 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     return pattern_sheets(plan.patterns, plan)
 
 
-def _target_outline_mm(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyped-def]
+def _target_outline_mm(text: str, field_mm: tuple[float, float]) -> FloatArray:
+    """Return the outline of --target, (n, 2); ParameterError if it is no shape, or is not wholly on the field."""
     import numpy as np
 
     from probewise.cli._explore import parse_truth
@@ -100,4 +105,7 @@ def _target_outline_mm(text: str, field_mm: tuple[float, float]):  # type: ignor
         hidden = parse_truth(text, ("circle",), Field(*field_mm), rng=np.random.default_rng(0))
     except ParameterError as error:
         raise ParameterError(error.name.replace("--truth", "--target"), error.value, error.allowed) from error
-    return outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
+    outline = outlines(hidden.shape.region(hidden.theta[None, :]), n_vertices=720)[0]
+    if (outline < 0).any() or (outline > field_mm).any():
+        raise ParameterError("--target", text, f"a shape that lies on the field, {field_mm[0]:g} x {field_mm[1]:g} mm")
+    return outline

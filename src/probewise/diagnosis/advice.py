@@ -451,7 +451,7 @@ def measurement_at_place(
         commands[best].description,
         commands[best].minutes,
         float(nats[best]),
-        (f"{apparatus.words.null} as calibrated", NO_NAME),
+        (f"{apparatus.words.null} as {apparatus.words.unrepaired}", NO_NAME),
         ((), ("unknown",)),
         np.full(2, 0.5),
         nats[best] * (1 - np.eye(2)),
@@ -580,10 +580,10 @@ def choose_next_measurement(
         return measurement_at_place(unknown_shows_in, null.found, prepared.everything, sd, plan, apparatus)
     if is_settled(searched) or len(found) == 1:
         return None
-    as_calibrated = f"{apparatus.words.null} as calibrated"
+    unrepaired = f"{apparatus.words.null} as {apparatus.words.unrepaired}"
     rivals = []
     for fit in found:
-        label = hypothesis_in_words(fit.names, nothing=as_calibrated)
+        label = hypothesis_in_words(fit.names, nothing=unrepaired)
         slopes, own_sd = fit.found.slopes, fit.whitened_sd
         free = residual_degrees_of_freedom(slopes, own_sd, len(slopes))
         root = covariance_root(slopes, own_sd**2 * len(slopes) / free)

@@ -77,6 +77,11 @@ class Words:
     facts: tuple[tuple[str, str], ...] = ()
     tells_duration: bool = True
 
+    @property
+    def unrepaired(self) -> str:
+        """The model before a repair, as an adjective: a light sensor is calibrated, a simulator fitted."""
+        return "calibrated" if self.covariates is None else "fitted"
+
     def as_sentence(self, text: str) -> str:
         """Return a text with a capital first letter, unless its first word is a person's own name."""
         first = (text.split() or [""])[0].rstrip(",.;:")

@@ -29,7 +29,7 @@ _DIGITS = 1e-6  # of a step: below this a difference is rounding
 class CorrelatedNoise(NoiseEffect):
     """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
 
-    name, words, covariates = "correlated_noise", "noise that neighbouring readings share", ("scan",)
+    name, words, covariates = "correlated_noise", "correlated noise", ("scan",)
     units = ("1",)
     prior = Product({"rho": Uniform(-0.5, 0.95)})
     n_nodes = 28  # dense enough to integrate the posterior of a thousand readings
@@ -90,7 +90,7 @@ class RandomWalk(NoiseEffect):
 
     n_before: int = 0
 
-    name, words, covariates = "random_walk", "a zero that wanders", ("time", "row", "run")
+    name, words, covariates = "random_walk", "a random walk of the zero", ("time", "row", "run")
     units = ("noise sd",)
     prior = Product({"sd_per_row": LogUniform(5e-3, 3.0)})
     n_nodes = 16

@@ -36,6 +36,9 @@ from probewise.recordings.table import LARGEST, CSVTable, csv_text, number_text,
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
+_OF_A_LIGHT_SENSOR = (
+    "a header row with it, in a recording by a light sensor; a table of anything else needs --simulator FILE.py"
+)
 _A_NAME = "a printable text without blanks around it"
 _FAR_AWAY = 100.0  # a place this many times the 5 to 95 % range of all places away looks mistyped
 PathLike = str | os.PathLike[str]
@@ -182,7 +185,7 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         raise FileError(path, "this is a description", "the name of the CSV beside it")
     known = ("x_mm", "y_mm", "reading")
     table = read_table(path, wanted=known, names=("scan", "pattern"), time="time_s", progress=progress)
-    table.require_columns("x_mm", "y_mm")
+    table.require_columns("x_mm", "y_mm", allowed=_OF_A_LIGHT_SENSOR)
     if not len(table):
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))

@@ -64,12 +64,12 @@ class CSVTable:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def require_columns(self, *names: str) -> None:
-        """Raise FileError if one of these columns is missing."""
+    def require_columns(self, *names: str, allowed: str = "a header row with it") -> None:
+        """Raise FileError, which says what is `allowed`, if one of these columns is missing."""
         for name in names:
             if name not in self.columns:
                 found = f"no such column; the header has {_in_words(list(self.columns))}"
-                raise FileError(self.path, found, "a header row with it", row=self.header_row, column=name)
+                raise FileError(self.path, found, allowed, row=self.header_row, column=name)
 
     def column_of_numbers(
         self, name: str, *, missing: bool = False, largest: float | None = LARGEST, allowed: str = ""
@@ -291,7 +291,7 @@ def read_table(
     if twice := next((name for name, n in Counter(header).items() if name and n > 1), None):
         cure = "each column once: rename or delete one of them"
         raise FileError(path, "the column comes twice in the header", cure, row=layout.at + 1, column=twice)
-    n_lines, number = text.count("\n"), 0
+    n_below, number = text.count("\n") - layout.at - 1, 0  # lines below the header
     records, rows, left_out = list[tuple[str, ...]](), list[int](), list[int]()
     failed: csv.Error | None = None
     try:
@@ -304,7 +304,7 @@ def read_table(
                     records.append(tuple(record))  # which, unlike lists, cost the garbage collector nothing
                     rows.append(number)
             if number % _PROGRESS == 0:
-                progress(f"reading {path.name}", number, max(n_lines, number))
+                progress(f"reading {path.name}", len(rows), max(n_below, len(rows)))
     except csv.Error as error:
         failed = error
     while failed is None and records and layout.is_below_table(records[-1]):
@@ -318,7 +318,7 @@ def read_table(
     if failed is not None:
         found = f"not readable as CSV ({failed})"
         raise FileError(path, found, "comma-separated cells, quotes closed", row=number + 1) from failed
-    progress(f"reading {path.name}", number, max(n_lines, number))
+    progress(f"reading {path.name}", len(rows), len(rows))
     if not header:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
     notes = layout.notes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -35,6 +36,27 @@ _SENSOR = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class DemoRun:
+    """Everything that a demo has found.
+
+    `searches` are the naive and the SSF robot's from an empty field, `started_alike` from the same first reading, with
+    places chosen by the paper's rule; `doubt` is the search of a trusting and of a doubting robot. `diagnosis` is that
+    of the second recording, whose simulated world `concealed` the effect of that name.
+    """
+
+    calibration: Calibration
+    recording: Recording
+    prediction: Prediction
+    searches: Sequence[RobotSearch]
+    started_alike: Sequence[RobotSearch]
+    doubt: Sequence[RobotSearch]
+    diagnosis: Diagnosis
+    geometry: Geometry
+    concealed: str
+    seed: int
+
+
 def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """State in one sentence how many readings the SSF and the naive robot needed after the same first reading."""
     naive, ssf = (len(s.run.steps) - 1 for s in searches)
@@ -56,102 +78,64 @@ def sds_after_equal_readings_text(searches: Sequence[RobotSearch]) -> str:
     )
 
 
-def main_findings_by_key(
-    started_alike: Sequence[RobotSearch],
-    diagnosis: Diagnosis,
-    doubt: Sequence[RobotSearch],
-    *,
-    concealed: str,
-    seed: int,
-) -> dict[str, str | int]:
+def main_findings_by_key(run: DemoRun) -> dict[str, str | int]:
     """Return what other pages quote of the demo, by key: seed, verdict, its effects, the concealed one, sentences."""
     return {
-        "seed": seed,
-        "search": summary_sentence(started_alike),
-        "equal_readings": sds_after_equal_readings_text(started_alike),
-        "verdict": diagnosis.verdict,
-        "combination": "+".join(diagnosis.combination),
-        "concealed": concealed,
-        "diagnosis": diagnosis_report.summary_sentence(diagnosis),
-        "reason": typeset_numbers(diagnosis.reason),
-        "doubt": doubt_sentence(doubt),
+        "seed": run.seed,
+        "search": summary_sentence(run.started_alike),
+        "equal_readings": sds_after_equal_readings_text(run.started_alike),
+        "verdict": run.diagnosis.verdict,
+        "combination": "+".join(run.diagnosis.combination),
+        "concealed": run.concealed,
+        "diagnosis": diagnosis_report.summary_sentence(run.diagnosis),
+        "reason": typeset_numbers(run.diagnosis.reason),
+        "doubt": doubt_sentence(run.doubt),
     }
 
 
-def figure_drawers(
-    calibration: Calibration,
-    recording: Recording,
-    *,
-    prediction: Prediction,
-    searches: Sequence[RobotSearch],
-    started_alike: Sequence[RobotSearch],
-    geometry: Geometry,
-    diagnosis: Diagnosis,
-    doubt: Sequence[RobotSearch],
-) -> dict[str, Callable[[], bytes]]:
-    """List all figures of the demo by file name, as functions that draw PNGs.
-
-    `searches` are the naive and the SSF robot's from an empty field, `started_alike` from the same first reading, with
-    places chosen by the paper's rule; `doubt` is the search of a trusting and of a doubting robot.
-    """
+def figure_drawers(run: DemoRun) -> dict[str, Callable[[], bytes]]:
+    """List all figures of the demo by file name, as functions that draw PNGs."""
+    recording, diagnosis, started_alike, doubt = run.recording, run.diagnosis, run.started_alike, run.doubt
     hidden = started_alike[0].truth_mm
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
     names = [hypothesis_in_words(h.effects) for h in diagnosis.hypotheses]
     before, after = diagnosis.repair.before.readings, diagnosis.repair.after.readings
     drawings: dict[str, Callable[[], Any]] = {
-        "arm.png": lambda: arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden),
+        "arm.png": lambda: arm_and_sensor(run.geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden),
         "orientations.png": lambda: sensor_orientations(recording),
         "quadrants.png": lambda: quadrant_patterns(recording),
         "first_three.png": lambda: of_searches.draw_paper_views(started_alike, n_first),
         "equal_readings.png": lambda: of_searches.draw_paper_views(started_alike, [len(started_alike[-1].run.steps)]),
-        "progress.png": lambda: of_searches.draw_widths_and_information(searches),
+        "progress.png": lambda: of_searches.draw_widths_and_information(run.searches),
         "explanations.png": lambda: hypothesis_probabilities(names, [h.probability for h in diagnosis.hypotheses]),
         "scans.png": lambda: residuals_by_scan(diagnosis.recording, before, after),
         "before_after.png": lambda: lay_out(before_and_after(diagnosis)),
         "doubt.png": lambda: of_searches.draw_final_posteriors(doubt),
         "belief.png": lambda: of_searches.draw_effect_probabilities(doubt[-1].run),
     }
-    return calibration_report.figure_drawers(calibration, recording, prediction) | {
+    return calibration_report.figure_drawers(run.calibration, recording, run.prediction) | {
         name: partial(lambda draw: png(draw()), draw) for name, draw in drawings.items()
     }
 
 
-def page_html(
-    calibration: Calibration,
-    recording: Recording,
-    *,
-    prediction: Prediction,
-    searches: Sequence[RobotSearch],
-    started_alike: Sequence[RobotSearch],
-    frames: Sequence[Sequence[bytes]],
-    diagnosis: Diagnosis,
-    doubt: Sequence[RobotSearch],
-    drawn: Mapping[str, bytes],
-    concealed: str,
-    seed: int,
-    seconds: float,
-) -> str:
-    """Return the HTML of the demo's page, of what `figure_drawers` takes and more.
-
-    `frames` has a PNG of each step of each search; `drawn` all figures by name; `concealed` names the effect that the
-    simulated world concealed in the second recording, whose `diagnosis` this is.
-    """
-    run = {
-        "seed": str(seed),
+def page_html(run: DemoRun, drawn: Mapping[str, bytes], *, frames: Sequence[Sequence[bytes]], seconds: float) -> str:
+    """Return the HTML of the demo's page; `drawn` is from `figure_drawers`, `frames` has a PNG of each step."""
+    facts = {
+        "seed": str(run.seed),
         "time": f"{number_text(seconds, 0)} s",
         "recordings": "the two that ship with the package, both simulated by a world that shares no code with "
         "the models",
-        "version": f"probewise {calibration.sensor.version}",
+        "version": f"probewise {run.calibration.sensor.version}",
     }
     sections = [
-        _sensor_section(calibration, recording, prediction, drawn, seed),
-        _search_section(searches, started_alike, frames, drawn),
-        _diagnosis_section(diagnosis, drawn, concealed),
-        doubt_section(doubt, drawn),
-        Section("This run", (run,)),
+        _sensor_section(run, drawn),
+        _search_section(run, frames, drawn),
+        _diagnosis_section(run.diagnosis, drawn, run.concealed),
+        doubt_section(run.doubt, drawn),
+        Section("This run", (facts,)),
     ]
     caption = (
-        f"{sds_after_equal_readings_text(started_alike)} Left the naive model, right the SSF model. "
+        f"{sds_after_equal_readings_text(run.started_alike)} Left the naive model, right the SSF model. "
         "Blue: 50 circles drawn from the posterior; where errors of centre and radius add up, their edges spread over "
         "several sds. Copper: entropy of the readings that these circles predict; "
         "brighter places promise more information. Squares: readings by their brightness. Green: the next place. "
@@ -159,16 +143,15 @@ def page_html(
     )
     return page(
         "Modeling a sensor to improve its efficacy",
-        answer=summary_sentence(started_alike),
+        answer=summary_sentence(run.started_alike),
         key_figure=figure(drawn["equal_readings.png"], caption),
         sections=sections,
     )
 
 
-def _sensor_section(
-    calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], seed: int
-) -> Section:
-    shown = calibration_report.sections(calibration.sensor, recording, prediction, drawn, seed=seed)
+def _sensor_section(run: DemoRun, drawn: Mapping[str, bytes]) -> Section:
+    sensor = run.calibration.sensor
+    shown = calibration_report.sections(sensor, run.recording, run.prediction, drawn, seed=run.seed)
     arm = (
         "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the links, "
         "and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light from the "
@@ -188,16 +171,11 @@ def _sensor_section(
         Section("How the recording was taken", taken),
         *shown[:-1],
     )
-    return Section("The sensor", (_SENSOR, calibration_report.summary_sentence(calibration.sensor)), parts)
+    return Section("The sensor", (_SENSOR, calibration_report.summary_sentence(sensor)), parts)
 
 
-def _search_section(
-    searches: Sequence[RobotSearch],
-    started_alike: Sequence[RobotSearch],
-    frames: Sequence[Sequence[bytes]],
-    drawn: Mapping[str, bytes],
-) -> Section:
-    naive, ssf = searches
+def _search_section(run: DemoRun, frames: Sequence[Sequence[bytes]], drawn: Mapping[str, bytes]) -> Section:
+    searches = naive, ssf = run.searches
     introduction = (
         "A white circle lies somewhere on the black field. The naive robot believes that its sensor sees a point, "
         "black or white. The other predicts each reading with the calibrated SSF. Both choose their own readings and "
@@ -211,7 +189,7 @@ def _search_section(
         "paper's: posterior samples are reweighted after each reading. The paper's own, a new nested sampling "
         "run after each reading, is probewise explore --method paper."
     )
-    panels = (figure(drawn["first_three.png"], first), search_comparison_table(started_alike))
+    panels = (figure(drawn["first_three.png"], first), search_comparison_table(run.started_alike))
     texts = [
         "; ".join(
             f"{s.model} model, {count_with_noun(k := s.step_number_after(n), 'reading')}: "

@@ -61,7 +61,6 @@ _MOST_PLACES = 3
 _MOST_CREDIBLE = 6
 _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
-_AS_CALIBRATED = "The predicted mean is as calibrated: there is no repair to test on held-out readings."
 _NOISE_CAPTIONS = {
     "correlated_noise": "Correlation of residuals, by how many readings they lie apart.",
     "random_walk": "Correlation of residuals, by how many readings they lie apart: for a random walk it falls slowly.",
@@ -74,8 +73,8 @@ _NOISE_CAPTIONS = {
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Section]:
     """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `figure_drawers`."""
-    repair = diagnosis.repair
-    changed = f"Before and after: as calibrated, {repair.after_in_words}" if repair.changes_predictions else "The model"
+    repair, before = diagnosis.repair, f"as {diagnosis.apparatus.words.unrepaired}"
+    changed = f"Before and after: {before}, {repair.after_in_words}" if repair.changes_predictions else "The model"
     return [
         html.Section("What it could be", _explanation_elements(diagnosis)),
         html.Section("Where it shows", _place_elements(diagnosis, drawn)),
@@ -121,7 +120,7 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = f", blue squares: {diagnosis.repair.after_in_words}" if diagnosis.repair.changes_predictions else ""
     where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
-    circles = f"Orange circles: as calibrated{after}."
+    circles = f"Orange circles: as {diagnosis.apparatus.words.unrepaired}{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
     return f"Residuals, averaged in bins. {circles}{_walk_note(diagnosis)} {band}{where} {bars}"
 
@@ -173,7 +172,8 @@ def _rms_in_words(diagnosis: Diagnosis, weighting: str = "") -> str:
     before = f"{gain.rms_before:.3g} {unit}"
     if not diagnosis.repair.changes_predictions:
         return before
-    return f"{before} as calibrated, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
+    before += f" as {diagnosis.apparatus.words.unrepaired}"
+    return f"{before}, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
 
 
 def _formula_in_words(formula: Formula) -> str:
@@ -302,9 +302,9 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
         for place, seen in ranked_places_with_visibility(diagnosis, ResidualNoise.of_diagnosis(diagnosis))
     ]
     opening = (
-        "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
-        "first, then the most visible. Each dot is a reading; by chance alone, 95 % of the means would lie in the grey "
-        f"band.{_walk_note(diagnosis)}"
+        f"Residuals of the {diagnosis.apparatus.words.unrepaired} model against each covariate in which they are "
+        "significant: the headline's first, then the most visible. Each dot is a reading; by chance alone, 95 % of the "
+        f"means would lie in the grey band.{_walk_note(diagnosis)}"
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
     return (opening, *first, *((html.details(f"{len(rest)} more", *rest),) if rest else ()))
@@ -316,7 +316,7 @@ def before_and_after_caption(diagnosis: Diagnosis) -> str:
     which, colours = f"One {run}", "orange"
     if diagnosis.repair.changes_predictions:
         which = f"The {run} that changes most"
-        colours = f"orange as calibrated, blue {diagnosis.repair.after_in_words}"
+        colours = f"orange as {diagnosis.apparatus.words.unrepaired}, blue {diagnosis.repair.after_in_words}"
     walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
     shown = f"readings (black) and predictions ({colours}{walk})"
     return f"{which}: {shown}, and below the residuals with their running means."
@@ -337,7 +337,9 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str | Mapping[str, str]]:
     gain, changes = diagnosis.improvement, diagnosis.repair.changes_predictions
-    shown = diagnosis.apparatus.words.nothing_held_out if changes else _AS_CALIBRATED
+    words = diagnosis.apparatus.words
+    unchanged = f"The predicted mean is as {words.unrepaired}: there is no repair to test on held-out readings."
+    shown = words.nothing_held_out if changes else unchanged
     if "gain.svg" in drawn:
         caption = (
             f"Gain in log predictive density of each held-out {noun_of_held_out_part(diagnosis)}, both models "

@@ -206,8 +206,9 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> h
 def steps_table(run: Exploration, unit: str = "LEGO") -> html.Markup:
     """Build an exploration's table of steps: place, reading (in `unit`), widest posterior sd, bits so far."""
     reading = f"reading ({unit_after_number(unit)})" if unit else "reading"
+    without = "" if run.arm_error is None else " without the arm's own error"
     return html.table(
-        ("number", "at (mm)", reading, "widest sd (mm)", "information so far (bits)"),
+        ("number", "at (mm)", reading, f"widest sd{without} (mm)", "information so far (bits)"),
         (
             (
                 str(s.number),
@@ -254,10 +255,11 @@ def page_html(
     widths = {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()}
     bits = {name: np.array([s.bits for s in steps]) for name, steps in runs.items()}
     more = "" if trust == 1 else " Information about what the sensor model leaves out is included."
+    arm = "" if run.arm_error is None else " The arm's own error, which the result above counts, is not in it."
     how_fast = (
         html.figure(
             draw("widths", lambda: png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm))),
-            "Widest posterior sd of a length after each reading; dashed: the target precision.",
+            f"Widest posterior sd of a length after each reading; dashed: the target precision.{arm}",
         ),
         html.figure(
             draw("information", lambda: png(information_gained(bits))),

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, varies
 from probewise._words import unit_after_number
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, notes_in_words, page, table
@@ -18,7 +18,6 @@ from probewise.report.words import digits_of_range, typeset_numbers
 from probewise.systems import RunTable
 
 _MOST_INPUTS = 4
-_LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 
 def summary_sentence(fit: SystemFit) -> str:
@@ -33,7 +32,7 @@ def summary_sentence(fit: SystemFit) -> str:
 def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
     """List a fit's figures by file name: functions that draw recorded against predicted readings, and residuals.
 
-    Residuals are drawn against time, predicted reading, and up to four input columns of eight distinct values or more.
+    Residuals are drawn against time, predicted reading, and up to four input columns that vary.
     """
     residuals = [("fitted", fit.residuals)]
     unit = unit_after_number(fit.fitted.simulator.unit)
@@ -56,7 +55,7 @@ def _labelled_covariates(fit: SystemFit) -> list[tuple[str, FloatArray]]:
     time = f"{plan.time} ({simulator.time_unit})" if plan.has_varying_time else "row of the table"
     level = f"predicted {simulator.reading} ({unit_after_number(simulator.unit)})"
     inputs = {name: v for name, v in plan.covariates.items() if name not in (simulator.reading, simulator.noise.sd)}
-    varying = [pair for pair in inputs.items() if len(np.unique(pair[1][np.isfinite(pair[1])])) >= _LEAST_VALUES]
+    varying = [pair for pair in inputs.items() if varies(pair[1])]
     return [(time, plan.time_s), (level, fit.predicted), *varying[:_MOST_INPUTS]]
 
 

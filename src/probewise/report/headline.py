@@ -34,24 +34,37 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
         return [_too_few_readings_sentence(diagnosis, n)]
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
-            return ["These readings look unusual, but nothing that was tried explains them better than the model."]
+            said = ["These readings look unusual, but nothing that was tried explains them better than the model."]
         case "clean":
-            return [f"Nothing is missing: the model explains all {n} readings to within their noise."]
+            said = [f"Nothing is missing: the model explains all {n} readings to within their noise."]
         case "unknown":
-            return _unknown_versions(diagnosis)
+            said = _unknown_versions(diagnosis)
         case "cannot_tell":
             return _undecided_versions(diagnosis)
         case "noise":
-            return _left_out_versions(diagnosis, "The predicted mean is right, but the noise is not white:")
+            said = _left_out_versions(diagnosis, "The predicted mean is right, but the noise is not white:")
         case "named":
-            more = ["Something more is missing."] if diagnosis.improvement.p_value_after < ALARM else []
-            said = _left_out_versions(diagnosis, "The model leaves out")
-            beside = [f"{one[:-1]}; besides, {either}" for one in said[:1] for either in _open_beside_shared(diagnosis)]
-            complete = [" ".join([one, *more]) for one in said]
+            more = " Something more is missing." if diagnosis.improvement.p_value_after < ALARM else ""
+            *plain, last = _left_out_versions(diagnosis, "The model leaves out")
+            beside = [f"{plain[0][:-1]}; besides, {either}." for either in _open_beside_shared(diagnosis)]
             # With sizes first; a name before that more is missing.
-            told = _told_with_sizes(diagnosis)
-            versions = [*beside, *(" ".join([one, *more]) for one in told), *told]
-            return [*versions, *complete[:-1], *said[:-1], complete[-1], said[-1]]
+            listed = [(one, rest) for own in (_told_with_sizes(diagnosis), plain) for rest in (more, "") for one in own]
+            return [*beside, *_with_rivals(diagnosis, [*listed, (last, more), (last, "")])]
+    return _with_rivals(diagnosis, [(one, "") for one in said])
+
+
+def _with_rivals(diagnosis: Diagnosis, versions: Sequence[tuple[str, str]]) -> list[str]:
+    """Add the hypotheses that remain possible to the first sentence of each version; without them where none fits."""
+    stated = frozenset(diagnosis.judged.stated)
+    rivals = [
+        h.effects
+        for h in diagnosis.hypotheses
+        if h.probability > _RIVAL
+        and not (bool(stated) == bool(h.effects) and (stated <= {*h.effects} or stated >= {*h.effects}))
+    ]
+    live = [*_rival_versions(rivals), "others are possible"] if rivals else []
+    told = [f"; {'' if one.startswith('others') else 'less likely, '}{one}." for one in live]
+    return [f"{first[:-1]}{rival}{rest}" for rival in (*told, ".") for first, rest in versions]
 
 
 def _told_with_sizes(diagnosis: Diagnosis) -> list[str]:
@@ -112,20 +125,20 @@ def _covariate_with_article(diagnosis: Diagnosis, family: str) -> str:
 
 
 def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
-    if diagnosis.p_value >= ALARM or any(h.probability > _RIVAL and not h.effects for h in diagnosis.hypotheses):
-        leading = next((h.effects for h in diagnosis.hypotheses if h.effects), ())
+    rivals = [h.effects for h in diagnosis.hypotheses if h.probability > _RIVAL]
+    if diagnosis.p_value >= ALARM or () in rivals:
         plain = "These readings cannot tell whether anything is missing"
-        return [f"{plain}; if so, most likely {hypothesis_in_words(leading)}.", f"{plain}."]
-    rivals = [h.effects for h in diagnosis.hypotheses[:_MOST_RIVALS] if h.probability > _RIVAL]
+        likely = [names for names in rivals if names] or [h.effects for h in diagnosis.hypotheses if h.effects][:1]
+        most = "" if len(likely) > 1 else "most likely "
+        return [*(f"{plain}; if so, {most}{either}." for either in _rival_versions(likely)), f"{plain}."]
     said = []
     something = "Something is missing"
     if diagnosis.judged.shared:
         something = f"Beside {join_names(effects_in_words(diagnosis.judged.shared))}, something is missing"
     if len(rivals) > 1:
-        joined = [_join_rival_hypotheses(rivals[:n]) for n in (3, 2)]
-        said = [f"{something}: {either}; these readings cannot tell which." for either in joined]
-        said += [f"{something}: {either}." for either in joined] if diagnosis.judged.shared else []
-        said.append(f"{something}, most likely {_without_shared(rivals)[0]}; these readings cannot tell.")
+        every, *cut = _rival_versions(rivals)
+        said = [f"{something}: {every}; these readings cannot tell which.", f"{something}: {every}."]
+        said += [f"{something}: {some}." for some in cut]
     elif diagnosis.judged.withdrawn:
         leader = hypothesis_in_words(diagnosis.hypotheses[0].effects)
         said = [f"Something is missing; {leader} fits best, but predicts new readings worse."]
@@ -136,18 +149,19 @@ def _open_beside_shared(diagnosis: Diagnosis) -> list[str]:
     """List wordings of what may act beside named effects that all rivals share, the most complete first."""
     if not diagnosis.judged.leader:
         return []
-    rivals = [h.effects for h in diagnosis.judged.beside_shared[:_MOST_RIVALS] if h.probability > _RIVAL]
-    if len(rivals) < 2 or () in rivals:
+    rivals = [h.effects for h in diagnosis.judged.beside_shared if h.probability > _RIVAL]
+    return [] if len(rivals) < 2 or () in rivals else _rival_versions(rivals)
+
+
+def _rival_versions(rivals: Sequence[tuple[str, ...]]) -> list[str]:
+    """Name hypotheses, given their effects, as in "A, B or C", without the effects that all share.
+
+    First three at most, then fewer, of which the last stands for those that are not named.
+    """
+    if not rivals:
         return []
-    return [f"{_join_rival_hypotheses(rivals[:n])}." for n in (3, 2)]
-
-
-def _join_rival_hypotheses(rivals: Sequence[tuple[str, ...]]) -> str:
-    """Name hypotheses, given their effects, as in "A, B or C", without the effects that all share."""
-    return join_lists(_without_shared(rivals), "or")
-
-
-def _without_shared(rivals: Sequence[tuple[str, ...]]) -> list[str]:
-    """List hypotheses in words, given their effects, without the effects that all share."""
     shared = frozenset.intersection(*map(frozenset, rivals))
-    return [hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals]
+    names = [hypothesis_in_words([k for k in own if k not in shared] or own) for own in rivals]
+    counts = range(min(len(names), _MOST_RIVALS), 0, -1)
+    rest = {n: ["another" if len(names) - n == 1 else f"{len(names) - n} others"] * (n < len(names)) for n in counts}
+    return [join_lists([*names[:n], *rest[n]], "or") for n in counts]

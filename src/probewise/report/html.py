@@ -109,14 +109,14 @@ def draw_or_raise(name: str, drawer: Callable[[], bytes]) -> bytes:
     return drawer()
 
 
-def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
-    """Build a figure that embeds a PNG or an SVG, with `alt`, by default the caption; b"" could not be drawn."""
+def figure(image: bytes, caption: str) -> Markup:
+    """Build a figure that embeds a PNG or an SVG; b"" could not be drawn."""
     if not image:
         return element("figure", paragraph("This figure could not be drawn."), element("figcaption", caption))
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
     size = "" if kind == "svg+xml" else _least_width_attribute(image)
-    shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}"{size}>')
+    shown = Markup(f'<img src="{source}" alt="{html.escape(caption)}"{size}>')
     return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, distinct_values
 
 _STEPS = 24
 _MOST_STEPS = 60
@@ -24,7 +24,8 @@ class ResidualMeans:
 
     `at` is the covariate's mean in the bin, or 0, 1, 2 ... for a categorical covariate. `before` and `after` are the
     mean residuals of the calibrated and of the repaired model (`after` None: nothing was repaired). `chance` is half
-    the width of the 95 % band of chance, `size` the number of readings.
+    the width of the 95 % band of chance, `size` the number of readings. `by_value`: whether each bin is one value of a
+    covariate that has few.
     """
 
     at: FloatArray
@@ -32,6 +33,7 @@ class ResidualMeans:
     after: FloatArray | None
     chance: FloatArray
     size: IntArray
+    by_value: bool = False
 
     @property
     def largest_mean_in_sds(self) -> float:
@@ -61,8 +63,8 @@ def mean_residuals(
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]
-    by_value = [np.flatnonzero(values == value) for value in np.unique(values)] if names else None
-    groups = by_value if by_value is not None else _groups_in_steps(values, window)
+    few = [np.flatnonzero(values == value) for value in np.unique(values)] if names else rows_by_value(values)
+    groups = _groups_in_steps(values, window) if few is None else few
     rows = [ok[group] for group in groups]
     at = np.arange(len(groups), dtype=np.float64) if names else np.array([values[g].mean() for g in groups])
     sd_of_row = np.broadcast_to(np.asarray(sd, dtype=np.float64), before.shape)
@@ -77,7 +79,29 @@ def mean_residuals(
         None if after is None else np.array([after[r].mean() for r in rows]),
         1.96 * np.sqrt(variance),
         np.array([r.size for r in rows], dtype=np.int64),
+        few is not None,
     )
+
+
+def rows_by_value(values: FloatArray) -> list[IntArray] | None:
+    """List the rows of each value, ascending, of a covariate with up to 24 values of four rows or more on average.
+
+    None for any other: its rows are averaged with their neighbours.
+    """
+    distinct = distinct_values(values)
+    if distinct.size > _STEPS or values.size < _LEAST_ROWS * distinct.size:
+        return None
+    which = np.searchsorted(distinct, values, side="right") - 1
+    return [np.flatnonzero(which == k) for k in range(distinct.size)]
+
+
+def groups_of_neighbours(values: FloatArray, n: int) -> list[IntArray]:
+    """Split rows by ascending value into `n` groups of equal size, or fewer, as rows of one value stay together."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    starts = np.cumsum([part.size for part in np.array_split(order, n)])[:-1]
+    cuts = np.unique(np.searchsorted(ordered, ordered[np.minimum(starts, values.size - 1)]))
+    return [rows for rows in np.split(order, cuts) if rows.size]
 
 
 def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
@@ -101,7 +125,7 @@ def _groups_of_rows(values: FloatArray, rows: IntArray, least: int) -> list[IntA
     if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
         return groups
     # Where most readings share a few values, groups of equal size show more than bins of equal width.
-    return np.array_split(rows[np.argsort(there, kind="stable")], min(n, rows.size // least))
+    return [rows[group] for group in groups_of_neighbours(there, min(n, rows.size // least))]
 
 
 def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:

@@ -30,6 +30,7 @@ AROUND_MM = 40.0  # margin beyond the outermost reading, which the sensor still 
 BEAM_MM = 8.0
 """Width of a LEGO beam."""
 
+PATTERN_FRAME = "the pattern's origin"
 _MOST_PAGES = 400
 _ROUND_MM = 5.0
 _JIG_MM, _JIG_BASE_MM = 20.0, 40.0
@@ -49,9 +50,14 @@ class Sheet:
     cross_names: tuple[str, ...] = ()  # text beside each cross; empty: its number and place
     strokes_mm: tuple[FloatArray, ...] = ()  # further lines, (n, 2) each
     words: tuple[tuple[float, float, str], ...] = ()  # further texts, each with x and y of its left end before it
-    frame: str = "the pattern's origin"  # origin of x and y, in words
+    frame: str = PATTERN_FRAME  # origin of x and y, in words
     orientations_rad: tuple[float, ...] = ()  # of the sensor over the sheet
     skips_blank_pages: bool = False  # whether pages without a line or cross are left out
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether it is a pattern to be laid under the arm, where the recording's origin is."""
+        return self.frame == PATTERN_FRAME
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -102,11 +108,18 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
 
 
 def _has_drawing(sheet: Sheet, tile: Tile) -> bool:
-    """Return whether a stroke or a cross of the sheet lies inside the page, not only along its edge."""
-    crosses = [] if sheet.crosses_mm is None else [sheet.crosses_mm]
-    strokes = [np.linspace(a, b, 500) for stroke in sheet.strokes_mm for a, b in itertools.pairwise(stroke)]
-    points = np.concatenate([*crosses, *strokes])
+    """Return whether a line or a cross of the sheet lies inside the page, not only along its edge."""
+    points = points_of_lines(sheet)
     return bool(((points > tile.low_mm) & (points < tile.high_mm)).all(axis=1).any())
+
+
+def points_of_lines(sheet: Sheet) -> FloatArray:
+    """Return the crosses of a sheet and places half a millimetre apart along its lines, (n, 2)."""
+    lines = [*sheet.strokes_mm, *([] if sheet.outline_mm is None else [sheet.outline_mm])]
+    places = [
+        np.linspace(a, b, 2 + math.ceil(2 * math.dist(a, b))) for line in lines for a, b in itertools.pairwise(line)
+    ]
+    return np.concatenate([np.empty((0, 2)) if sheet.crosses_mm is None else sheet.crosses_mm, *places])
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:

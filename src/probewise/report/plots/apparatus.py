@@ -48,19 +48,16 @@ def arm_and_sensor(
     return axes
 
 
-def draw_arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | None = None) -> Axes:
+def draw_arm_lengths(geometry: Geometry) -> Axes:
     """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
 
-    The sensor reads `away_mm` from the base's axis, by default in the middle of its reach; ReachError if it cannot.
+    The sensor reads in the middle of its reach.
     """
-    nearest, farthest = geometry.radii_in_reach_mm()
-    away = (nearest + farthest) / 2 if away_mm is None else away_mm
+    away = sum(geometry.radii_in_reach_mm()) / 2
     middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
     place = np.array([geometry.axis_mm]) + away * np.array([[np.cos(middle), np.sin(middle)]])
     _, shoulder, elbow = geometry.angles_rad(place, geometry.read_height_mm)[0].tolist()
-    if not np.isfinite(shoulder):
-        raise ReachError("away_mm", away, f"{nearest:.0f} to {farthest:.0f} mm")
-    ax = canvas.axes_or_new(ax, size_in=(8.2, 5.4))
+    ax = canvas.axes_or_new(None, size_in=(8.2, 5.4))
     _draw_arm_from_side(ax, geometry, shoulder, elbow, named=False)
     _draw_lengths(ax, geometry, shoulder, elbow)
     joint, knee, *_ = _joints_from_side(geometry, shoulder, elbow)

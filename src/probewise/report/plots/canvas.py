@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
-from probewise.errors import ShapeError
 from probewise.report.words import typeset_numbers
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
@@ -91,23 +90,6 @@ def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, 
     (width, height), (left, bottom, right, top) = size_in, margins_in
     within = (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
     return new_figure(size_in).add_axes(within)
-
-
-def axes_or_grid(
-    axes: AxesGrid | None, n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any
-) -> AxesGrid:
-    """Return the axes given, shape (n_rows, n_columns), or those of a new figure.
-
-    Raises ShapeError if those given have another shape, ParameterError if something else than axes is given.
-    """
-    if axes is None:
-        return grid_of_axes(n_rows, n_columns, size_in=size_in, **options)
-    given = np.asarray(axes, dtype=np.object_)
-    if given.shape != (n_rows, n_columns):
-        raise ShapeError(f"axes have shape {given.shape}; allowed: ({n_rows}, {n_columns})")
-    for ax in given.flat:
-        require_kind("axes", ax, Axes, _AXES)
-    return given
 
 
 def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:

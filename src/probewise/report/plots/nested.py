@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
@@ -39,9 +40,7 @@ _DEPTH = "−ln X (X: prior mass left)"
 _FEW = 6  # parameters up to which a corner plot fits a page and has numbers
 
 
-def trace_plot(
-    result: NestedResult, *, parameters: Sequence[str] | None = None, axes: canvas.AxesGrid | None = None
-) -> canvas.AxesGrid:
+def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None) -> canvas.AxesGrid:
     """Draw each parameter of the dead points against the remaining log volume, darker where the posterior mass is.
 
     On top: posterior mass per nat of log volume. To the right of each trace: the parameter's marginal posterior, on a
@@ -52,13 +51,8 @@ def trace_plot(
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
     height = 1.5 if n <= _FEW else 1.15
-    axes = canvas.axes_or_grid(
-        axes,
-        n + 1,
-        2,
-        size_in=(8.6, 1.9 + height * n),
-        gridspec_kw={"width_ratios": (4.0, 1.0), "height_ratios": (1.2 if n <= _FEW else 1.6, *[1.0] * n)},
-    )
+    shares: dict[str, Any] = {"width_ratios": (4.0, 1.0), "height_ratios": (1.2 if n <= _FEW else 1.6, *[1.0] * n)}
+    axes = canvas.grid_of_axes(n + 1, 2, size_in=(8.6, 1.9 + height * n), **shares)
     depth, mass = -result.log_volume, _mass_per_nat(result)
     shown = _thinned_rows(result.n_dead)
     shown = shown[np.argsort(mass[shown], kind="stable")]
@@ -98,9 +92,7 @@ def trace_plot(
     return axes
 
 
-def corner_plot(
-    result: Posterior, *, parameters: Sequence[str] | None = None, axes: canvas.AxesGrid | None = None
-) -> canvas.AxesGrid:
+def corner_plot(result: Posterior, *, parameters: Sequence[str] | None = None) -> canvas.AxesGrid:
     """Draw the marginal posterior of each parameter, and 68 % and 95 % regions of each pair.
 
     Intervals of single parameters are central ones; up to six parameters, which fit the width of a page, also have
@@ -108,25 +100,17 @@ def corner_plot(
     weighted samples smoothed by a kernel that narrows as the effective sample size grows. `parameters` are the names to
     draw, in this order; default: all.
 
-    Return the axes, (n, n), of the n parameters drawn; None above the diagonal, where axes given are hidden.
-    ParameterError for an unknown name or none.
+    Return the axes, (n, n), of the n parameters drawn, None above the diagonal. ParameterError for an unknown name or
+    none.
     """
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
     side = (min(1.9, (canvas.PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
-    cells = (
-        _corner_axes(n, side)
-        if axes is None
-        else canvas.axes_or_grid(axes, n, n, size_in=(canvas.PAGE_IN, canvas.PAGE_IN))
-    )
-    drawn = np.full((n, n), None, dtype=np.object_)
+    sheet, drawn = _corner_axes(n, side)
     spans = [_axis_limits(result, i) for i in columns]
-    for (row, column), ax in np.ndenumerate(cells):
-        if column > row:
-            if ax is not None:
-                ax.set_axis_off()
+    for (row, column), ax in np.ndenumerate(drawn):
+        if ax is None:
             continue
-        drawn[row, column] = ax
         if row == column:
             _draw_marginal(ax, result, columns[row], spans[row], titled=n <= _FEW)
         else:
@@ -151,11 +135,10 @@ def corner_plot(
             Patch(facecolor=colour, label=f"{mass:.0%}".replace("%", " %"))
             for mass, colour in zip(_MASSES, reversed(_SHADES), strict=True)
         ]
-        cells[0, n - 1].legend(
+        sheet.legend(
             handles=patches,
             title=f"{_evidence_text(result)}\nposterior within",
             loc="upper right",
-            borderaxespad=0.0,
             frameon=False,
             fontsize=canvas.SMALL_PT,
             title_fontsize=canvas.SMALL_PT,
@@ -164,17 +147,16 @@ def corner_plot(
     return drawn
 
 
-def _corner_axes(n: int, side_in: float) -> canvas.AxesGrid:
-    """Open square axes on and below the diagonal, and at the upper right for the legend: (n, n), None elsewhere."""
+def _corner_axes(n: int, side_in: float) -> tuple[Figure, canvas.AxesGrid]:
+    """Open a figure with square axes on and below the diagonal: (n, n), None elsewhere."""
     width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
     sheet = canvas.new_figure((width, height))
     cells = np.full((n, n), None, dtype=np.object_)
-    for row, column in [*((i, j) for i in range(n) for j in range(i + 1)), (0, n - 1)]:
-        if cells[row, column] is None:
-            left, bottom = _LEFT_IN + column * side_in, _BOTTOM_IN + (n - 1 - row) * side_in
-            size = side_in - _GAP_IN
-            cells[row, column] = sheet.add_axes((left / width, bottom / height, size / width, size / height))
-    return cells
+    size = side_in - _GAP_IN
+    for row, column in zip(*np.tril_indices(n), strict=True):
+        left, bottom = _LEFT_IN + column * side_in, _BOTTOM_IN + (n - 1 - row) * side_in
+        cells[row, column] = sheet.add_axes((left / width, bottom / height, size / width, size / height))
+    return sheet, cells
 
 
 def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
@@ -211,13 +193,13 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def run_plot(result: NestedResult, *, axes: canvas.AxesGrid | None = None) -> canvas.AxesGrid:
+def run_plot(result: NestedResult) -> canvas.AxesGrid:
     """Draw the course of a run: likelihood, posterior mass, live points and cumulative evidence against log volume.
 
     Return the axes, (4, 1). The likelihood's axis leaves out values far below those that carry posterior mass.
     """
     require_kind("result", result, NestedResult, _A_RUN)
-    axes = canvas.axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
+    axes = canvas.grid_of_axes(4, 1, size_in=(7.0, 7.6), sharex=True)
     depth, mass = -result.log_volume, _mass_per_nat(result)
     likelihood, posterior, alive, evidence = axes[:, 0]
     peak = float(result.log_likelihood.max())

@@ -128,12 +128,7 @@ def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, 
 
 
 def audit_matrix(
-    names: Sequence[str],
-    detectability: Sequence[str],
-    cosines: FloatArray,
-    *,
-    alias: float,
-    axes: canvas.AxesGrid | None = None,
+    names: Sequence[str], detectability: Sequence[str], cosines: FloatArray, *, alias: float
 ) -> canvas.AxesGrid:
     """Draw the detectable share of each effect, and how well every other effect imitates it; fine effects come first.
 
@@ -145,8 +140,7 @@ def audit_matrix(
     order = sorted(range(len(names)), key=lambda k: (list(_DETECTABILITY).index(detectability[k]), -cosines[k, k]))
     labels = [spoken_name(names[k]) for k in order]
     at = np.arange(len(order))
-    opened = axes is None
-    axes = canvas.axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
+    axes = canvas.grid_of_axes(1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
     bars, matrix = axes[0]
     bars.barh(at, np.diag(cosines)[order], color=[_DETECTABILITY[detectability[k]] for k in order], height=0.7)
     bars.set_yticks(at, labels)
@@ -160,10 +154,7 @@ def audit_matrix(
         bars.set_yticks(at, [f"{name}  {k + 1}" for k, name in enumerate(labels)])
         labels = [str(k + 1) if k % 5 == 4 else "" for k in range(len(labels))]
     _draw_matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
-    if opened:
-        canvas.legend_below(axes)
-    else:
-        bars.legend(frameon=False, fontsize=canvas.SMALL_PT)
+    canvas.legend_below(axes)
     return axes
 
 

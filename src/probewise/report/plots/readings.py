@@ -20,12 +20,12 @@ from probewise.recordings import HalfPlane, Plan, Quadrant, Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots import canvas
 from probewise.report.plots.apparatus import draw_sensor_face
+from probewise.report.plots.residuals import draw_running_mean
 from probewise.report.words import decimals_to_show, number_text, number_unsigned_zero
 
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 _MOST_NAMED = 8  # tracks in the legend, panels, and names of single readings; with more there is none
 _SD_95 = 1.96
-_MOST_GROUPS, _LEAST_ROWS = 18, 5  # of neighbours in a running mean
 _ALONG_EDGE, _ALONG_SCAN = "distance from the edge{} (mm)", "place along the scan (mm)"
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
 _AROUND_MM = 16.0  # half width of the drawing of a quadrant
@@ -192,9 +192,7 @@ def _draw_quadrant(ax: Axes, pattern: Quadrant, reading: str) -> None:
     ax.set(xlim=(-_AROUND_MM, _AROUND_MM), ylim=(-_AROUND_MM, _AROUND_MM), aspect="equal")
 
 
-def predicted_and_recorded_by_scan(
-    recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: canvas.AxesGrid | None = None
-) -> canvas.AxesGrid:
+def predicted_and_recorded_by_scan(recording: Recording, mean: FloatArray, sd: FloatArray) -> canvas.AxesGrid:
     """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
 
     Each panel shows a scan over one pattern, the last one all single readings; of more than eight panels, evenly spaced
@@ -210,8 +208,7 @@ def predicted_and_recorded_by_scan(
     n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
     n_rows = -(-n_panels // n_columns)
     width = 4.4 * n_columns if n_columns < 3 else canvas.PAGE_IN
-    opened = axes is None
-    axes = canvas.axes_or_grid(axes, n_rows, n_columns, size_in=(width, 0.4 + 2.4 * n_rows), sharey=True)
+    axes = canvas.grid_of_axes(n_rows, n_columns, size_in=(width, 0.4 + 2.4 * n_rows), sharey=True)
     for ax, track in zip(axes.flat, shown, strict=False):
         _draw_track(ax, recording, track, mean, sd)
         canvas.label_axes(ax, x="", y="", title=track.label)
@@ -224,10 +221,7 @@ def predicted_and_recorded_by_scan(
         ax.set_ylabel(f"reading ({recording.plan.instrumentation.unit_after_number})")
     for ax in list(axes.flat)[max(n_panels - n_columns, 0) : len(shown)]:
         ax.set_xlabel(_along_label(shown))
-    if opened:
-        canvas.legend_below(axes)
-    else:
-        axes.flat[0].legend(frameon=False, fontsize=canvas.SMALL_PT)
+    canvas.legend_below(axes)
     return axes
 
 
@@ -273,21 +267,19 @@ def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArra
     return canvas.label_axes(ax, x="reading number", y="(recorded − predicted) / sd")
 
 
-def residuals_by_scan(
-    recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
-) -> canvas.AxesGrid:
+def residuals_by_scan(recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9) -> canvas.AxesGrid:
     """Draw the residuals of two models along the `most` scans that the repair changes most, a panel each, on one scale.
 
     Each usable residual, and running means; `before` and `after` are predictions, (n_points,). Return the axes,
-    (n_rows, columns).
+    (n_rows, 3).
     """
     require_recording(recording)
     tracks, _ = tracks_and_single_rows(recording.plan)
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in tracks]
     shown = [tracks[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
-    n_rows = max(-(-len(shown) // columns), 1)
-    size = (3.2 * columns, 1.75 * n_rows + 0.7)
-    axes = canvas.grid_of_axes(n_rows, columns, size_in=size, sharex=True, sharey=True)
+    n_rows = max(-(-len(shown) // 3), 1)
+    size = (canvas.PAGE_IN, 1.75 * n_rows + 0.7)
+    axes = canvas.grid_of_axes(n_rows, 3, size_in=size, sharex=True, sharey=True)
     models = {"calibrated model": (before, canvas.VERMILLION), "repaired model": (after, canvas.BLUE)}
     for ax, track in zip(axes.flat, shown, strict=False):
         ok = recording.usable[track.rows]
@@ -295,7 +287,7 @@ def residuals_by_scan(
         for predicted, colour in models.values():
             residual = recording.readings[rows] - predicted[rows]
             ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
-            ax.plot(*_running_mean_by_position(along, residual), color=colour, linewidth=1.8)
+            draw_running_mean(ax, along, residual, colour=colour, width=1.8)
         ax.axhline(0.0, color=canvas.BLACK, linewidth=0.7)
         scan = recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])]
         canvas.label_axes(ax, x="", y="", title=scan.replace("_", " "))
@@ -307,15 +299,3 @@ def residuals_by_scan(
     style = {"ncols": 2, "frameon": False, "fontsize": canvas.SMALL_PT}
     sheet.legend(lines, list(models), loc="outside upper left", **style)
     return axes
-
-
-def _running_mean_by_position(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean position and mean residual, (n_bins,) each, in up to 18 bins of equal width, none of them empty."""
-    if along.size == 0:
-        return along, residual
-    edges = np.linspace(along.min(), along.max(), min(_MOST_GROUPS, max(along.size // _LEAST_ROWS, 1)) + 1)
-    group = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, len(edges) - 2)
-    count = np.bincount(group, minlength=len(edges) - 1)
-    some = count > 0
-    middle = np.bincount(group, along, minlength=len(count))[some] / count[some]
-    return middle, np.bincount(group, residual, minlength=len(count))[some] / count[some]

@@ -17,10 +17,9 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots import canvas
-from probewise.report.residual_means import ResidualMeans
+from probewise.report.residual_means import ResidualMeans, groups_of_neighbours, rows_by_value
 from probewise.report.words import number_text, number_unsigned_zero
 
-BEFORE, AFTER = "as calibrated", "repaired"
 _CHANCE = "95 % by chance alone"
 _STYLES = ((canvas.VERMILLION, "o", "-"), (canvas.BLUE, "s", (0, (4, 1.5))))
 _CROWDED = 500  # number of dots from which they are paler
@@ -37,14 +36,26 @@ _SD_95 = 1.96
 _WHITE = "95 % of white noise"
 
 
-def running_mean_curve(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return means of x and of y, (n_groups,) each, over up to 20 groups of equal numbers of neighbours in x."""
+def draw_running_mean(
+    ax: Axes, x: FloatArray, y: FloatArray, *, colour: str, line: Any = "-", width: float = 1.6, name: str = ""
+) -> None:
+    """Draw means of y, (n,), over up to 20 groups of neighbours in x as a curve.
+
+    Where x has few values, no curve joins them: each has its mean with the 95 % interval of that. `name` is that of the
+    model, for the legend.
+    """
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]
-    if x.size == 0:
-        return x, y
-    groups = np.array_split(np.argsort(x, kind="stable"), max(1, min(_RUNNING_MEANS, len(x) // 4)))
-    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
+    few = rows_by_value(x)
+    groups = groups_of_neighbours(x, max(1, min(_RUNNING_MEANS, len(x) // 4))) if few is None else few
+    at, means = (np.array([values[g].mean() for g in groups]) for values in (x, y))
+    if few is None:
+        label = f"running mean, {name}" if name else None
+        ax.plot(at, means, color=colour, linewidth=width, linestyle=line, label=label)
+        return
+    half = [_SD_95 * float(y[g].std()) / np.sqrt(g.size) for g in groups]
+    label = f"mean with 95 %, {name}" if name else None
+    ax.errorbar(at, means, yerr=half, fmt="o", color=colour, markersize=4.5, linewidth=width, capsize=3, label=label)
 
 
 def mean_residuals_along(
@@ -55,14 +66,15 @@ def mean_residuals_along(
     each: tuple[FloatArray, FloatArray] | None = None,
     window: tuple[float, float] | None = None,
     names: Sequence[str] | None = None,
-    after: str = AFTER,
+    before: str = "as calibrated",
+    after: str = "repaired",
     ax: Axes | None = None,
 ) -> Axes:
     """Draw mean residuals against a covariate, the 95 % band of chance, and the interval that is significant.
 
     `each` holds covariate and residual of every reading, (n_points,) each, drawn as dots behind; `window` is the
     significant interval, shaded unless it takes up most of the axis; `names` are those of the values 0, 1, 2 ... of a
-    categorical covariate; `after` is the name of the later of the two models.
+    categorical covariate; `before` and `after` are the names of the two models.
     """
     ax = canvas.axes_or_panel(ax)
     if each is not None:
@@ -71,16 +83,16 @@ def mean_residuals_along(
     band: dict[str, Any] = {"color": canvas.GREY, "alpha": 0.3, "label": _CHANCE}
     if names:
         ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, **band)
-    elif len(means.at) == 1:
-        ax.errorbar(means.at, [0.0], yerr=means.chance, linewidth=8, **band)
+    elif len(means.at) == 1 or means.by_value:
+        ax.errorbar(means.at, np.zeros(len(means.at)), yerr=means.chance, fmt="none", elinewidth=8, **band)
     else:
         ax.fill_between(means.at, -means.chance, means.chance, linewidth=0, **band)
     aside = _ASIDE if names and means.after is not None else 0.0
     mean = "mean, " if each is not None else ""
-    drawn = ((means.before, canvas.VERMILLION, "o", BEFORE, -aside), (means.after, canvas.BLUE, "s", after, aside))
+    drawn = ((means.before, canvas.VERMILLION, "o", before, -aside), (means.after, canvas.BLUE, "s", after, aside))
     for values, colour, marker, name, step in drawn:
         if values is not None:
-            line = marker if names else f"{marker}-"
+            line = marker if means.by_value else f"{marker}-"
             ax.plot(means.at + step, values, line, color=colour, ms=4.5, lw=1.4, label=f"{mean}{name}")
     if names:
         _label_x_by_name(ax, names)
@@ -119,7 +131,7 @@ def scan_with_residuals(
         above.plot(along, predicted, label=f"predicted, {name}", **curve if joined else {**style, "markersize": 6.0})
         below.plot(along, readings - predicted, label=f"residual, {name}", **{**style, "alpha": 0.5})
         if joined:
-            below.plot(*running_mean_curve(along, readings - predicted), **curve)
+            draw_running_mean(below, along, readings - predicted, colour=colour, line=line)
     below.sharex(above)
     canvas.finish(above, x="", y=f"reading ({unit})")
     canvas.finish(below, x=label, y=f"residual ({unit})")
@@ -150,8 +162,7 @@ def residuals_against_covariates(
         ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
             _draw_dots(ax, at, residuals, colour, "")
-            curve = running_mean_curve(at, residuals)
-            ax.plot(*curve, color=colour, linewidth=2.0, linestyle=line, label=f"running mean, {name}")
+            draw_running_mean(ax, at, residuals, colour=colour, line=line, width=2.0, name=name)
         canvas.finish(ax, x=label, y=f"residual ({unit})")
     return axes
 
@@ -257,7 +268,7 @@ def spread_by_level(
     """
     ax = canvas.axes_or_panel(ax)
     ok = np.flatnonzero(np.isfinite(residuals) & np.isfinite(predicted))
-    parts = np.array_split(ok[np.argsort(predicted[ok], kind="stable")], max(1, min(_STEPS, len(ok) // 8)))
+    parts = [ok[group] for group in groups_of_neighbours(predicted[ok], max(1, min(_STEPS, len(ok) // 8)))]
     at = np.array([predicted[p].mean() for p in parts])
     rms = np.array([np.sqrt(np.mean(residuals[p] ** 2)) for p in parts])
     # The sd of an rms of n normal values is close to sd / sqrt(2 n).

@@ -40,7 +40,6 @@ def playing_field(
     cards_mm: Sequence[FloatArray] = (),
     title: str = "",
     utility_label: str = "entropy (bits)",
-    utility_max: float | None = None,
     lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
@@ -60,15 +59,13 @@ def playing_field(
         Reading of black and of white, for the brightness of the squares.
     cards_mm
         Corners of each card whose place and albedo are known, (4, 2).
-    utility_max
-        Upper end of the colour scale, for comparable figures; default: the map's maximum.
     lego_scale
         Whether to add the paper's coordinates, LEGO distance units, at the top.
     """
     ax = canvas.axes_or_new(ax, size_in=(8.2, 5.2))
     if np.isnan(utility).any():
         canvas.paint_out_of_reach(ax)
-    top = utility_max if utility_max is not None else float(np.nanmax(utility))
+    top = float(np.nanmax(utility))
     if top <= _NOTHING:
         top = 1.0  # a scale of nothing would have a power of ten
     image = canvas.draw_map(ax, utility, x_mm, y_mm, cmap=canvas.COPPER, vmin=0.0, vmax=top)

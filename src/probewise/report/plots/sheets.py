@@ -20,7 +20,16 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
-from probewise.report.sheets import BOTTOM_MM, LEFT_MM, OVERLAP_MM, PAPERS_MM, Sheet, Tile, tiles_of
+from probewise.report.sheets import (
+    BOTTOM_MM,
+    LEFT_MM,
+    OVERLAP_MM,
+    PAPERS_MM,
+    Sheet,
+    Tile,
+    points_of_lines,
+    tiles_of,
+)
 from probewise.scene import region_of
 
 _MM_PER_IN = 25.4
@@ -32,6 +41,20 @@ _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
 _THUMB_MM = 38.0
 _LETTER_MM, _COVER_LETTERS = 1.6, 66  # of small print; letters on a line beside an overview
 _CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
+
+_PRINT = ("Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",)
+_GLUE = (
+    "A sheet of several pages: cut each page along the corner marks at its left and lower side, and glue it, mark",
+    "on mark, on the strip that its neighbour prints beyond the marks. Each strip says which page lies there.",
+)
+_LAY = (
+    "Ticks in the margins show x = 0 and y = 0. All is seen from above, x to the right, y up (away from you).",
+    "Lay a sheet so that these ticks are where `arm record` says that the origin is, the sheet's x axis along",
+    "the field's. At orientation 0 the sensor's x' axis is along x, the photodiode on the side of y; it turns",
+    "anticlockwise.",
+)
+_PLACES = ("Numbers are mm from the origin that each sheet names, x to the right, y up.",)
+_LABEL_MM = 15.0  # half the length of the text on a glue strip
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
@@ -71,15 +94,10 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
     ax = _new_page_axes(page)
     top = page[1] - 18.0
     ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
-    instructions = (
-        "Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",
-        "A sheet of several pages: cut each page along the corner marks at its left and lower side, and glue it, mark",
-        "on mark, on the strip that its neighbour prints beyond the marks. Each strip says which page lies there.",
-        "Ticks in the margins show x = 0 and y = 0. All is seen from above, x to the right, y up (away from you).",
-        "Lay a sheet so that these ticks are where `arm record` says that the origin is, the sheet's x axis along",
-        "the field's. At orientation 0 the sensor's x' axis is along x, the photodiode on the side of y; it turns",
-        "anticlockwise.",
-    )
+    instructions = list(_PRINT)
+    if any(len(tiles) > 1 for (_, tiles), _ in batch):
+        instructions += _GLUE
+    instructions += _LAY if any(sheet.is_pattern for (sheet, _), _ in batch) else _PLACES
     for k, line in enumerate(instructions):
         ax.text(LEFT_MM, top - 8.0 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
     y = top - 8.0 - 4.6 * len(instructions) - 4.0
@@ -102,7 +120,7 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
         ax.text(x, y - 5.0, sheet.name, fontsize=11, fontweight="bold", va="baseline")
         for k, line in enumerate(lines):
             ax.text(x, y - 10.5 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
-        y -= _THUMB_MM + 6.0
+        y -= max(_THUMB_MM, 10.5 + 4.6 * len(lines)) + 6.0
     _draw_ruler(ax, LEFT_MM, 11.0)
     ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
     return ax.figure  # type: ignore[return-value]
@@ -172,21 +190,26 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
         LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
     )
     ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
-    _label_glue_strips(ax, tiles, tile, first)
+    _label_glue_strips(ax, sheet, tiles, tile, first)
     return ax.figure  # type: ignore[return-value]
 
 
-def _label_glue_strips(ax: Axes, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
-    """Print on each glue strip the number of the page to be glued on it."""
+def _label_glue_strips(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
+    """Print on each glue strip, where the sheet's lines leave room, the number of the page to be glued on it."""
     number = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
     (left, bottom), (right, top) = tile.on_page_mm(np.array([tile.low_mm, tile.high_mm])).tolist()
-    upright = ((tile.column + 1, tile.row), (right + OVERLAP_MM / 2, (bottom + top) / 2), 90.0)
-    level = ((tile.column, tile.row + 1), ((left + right) / 2, top + OVERLAP_MM / 2), 0.0)
+    upright = ((tile.column + 1, tile.row), (right + OVERLAP_MM / 2, bottom), (right + OVERLAP_MM / 2, top))
+    level = ((tile.column, tile.row + 1), (left, top + OVERLAP_MM / 2), (right, top + OVERLAP_MM / 2))
     white = {"boxstyle": "square,pad=0.2", "fc": "white", "ec": "none"}  # legible on black
     text: dict[str, Any] = {"fontsize": _SMALL, "ha": "center", "va": "center", "bbox": white, "zorder": 5}
-    for neighbour, (x, y), rotation in (upright, level):
+    lines = tile.on_page_mm(points_of_lines(sheet))
+    for neighbour, start, end in (upright, level):
         if neighbour in number:
-            ax.text(x, y, f"page {number[neighbour]} lies here", rotation=rotation, **text)
+            turned = start[0] == end[0]
+            half = np.array([OVERLAP_MM / 2, _LABEL_MM] if turned else [_LABEL_MM, OVERLAP_MM / 2])
+            places = [np.array(start) + share * np.subtract(end, start) for share in (0.5, 0.3, 0.7, 0.15, 0.85)]
+            x, y = min(places, key=lambda place: int((np.abs(lines - place) < half).all(axis=1).sum()))
+            ax.text(x, y, f"page {number[neighbour]} lies here", rotation=90.0 if turned else 0.0, **text)
 
 
 def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:

@@ -54,8 +54,6 @@ def ssf_by_n_gaussians(
     fields: Mapping[int, SSFField],
     log_z: Mapping[int, float],
     log_z_error: Mapping[int, float],
-    *,
-    axes: canvas.AxesGrid | None = None,
 ) -> canvas.AxesGrid:
     """Draw the mean SSF of each number of Gaussians with its log evidence and standard error (paper, figure 6).
 
@@ -64,7 +62,7 @@ def ssf_by_n_gaussians(
     orders = sorted(fields)
     n_columns = min(len(orders), 2)
     n_rows = -(-len(orders) // n_columns)
-    axes = canvas.axes_or_grid(axes, n_rows, n_columns, size_in=(4.6 * n_columns, 3.9 * n_rows))
+    axes = canvas.grid_of_axes(n_rows, n_columns, size_in=(4.6 * n_columns, 3.9 * n_rows))
     best = max(orders, key=lambda n: log_z[n])
     drawn = list(axes.flat)[: len(orders)]
     for ax, n in zip(drawn, orders, strict=True):

@@ -423,9 +423,9 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
 READING_WORDS = {
     "offset_step": "a jump of all readings",
     "gain_step": "a jump of the readings' gain",
-    "offset_per_run": "an offset of its own in each run",
-    "gain_per_run": "a gain of its own in each run",
-    "delay": "readings that come late",
+    "offset_per_run": "an offset that differs from run to run",
+    "gain_per_run": "a gain that differs from run to run",
+    "delay": "a delay of the readings",
     "settling": "readings that settle at the start of each run",
     "interference": "a wave in the readings",
     "sensitivity": "readings that depend on {0}",

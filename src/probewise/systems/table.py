@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -81,6 +82,9 @@ class RunTable:
                 if note:
                     object.__setattr__(self, "notes", (*self.notes, note))
             columns[name] = _checked_column(name, values, are_names=name == self.run)
+            if name == self.run and _holds_decimals(values):
+                note = f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
+                object.__setattr__(self, "notes", (*self.notes, note))
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -290,6 +294,12 @@ def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     return texts
 
 
+def _holds_decimals(values: Any) -> bool:
+    """Return whether values are floating-point numbers, some of them not whole."""
+    array = np.asarray(values)
+    return array.dtype.kind == "f" and bool(np.any(np.isfinite(array) & (array != np.floor(array))))
+
+
 def _with_missing(values: Any) -> Any:
     """Return a column with the masked values of a masked array missing, NaN or ""."""
     if not isinstance(values, np.ma.MaskedArray):
@@ -336,6 +346,11 @@ def read_run_table(
 def run_table_csv(table: RunTable) -> str:
     """Return a table as CSV text, with numbers in full precision."""
     return csv_text({name: [_text(value) for value in values.tolist()] for name, values in table.columns.items()})
+
+
+def table_digest(table: RunTable) -> str:
+    """Return the fingerprint of a table, by which a fitted simulator knows its recording."""
+    return hashlib.sha256(run_table_csv(table).encode()).hexdigest()[:16]
 
 
 def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:

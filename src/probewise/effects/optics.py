@@ -19,6 +19,7 @@ from probewise.effects.effect import (
     LightEffect,
     Say,
     Where,
+    in_words,
     light_effect,
     one_of,
     scans_in_words,
@@ -57,9 +58,7 @@ def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
         {"offset_mm": "mm"},
         0.003 * of.length_mm,
         lambda value, theta, plan: _with_shifted_patterns(value, theta * np.ones(len(plan)), plan),
-        lambda mean, sd: (
-            f"the printed edges lie {value_with_sd(mean[0], sd[0])} mm from their described place, in all scans"
-        ),
+        in_words("the printed edges lie {0} mm from their described place, in all scans"),
     )
 
 
@@ -73,10 +72,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
             {"offset_mm": "mm"},
             0.003 * of.length_mm,
             lambda value, theta, plan: _with_shifted_patterns(value, theta * scan_indicator(plan, (name,)), plan),
-            lambda mean, sd: (
-                f"in {scans_in_words((name,))} the pattern lies {value_with_sd(mean[0], sd[0])} mm from where it lies "
-                "in the others"
-            ),
+            in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others"),
             where=Where(scans=(name,)),
         )
 
@@ -244,6 +240,9 @@ def _patch(kind: LightEffect, of: Extent, size: str, unit: str, typical: float, 
     return one_of([on_line(line) for line in distinct_scan_lines(of.plan)])
 
 
+_place_in_words = in_words("within {3} mm of the place ({1}, {2}) mm")
+
+
 @light_effect("glint", Stage.OFFSET, "a glint at one place", ("place",))
 def glint(kind: LightEffect, of: Extent) -> Effect | None:
     """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y)."""
@@ -253,12 +252,8 @@ def glint(kind: LightEffect, of: Extent) -> Effect | None:
         return value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
-            f"{value_with_sd(mean[2], sd[2])}) mm the readings are "
-            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} too {'high' if mean[0] > 0 else 'low'}, over black "
-            "and white alike: a reflection"
-        )
+        size = f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} too {'high' if mean[0] > 0 else 'low'}"
+        return _place_in_words(mean, sd) + f" the readings are {size}, over black and white alike: a reflection"
 
     return _patch(kind, of, "amp", "reading", 0.02 * of.span, act, says)
 
@@ -273,17 +268,12 @@ def albedo_gradient(kind: LightEffect, of: Extent) -> Effect:
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return _with_changed_regions(value, plan, lambda region: RegionWithGradient(region, theta, of.origin))
 
-    return kind.linear(
-        of,
-        {"per_mm_x": "1/mm", "per_mm_y": "1/mm"},
-        0.02 / of.length_mm,
-        act,
-        lambda mean, sd: (
-            f"the signal over white changes by {value_with_sd(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
-            f"{value_with_sd(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
-            "its illumination is uneven"
-        ),
+    says = (
+        "the signal over white changes by {0} % per 100 mm along X and by {1} % per 100 mm along Y, that over black "
+        "does not: the paper or its illumination is uneven"
     )
+    units = {"per_mm_x": "1/mm", "per_mm_y": "1/mm"}
+    return kind.linear(of, units, 0.02 / of.length_mm, act, in_words(says, factors=(1e4, 1e4)))
 
 
 @light_effect("albedo_patch", Stage.SCENE, "a stain on the paper", ("place",))
@@ -294,11 +284,8 @@ def albedo_patch(kind: LightEffect, of: Extent) -> Effect | None:
         return _with_changed_regions(value, plan, lambda region: RegionWithPatch(region, theta))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
-            f"{value_with_sd(mean[2], sd[2])}) mm every pattern is {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
-            f"{'whiter' if mean[0] > 0 else 'darker'} than it should be: a stain or a worn area"
-        )
+        size = f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'whiter' if mean[0] > 0 else 'darker'}"
+        return _place_in_words(mean, sd) + f" every pattern is {size} than it should be: a stain or a worn area"
 
     return _patch(kind, of, "albedo", "1", 0.05, act, says)
 
@@ -492,7 +479,7 @@ def edge_blur(kind: LightEffect, of: Extent) -> Effect:
         {"sd_mm": "mm"},
         0.02 * of.length_mm,
         act,
-        lambda mean, sd: f"the printed edges are soft: blurred by {value_with_sd(mean[0], sd[0])} mm (sd)",
+        in_words("the printed edges are soft: blurred by {0} mm (sd)"),
         positive=True,
         kind=_BlurEffect,
     )
@@ -536,9 +523,9 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
         ("1", "mm"),
         act,
         single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5)),
-        lambda mean, sd: (
-            f"a wide halo around the sensor's spot, of sd {value_with_sd(mean[1], sd[1])} mm, contributes "
-            f"{value_with_sd(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
+        in_words(
+            "a wide halo around the sensor's spot, of sd {1} mm, contributes {0} % of the light: the lens scatters it",
+            factors=(100,),
         ),
     )
 
@@ -618,19 +605,18 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
         share = np.clip(theta[:, :1, None], 0.0, 1.0)
         turn = plan.orientation_rad[None, :, None]
         dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
+        shapes = {"var_u": value.var_u, "var_v": value.var_v, "cov_uv": value.cov_uv}
 
         def doubled(first: FloatArray, second: FloatArray) -> FloatArray:
             shape = np.broadcast_shapes(first.shape, second.shape)
             return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)
 
-        return Footprint(
+        return replace(
+            value,
             weight=doubled(value.weight * (1 - share), value.weight * share),
             u_mm=doubled(value.u_mm, value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy),
             v_mm=doubled(value.v_mm, value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy),
-            var_u=doubled(value.var_u, value.var_u),
-            var_v=doubled(value.var_v, value.var_v),
-            cov_uv=doubled(value.cov_uv, value.cov_uv),
-            brightness=value.brightness,
+            **{name: doubled(own, own) for name, own in shapes.items()},
         )
 
     angles, reach = 2 * math.pi * np.arange(_ANGLES) / _ANGLES, Uniform(-farthest_mm, farthest_mm)
@@ -641,8 +627,9 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
         ("1", "mm", "mm"),
         act,
         single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()),
-        lambda mean, sd: (
-            f"a second spot, {value_with_sd(mean[1], sd[1])} mm along X and {value_with_sd(mean[2], sd[2])} mm along Y "
-            f"from the first, contributes {value_with_sd(mean[0], sd[0], factor=100)} % of the light: a reflection"
+        in_words(
+            "a second spot, {1} mm along X and {2} mm along Y from the first, contributes {0} % of the light: a "
+            "reflection",
+            factors=(100,),
         ),
     )

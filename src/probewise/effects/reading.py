@@ -11,6 +11,7 @@ from probewise.effects.effect import (
     Effect,
     LightEffect,
     WaveEffect,
+    in_words,
     light_effect,
     sine_and_cosine_entries,
     single_column_bank,
@@ -166,15 +167,17 @@ def ambient_gradient(kind: LightEffect, of: Extent) -> Effect | None:
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from the origin."""
     if not (varies(of.plan.x_mm) or varies(of.plan.y_mm)):
         return None
-    at, unit = of.origin, of.reading_unit
+    at = of.origin
     return kind.linear(
         of,
         {"per_mm_x": "reading/mm", "per_mm_y": "reading/mm"},
         0.01 * of.span / of.length_mm,
         lambda value, theta, plan: value + theta[:, :1] * (plan.x_mm - at.x_mm) + theta[:, 1:2] * (plan.y_mm - at.y_mm),
-        lambda mean, sd: (
-            f"the reading changes by {value_with_sd(mean[0], sd[0], unit, factor=100)} per 100 mm along X and by "
-            f"{value_with_sd(mean[1], sd[1], unit, factor=100)} per 100 mm along Y, {_ALIKE}: stray light from one side"
+        in_words(
+            f"the reading changes by {{0}} per 100 mm along X and by {{1}} per 100 mm along Y, {_ALIKE}: stray light "
+            "from one side",
+            *(of.reading_unit, of.reading_unit),
+            factors=(100, 100),
         ),
     )
 
@@ -282,10 +285,7 @@ def lag(kind: LightEffect, of: Extent) -> Effect:
         ("s",),
         act,
         single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7)),
-        lambda mean, sd: (
-            f"each reading keeps part of the previous one, with a time constant of {value_with_sd(mean[0], sd[0])} s: "
-            "the electronics lag"
-        ),
+        in_words("each reading keeps part of the previous one, with a time constant of {0} s: the electronics lag"),
         amplitudes=(),
         absent={0: 0.0},
     )

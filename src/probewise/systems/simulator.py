@@ -338,17 +338,15 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
             raise ParameterError(name, value, allowed)
         return value
 
-    def text_of(name: str) -> str:
-        return str(given(name, f'a text: {name} = "..."', lambda v: isinstance(v, str) and v != ""))
+    def text_of(name: str, default: str | None = None) -> str:
+        return str(given(name, f'a text: {name} = "..."', lambda v: isinstance(v, str) and v != "", default))
 
     def function(name: str) -> Any:
         return raising_exceptions(given(name, f"a function: def {name}(...)", callable))
 
     def texts(name: str) -> tuple[str, ...]:
         allowed = f'a list of names: {name} = ["..."]'
-        return tuple(
-            given(name, allowed, lambda v: not isinstance(v, str) and all(isinstance(each, str) for each in v), ())
-        )
+        return tuple(given(name, allowed, lambda v: not isinstance(v, str) and all(isinstance(n, str) for n in v), ()))
 
     def mapping(name: str, allowed: str, default: object = None) -> Any:
         return given(name, allowed, lambda v: isinstance(v, Mapping), default)
@@ -356,22 +354,18 @@ def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulato
     parameters = mapping("parameters", 'a dict from names to priors: {"gain": (0, 10)}')
     law = None
     if "rates" in said or "states" in said:
-        law = Law(
-            mapping("states", 'a dict from states to where they start: {"temp_c": 20.0}'),
-            function("rates"),
-            function("observe") if "observe" in said else None,
-            said.get("hold", "previous"),
-            said.get("max_step_s"),
-        )
+        states = mapping("states", 'a dict from states to where they start: {"temp_c": 20.0}')
+        rates, observe = function("rates"), function("observe") if "observe" in said else None
+        law = Law(states, rates, observe, said.get("hold", "previous"), said.get("max_step_s"))
     return Simulator(
         reading=text_of("reading"),
         unit=text_of("unit"),
         parameters=parameters,
         simulate=function("simulate") if "simulate" in said else None,
         law=law,
-        time=text_of("time") if said.get("time") is not None else None,
-        time_unit=text_of("time_unit") if "time_unit" in said else "s",
-        run=text_of("run") if said.get("run") is not None else None,
+        time=None if said.get("time") is None else text_of("time"),
+        time_unit=text_of("time_unit", "s"),
+        run=None if said.get("run") is None else text_of("run"),
         per_run=texts("per_run"),
         controls=texts("controls"),
         noise=said.get("noise", {}),

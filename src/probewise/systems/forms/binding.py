@@ -125,14 +125,6 @@ class _StoredReferenceFit(ReferenceFit):
     def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
 
-    def typical_amplitude(
-        self, stage: Stage, act: Act, entries: FloatArray, guess: float, amplitudes: tuple[int, ...] = (0,)
-    ) -> float | None:
-        return guess
-
-    def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        return float(tried[0]), float(tried[-1])
-
 
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:
     """Return the part of a reference fit from which its forms can be bound again."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -12,7 +12,17 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.effect import Act, Effect, Fixed, Say, StepEffect, VariantMasks, WaveEffect, thinned
+from probewise.effects.effect import (
+    Act,
+    Effect,
+    Fixed,
+    Say,
+    StepEffect,
+    VariantMasks,
+    WaveEffect,
+    in_words,
+    thinned,
+)
 from probewise.priors import HeavyTailedPrior, Uniform
 from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.table import RunTable
@@ -33,7 +43,10 @@ Form: TypeAlias = Effect
 StepForm: TypeAlias = StepEffect
 WaveForm: TypeAlias = WaveEffect
 
-__all__ = ["AMPLITUDE", "POSITIVE", "Act", "ActInTime", "BlockForm", "Fixed", "Form", "Say", "StepForm", "WaveForm"]
+__all__ = [
+    *("AMPLITUDE", "POSITIVE", "Act", "ActInTime", "BlockForm", "Fixed", "Form", "Say", "StepForm", "WaveForm"),
+    "in_words",
+]
 
 
 @dataclass(frozen=True)
@@ -64,19 +77,12 @@ class BlockForm(StepForm):
         thinner = replace(self.change_points, at=thinned(np.array(self.change_points.at), self.most))
         return [*((begin, None) for begin in self.change_points.intervals), *combinations(thinner.intervals, 2)]
 
-    @cached_property
-    def _variants(self) -> tuple[Form, ...]:
-        n_steps, out = len(self.change_points.intervals), []
-        _, name_of_end, name_of_begin = self.marginals
-        odds = max(len(self._ends) - n_steps, 1) / (_BLOCKS * n_steps)
-        never = replace(self.never, odds=odds)
-        for begin, end in self._ends:
-            last: Uniform = never if end is None else Uniform(*end)
-            entries = self.entries.copy()
-            entries[:, :, 1:] = [0.5 * (last.low + last.high), 0.5 * sum(begin)]
-            priors = {**self.marginals, name_of_end: last, name_of_begin: Uniform(*begin)}
-            out.append(replace(self, parameters=priors, entries=entries))
-        return tuple(out)
+    @property
+    def places(self) -> Sequence[tuple[Uniform, ...]]:
+        """The priors of end and begin in each variant."""
+        n_steps = len(self.change_points.intervals)
+        never = replace(self.never, odds=max(len(self._ends) - n_steps, 1) / (_BLOCKS * n_steps))
+        return [(never if end is None else Uniform(*end), Uniform(*begin)) for begin, end in self._ends]
 
     def with_fewer_variants(self) -> Self:
         """Return the form with fewer begins and ends."""
@@ -91,15 +97,16 @@ class BlockForm(StepForm):
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Redraw end and begin: a variant by `weights`, (n_variants,), each uniform within its interval."""
+        low, high = np.array([[(prior.low, prior.high) for prior in last] for last in self.places]).transpose(2, 0, 1)
         chosen = rng.choice(len(weights), len(theta), p=weights)
-        priors = [self._variants[k].prior for k in chosen]
-        drawn = [prior.from_unit_cube(rng.random((1, 3)))[0, 1:] for prior in priors]
+        drawn = low[chosen] + (high - low)[chosen] * rng.random((len(theta), 3))[:, 1:]
         return np.concatenate([theta[:, :1], drawn], axis=1)
 
 
-def says_value(text: str, unit: str = "") -> Say:
-    """Return the sentence of an effect of one parameter: a text with {value} in place of the value with its sd."""
-    return lambda mean, sd: text.replace("{value}", value_with_sd(mean[0], sd[0], unit))
+def says_of_limit(what: str, least_ceiling: float, unit: str = "") -> Say:
+    """Return the sentence of a quantity with a level: a ceiling above `least_ceiling`, otherwise a floor."""
+    ceiling, floor = (in_words(f"{what} {way} no further than {{0}}", unit) for way in ("rises", "falls"))
+    return lambda mean, sd: (ceiling if mean[0] > least_ceiling else floor)(mean, sd)
 
 
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:

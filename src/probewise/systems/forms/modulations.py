@@ -109,19 +109,12 @@ def frequency_prior(frequencies: FloatArray) -> LogUniform:
     return LogUniform(float(0.9 * frequencies[0]), float(frequencies[-1] * 1.02))
 
 
-@dataclass(frozen=True, eq=False)
-class Peaks:
-    """Frequencies `at` (n_peaks,) where residuals have peaks, rising; `highest` is the end of the range looked at."""
-
-    at: FloatArray
-    highest: float
-
-
-def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
+def residual_peaks(about: ReferenceFit, tried: FloatArray) -> tuple[FloatArray, float]:
     """Find the frequencies in time at which the residuals of a fit have peaks, where those `tried` are too sparse.
 
     Clustered times tell waves apart up to one in two median gaps, far too many to try each. A fast Fourier transform
     finds the eight highest peaks in each of 64 bands, of one width in log frequency, so that slow noise hides no wave.
+    Returns the frequencies, (n_peaks,), rising, and the highest one that was looked at.
     """
     times, groups = _times_of_readings(about)
     residuals, reach = _weighted_residuals(about), float(np.ptp(times))
@@ -129,7 +122,7 @@ def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
     highest = max(1 / (_BINS_PER_WAVE * bin_width), float(tried[-1]))
     is_sparse = float(np.diff(tried).max()) * reach > 0.6
     if len(residuals) < len(times) or (not is_sparse and highest <= 1.001 * tried[-1]):
-        return Peaks(np.zeros(0), float(tried[-1]))
+        return np.zeros(0), float(tried[-1])
     bins = np.rint((times - times.min()) / bin_width).astype(np.int64)
     n_bins = 1 << int(2 * (bins.max() + 1) - 1).bit_length()  # twice the range: steps of half the resolution
     power = np.abs(np.fft.rfft(np.bincount(bins, residuals, n_bins))) ** 2
@@ -141,7 +134,7 @@ def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
     falling = np.flatnonzero(is_peak)
     falling = falling[np.lexsort((-power[falling], band[falling]))]
     rank = np.arange(len(falling)) - np.searchsorted(band[falling], band[falling])
-    return Peaks(np.sort(frequencies[falling[rank < _PEAKS_OF_A_BAND]]), highest)
+    return np.sort(frequencies[falling[rank < _PEAKS_OF_A_BAND]]), highest
 
 
 def _times_of_readings(about: ReferenceFit) -> tuple[FloatArray, list[Any]]:
@@ -303,7 +296,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
     """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from `time_origin`."""
     table, time_unit = about.table, about.time_unit
     origin, frequencies = time_origin(table), trial_frequencies_in_time(about)
-    peaks = residual_peaks(about, frequencies)
+    suggested, highest = residual_peaks(about, frequencies)
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
@@ -311,11 +304,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
     return Modulation(
         at_rows,
         lambda what, unit, **own: WaveForm(
-            parameters={
-                "a": POSITIVE,
-                "hz": frequency_prior(np.append(frequencies, peaks.highest)),
-                "phase": PHASE,
-            },
+            parameters={"a": POSITIVE, "hz": frequency_prior(np.append(frequencies, highest)), "phase": PHASE},
             units=(unit, f"1/{time_unit}", "rad"),
             covariates=("time",),
             entries=sine_and_cosine_entries(1.0, frequencies),
@@ -324,7 +313,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
                 f"{period_with_sd(mean[1], sd[1], time_unit)}"
             ),
             counted_from=origin_in_words(table.time, origin, time_unit),
-            suggested=peaks.at,
+            suggested=suggested,
             **own,
         ),
     )

@@ -14,7 +14,16 @@ from probewise.effects import name_without_copy_suffix
 from probewise.effects.effect import PHASE, sine_and_cosine_entries, single_column_bank
 from probewise.priors import Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Fixed, Form, WaveForm, period_with_sd
+from probewise.systems.forms.form import (
+    AMPLITUDE,
+    POSITIVE,
+    Fixed,
+    Form,
+    WaveForm,
+    in_words,
+    period_with_sd,
+    says_of_limit,
+)
 from probewise.systems.forms.modulations import (
     frequency_prior,
     max_n_trial_frequencies,
@@ -98,11 +107,7 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
     tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
     along = f"state:{state}", "level"
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size = value_with_sd(mean[0], sd[0], "")
-        return f"dry friction slows {state} by {size} per {about.time_unit}, and holds it at rest"
-
+    says = in_words(f"dry friction slows {state} by {{0}} per {about.time_unit}, and holds it at rest")
     return about.sized(f"friction:{state}", Stage.RATE, "a", unit, along, act, tried, says)
 
 
@@ -144,21 +149,23 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
         return value.with_limit(ceiling).with_limit(floor)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if mean[0] > ends.least_ceiling else "falls"
         taken = (
-            f"; {other} takes up {value_with_sd(mean[k], sd[k], '')} of the rest"
+            f"; {other} takes up {value_with_sd(mean[k], sd[k])} of the rest"
             for k, other in enumerate(others, 1)
             if mean[k] > _NO_SHARE
         )
-        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}{''.join(taken)}"
+        return says_of_limit(state, ends.least_ceiling)(mean, sd) + "".join(taken)
 
     def variant(taking: str | None) -> Form:
         shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
         tried = [0.5 * (other == taking) for other in others]
-        priors = {"level": ends.prior, **{f"share[{other}]": prior for other, prior in shares.items()}}
+        priors = {
+            "level": ends.prior,
+            **{f"share[{other}]": prior for other, prior in shares.items()},
+        }
         units, bank = (state, *("1" for _ in others)), single_column_bank(ends.trial_levels, *tried)
         own = (f"limit:{state}", Stage.RATE, priors, units, (f"state:{state}", "level"), act, bank, says)
-        return Form(*own, amplitudes=(), absent={0: ends.level_out_of_reach})
+        return Form(*own, amplitudes=(), absent=ends.absent)
 
     alone = variant(None)
     if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:

@@ -32,7 +32,6 @@ _WILD = 4.0  # times the range of the other values, from which some are wild
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
-_TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
 _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
 N_SIZES = 9  # in the bank of a form of one size
@@ -119,9 +118,9 @@ class ClippingLevels:
         return Uniform(self.low, self.high)
 
     @property
-    def level_out_of_reach(self) -> float:
-        """A level far above all values: a ceiling without effect."""
-        return self.top + (self.high - self.low)
+    def absent(self) -> dict[int, float]:
+        """A level far above all values, a ceiling without effect, by the index of the parameter."""
+        return {0: self.top + (self.high - self.low)}
 
 
 def clipped(values: FloatArray, level: FloatArray, least_ceiling: float) -> FloatArray:
@@ -320,45 +319,39 @@ class ReferenceFit:
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
-    def typical_amplitude(
-        self, stage: Stage, act: Act, entries: FloatArray, guess: float, amplitudes: tuple[int, ...] = (0,)
-    ) -> float | None:
-        """Find the amplitude at which the readings change by one sd (median over entries); None if they do not change.
+    def _typical_amplitude(self, form: Form, guess: float) -> float:
+        """Find the amplitude at which the readings change by one sd (median over entries); 0 if they do not change.
 
-        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`, to which the change is proportional;
-        `amplitudes` are the indices of the parameters with that amplitude.
+        The form is declared with amplitudes of 1; the readings change in proportion to them up to `guess`.
         """
-        settings = entries.reshape(-1, entries.shape[-1])
-        settings = settings[:: max(len(settings) // 16, 1)]
+        settings, amplitudes = form.entries.reshape(-1, form.entries.shape[-1]), list(form.amplitudes)
+        settings = settings[:: max(len(settings) // 16, 1)].copy()
+        settings[:, amplitudes] *= guess
         # In the unit of a column or a time a term may be minute. What is added to a reading, or to its gain, is
         # proportional at any amplitude; elsewhere a larger one could act where a small one does not.
-        for times in _GROWTH if stage in (Stage.OFFSET, Stage.GAIN) else (1.0,):
+        for times in _GROWTH if form.stage in (Stage.OFFSET, Stage.GAIN) else (1.0,):
             larger = settings.copy()
-            larger[:, list(amplitudes)] *= times
-            rms = self.rms_change_in_sds(stage, act, larger)
+            larger[:, amplitudes] *= times
+            rms = self.rms_change_in_sds(form.stage, form.act, larger)
             rms = rms[np.isfinite(rms)]
             if rms.size and rms.max() > _UNSEEN:
-                return _TYPICAL * times * guess / float(np.median(rms[rms > _UNSEEN]))
-        return None
+                return times * guess / float(np.median(rms[rms > _UNSEEN]))
+        return 0.0
 
     def scaled(self, form: Form, guess: float) -> Iterator[Form]:
         """Yield a form, declared with amplitudes of 1, with typical ones and their priors; none if without effect.
 
         `guess` is an amplitude so small that the readings change in proportion.
         """
-
-        def at_size(size: float) -> FloatArray:
+        typical = self._typical_amplitude(form, guess)
+        if np.isfinite(typical) and typical > 0:
             entries = form.entries.copy()
-            entries[..., list(form.amplitudes)] *= size
-            return entries
-
-        typical = self.typical_amplitude(form.stage, form.act, at_size(guess), guess, form.amplitudes)
-        if typical is not None and np.isfinite(typical) and typical > 0:
+            entries[..., list(form.amplitudes)] *= typical
             priors = dict(cast(Mapping[str, Marginal], form.parameters))
             for k in form.amplitudes:
                 name = form.prior.names[k]
                 priors[name] = self.amplitude_prior(typical, positive=priors[name] is POSITIVE)
-            yield replace(form, parameters=priors, entries=at_size(typical))
+            yield replace(form, parameters=priors, entries=entries)
 
     def sized(
         self,
@@ -383,19 +376,15 @@ class ReferenceFit:
         plain = HeavyTailedPrior(typical, positive=positive)
         return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
-    def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        """Return the range of those sizes `tried` that change the readings by 0.05 to 10,000 sds (rms); or None.
+    def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
+        """Return a log-uniform prior over those sizes `tried` that change the readings by 0.05 to 10,000 sds (rms).
 
-        A misfit above 1 raises the upper limit. If one size alone qualifies, the range ends at the next.
+        A misfit above 1 raises the upper limit. If one size alone qualifies, the range ends at the next; None without.
         """
         rms = self.rms_change_in_sds(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
             return None
-        low, high = int(there.min()), int(there.max())
-        return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
-
-    def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
-        """Return a log-uniform prior over `range_of_plausible_sizes`; None if there is no range."""
-        between = self.range_of_plausible_sizes(stage, act, tried)
-        return None if between is None or not between[0] < between[1] else LogUniform(*between)
+        first, last = int(there[0]), int(there[-1])
+        low, high = float(tried[first]), float(tried[last if last > first else min(last + 1, len(tried) - 1)])
+        return LogUniform(low, high) if low < high else None

@@ -16,14 +16,10 @@ from probewise.priors import Empty
 from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform, paper_plan
 from probewise.scene import KnownScene, edge_distance
 from probewise.scene.regions import (
-    EllipseRegion,
     HalfPlaneRegion,
     PolygonRegion,
     QuadrantRegion,
-    RampRegion,
-    RegionsOfMixedKinds,
     StripesRegion,
-    UniformRegion,
     disc_region,
 )
 from probewise.sensor import (
@@ -348,28 +344,6 @@ def test_the_distance_is_that_to_where_the_albedo_changes(name):
         assert distance == pytest.approx(radii[changed[0]], abs=0.1)
     changed_surface = RegionWithGradient(RegionWithPatch(region, np.ones((1, 4))), np.zeros((1, 2)))
     np.testing.assert_array_equal(edge_distance(changed_surface, places[None, :, 0], places[None, :, 1])[0], found)
-
-
-def test_near_an_ellipse_the_distance_is_right_to_first_order():
-    ellipse = EllipseRegion([[1.0, 2.0]], [[9.0, 4.0]], [0.4])
-    t = np.linspace(0, 2 * np.pi, 30)
-    p, q = 9 * np.cos(t), 4 * np.sin(t)
-    normal = np.stack([np.cos(t) / 9, np.sin(t) / 4]) / np.hypot(np.cos(t) / 9, np.sin(t) / 4)
-    p, q = p + 0.05 * normal[0], q + 0.05 * normal[1]
-    x, y = 1 + np.cos(0.4) * p - np.sin(0.4) * q, 2 + np.sin(0.4) * p + np.cos(0.4) * q
-    np.testing.assert_allclose(edge_distance(ellipse, x[None], y[None]), 0.05, rtol=0.05)
-    assert edge_distance(ellipse, np.array([[1.0]]), np.array([[2.0]]))[0, 0] == pytest.approx(4.0)
-
-
-def test_where_there_is_no_edge_it_is_infinitely_far():
-    place = np.zeros((1, 1))
-    for region in (UniformRegion([0.5]), RampRegion([0.0], [0.1])):
-        assert edge_distance(region, place, place)[0, 0] == np.inf
-
-
-def test_each_hypothesis_of_a_mixture_has_its_own_edge():
-    mixture = RegionsOfMixedKinds([1, 0, 1], (HalfPlaneRegion([0.0], [3.0]), disc_region([[0.0, 0.0]] * 2, [5.0, 7.0])))
-    np.testing.assert_allclose(edge_distance(mixture, np.zeros((1, 1)), np.zeros((1, 1))), [[5.0], [3.0], [7.0]])
 
 
 SIZES = {

@@ -12,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._words import value_with_sd
 from probewise.effects.effect import (
     Act,
     Effect,
@@ -140,19 +139,14 @@ def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
             continue
         line = ScanLine(angle, float(across.mean()), float(along.min()), float(along.max()))
         for k, other in enumerate(found):
-            if _are_one_line(line, other):
+            apart = line.offset_mm / line.length_mm - other.offset_mm / other.length_mm
+            if abs(line.angle_rad - other.angle_rad) < _ONE_DIRECTION_RAD and abs(apart) < 0.5 * _STRAIGHT:
                 low_mm, high_mm = min(line.low_mm, other.low_mm), max(line.high_mm, other.high_mm)
                 found[k] = replace(other, low_mm=low_mm, high_mm=high_mm)
                 break
         else:
             found.append(line)
     return tuple(found)
-
-
-def _are_one_line(line: ScanLine, other: ScanLine) -> bool:
-    """Return whether two lines have one direction and, as shares of their lengths, one offset."""
-    apart = line.offset_mm / line.length_mm - other.offset_mm / other.length_mm
-    return abs(line.angle_rad - other.angle_rad) < _ONE_DIRECTION_RAD and abs(apart) < 0.5 * _STRAIGHT
 
 
 def _principal_angle_rad(places_mm: FloatArray) -> float:
@@ -240,7 +234,7 @@ def _patch(kind: LightEffect, of: Extent, size: str, unit: str, typical: float, 
     return one_of([on_line(line) for line in distinct_scan_lines(of.plan)])
 
 
-_place_in_words = in_words("within {3} mm of the place ({1}, {2}) mm")
+_NEAR = "within {3} mm of the place ({1}, {2}) mm"
 
 
 @light_effect("glint", Stage.OFFSET, "a glint at one place", ("place",))
@@ -251,11 +245,8 @@ def glint(kind: LightEffect, of: Extent) -> Effect | None:
         amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
         return value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r)
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size = f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} too {'high' if mean[0] > 0 else 'low'}"
-        return _place_in_words(mean, sd) + f" the readings are {size}, over black and white alike: a reflection"
-
-    return _patch(kind, of, "amp", "reading", 0.02 * of.span, act, says)
+    says = f"{_NEAR} the readings are {{|0|}} too {{high/low}}, over black and white alike: a reflection"
+    return _patch(kind, of, "amp", "reading", 0.02 * of.span, act, in_words(says, of.reading_unit))
 
 
 @light_effect("albedo_gradient", Stage.SCENE, "unevenly white paper", ("place",), counts="place")
@@ -283,11 +274,8 @@ def albedo_patch(kind: LightEffect, of: Extent) -> Effect | None:
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return _with_changed_regions(value, plan, lambda region: RegionWithPatch(region, theta))
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size = f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'whiter' if mean[0] > 0 else 'darker'}"
-        return _place_in_words(mean, sd) + f" every pattern is {size} than it should be: a stain or a worn area"
-
-    return _patch(kind, of, "albedo", "1", 0.05, act, says)
+    says = f"{_NEAR} every pattern is {{|0|}} % {{whiter/darker}} than it should be: a stain or a worn area"
+    return _patch(kind, of, "albedo", "1", 0.05, act, in_words(says, factors=(100,)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,9 +386,9 @@ def height_gradient(kind: LightEffect, of: Extent) -> Effect:
         {"mm_per_mm": "mm/mm"},
         0.01 * _nominal_height_mm(of.plan) / of.length_mm,
         act,
-        lambda mean, sd: (
-            f"the sensor's height above the surface {'grows' if mean[0] > 0 else 'shrinks'} by "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} mm per 100 mm along X: the table slopes"
+        in_words(
+            "the sensor's height above the surface {grows/shrinks} by {|0|} mm per 100 mm along X: the table slopes",
+            factors=(100,),
         ),
     )
 
@@ -422,10 +410,7 @@ def height_offset(kind: LightEffect, of: Extent) -> Effect | None:
             {"mm": "mm"},
             0.01 * _nominal_height_mm(of.plan),
             act,
-            lambda mean, sd: (
-                f"in {scans_in_words(scans)} the sensor hangs {value_with_sd(abs(mean[0]), sd[0])} mm "
-                f"{'higher' if mean[0] > 0 else 'lower'} than in the others"
-            ),
+            in_words(f"in {scans_in_words(scans)} the sensor hangs {{|0|}} mm {{higher/lower}} than in the others"),
             where=Where(scans=scans),
         )
 
@@ -448,9 +433,8 @@ def slow_sinking(kind: LightEffect, of: Extent) -> Effect:
         {"per_hour": "1/h"},
         0.01 / (of.duration_s / 3600),
         lambda value, theta, plan: footprint_at_added_height(value, theta[:, :1] * of.origin.hours(plan), plan),
-        lambda mean, sd: (
-            f"the sensor {'rises' if mean[0] > 0 else 'sinks'} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
-            "of its height per hour: it is loose in its holder"
+        in_words(
+            "the sensor {rises/sinks} by {|0|} % of its height per hour: it is loose in its holder", factors=(100,)
         ),
     )
 
@@ -566,22 +550,18 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
             distance[:, rows] = part
         return replace(value, seen=value.seen - theta[:, :1] * gaussian_bump(distance**2, theta[:, 1:2]))
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        where = f" of pattern {', '.join(patterns)}" if patterns else ""
-        why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"
-        return (
-            f"within {value_with_sd(mean[1], sd[1])} mm of an edge{where} the surface looks "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'darker' if mean[0] > 0 else 'brighter'} than the "
-            f"pattern explains: {why}"
-        )
-
+    where = f"of an edge of pattern {', '.join(patterns)}" if patterns else "of an edge"
+    says = (
+        f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains: the edge "
+        "{casts a shadow/reflects light}"
+    )
     found = kind.bind(
         of,
         {"amp": HeavyTailedPrior(typical), "w": LogUniform(narrowest_mm, widest_mm)},
         ("1", "mm"),
         act,
         single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6)),
-        says,
+        in_words(says, factors=(100,)),
         where=Where(patterns=patterns),
     )
     return replace(found, source=partial(edge_shadow_of_patterns, kind, of, patterns))

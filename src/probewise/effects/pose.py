@@ -32,6 +32,7 @@ from probewise.sensor.stages import Poses, Stage
 _STILL_MM = 1e-6  # a smaller step of an axis is rounding
 _TURN_DEG = 3.0  # of a mount set by eye
 _LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
+_FURTHER = "{|0|} degrees further {anticlockwise/clockwise} than commanded"
 _UNIT_MM = 10.0
 _MOST_PLACES = 160
 _N_PERIODS, _N_LONG = 40, 8  # of the bank of a periodic error, within the range and longer
@@ -122,7 +123,7 @@ def orientation_error(kind: LightEffect, of: Extent) -> Effect:
         {"deg": "deg"},
         _TURN_DEG,
         lambda value, theta, plan: _turned(value, np.radians(theta)),
-        lambda mean, sd: f"in all scans the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}",
+        in_words(f"in all scans the sensor is turned {_FURTHER}"),
     )
 
 
@@ -136,17 +137,12 @@ def scan_angle_error(kind: LightEffect, of: Extent) -> Effect | None:
             {"deg": "deg"},
             _TURN_DEG,
             lambda value, theta, plan: _turned(value, np.radians(theta) * scan_indicator(plan, scans)),
-            lambda mean, sd: f"in {scans_in_words(scans)} the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}",
+            in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"),
             sizes=(1.0, -8.0, 8.0, -14.0, 14.0),
             where=Where(scans=scans),
         )
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
-
-
-def _extra_turn_in_words(deg: float, sd: float) -> str:
-    way = "anticlockwise" if deg > 0 else "clockwise"
-    return f"{value_with_sd(abs(deg), sd)} degrees further {way} than commanded"
 
 
 @light_effect("sensor_tilt", Stage.POSE, "a tilted sensor", ("orientation", "slope"))
@@ -300,9 +296,8 @@ def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
         ("mm", "mm", "1"),
         act,
         single_column_bank(typical_mm, periods.ravel(), phases.ravel()),
-        lambda mean, sd: (
-            f"the slide sticks and then jumps by {value_with_sd(abs(mean[0]), sd[0], factor=2)} mm, once every "
-            f"{value_with_sd(mean[1], sd[1])} mm along X: it lacks lubrication"
+        in_words(
+            "the slide sticks and then jumps by {|0|} mm, once every {1} mm along X: it lacks lubrication", factors=(2,)
         ),
     )
 

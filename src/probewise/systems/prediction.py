@@ -15,7 +15,7 @@ from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
-from probewise.effects import AGAIN, EFFECTS, PROPOSAL, NamedEffect
+from probewise.effects import EFFECTS, NamedEffect
 from probewise.effects.noise import NoisePerRun, RandomWalk
 from probewise.effects.noise_distribution import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError
@@ -26,7 +26,7 @@ from probewise.recordings.prediction import prediction_summary
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
-from probewise.systems.forms.binding import has_value_per_run, rebind_forms
+from probewise.systems.forms.binding import has_value_per_run, jumps_at_row, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import STANDS_STILL, System, SystemChain, with_converged_step
 from probewise.systems.table import (
@@ -358,21 +358,12 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
 def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
     """Return the names of the recording's columns of numbers that effects act on or name in formulas.
 
-    A column may be named like a state or a parameter, on which other effects act.
+    A jump at a row may show along a column that it does not read.
     """
     assert fitted.known is not None
     columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
-    in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
-    of_column = [
-        name.removesuffix(AGAIN)
-        for name, form in forms.items()
-        if form.stage in (Stage.INPUT, Stage.OFFSET) or name.startswith("depends:")
-    ]
-    return {
-        name
-        for name in columns
-        if covariate_of_column(name) in in_formulas or any(own.endswith(f":{name}") for own in of_column)
-    }
+    along = {covariate for form in forms.values() if not jumps_at_row(form) for covariate in form.covariates}
+    return {name for name in columns if covariate_of_column(name) in along}
 
 
 def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -82,7 +82,8 @@ class RunTable:
                 if note:
                     object.__setattr__(self, "notes", (*self.notes, note))
             columns[name] = _checked_column(name, values, are_names=name == self.run)
-            if name == self.run and _holds_decimals(values):
+            numbers = np.asarray(values)
+            if name == self.run and numbers.dtype.kind == "f" and np.any(np.isfinite(numbers) & (numbers % 1 != 0)):
                 note = f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
                 object.__setattr__(self, "notes", (*self.notes, note))
         if not columns:
@@ -280,7 +281,9 @@ def column_error(
 
 def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     """Return a column as read-only floats or texts; names of runs are texts."""
-    array = np.asarray(_with_missing(values))
+    if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
+        values = np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
+    array = np.asarray(values)
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
     if are_names and array.dtype.kind == "U" and not array.flags.writeable:
@@ -292,19 +295,6 @@ def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     texts = np.array([text_of_name(v) if are_names else str(v) for v in array.tolist()], dtype=np.str_)
     texts.flags.writeable = False
     return texts
-
-
-def _holds_decimals(values: Any) -> bool:
-    """Return whether values are floating-point numbers, some of them not whole."""
-    array = np.asarray(values)
-    return array.dtype.kind == "f" and bool(np.any(np.isfinite(array) & (array != np.floor(array))))
-
-
-def _with_missing(values: Any) -> Any:
-    """Return a column with the masked values of a masked array missing, NaN or ""."""
-    if not isinstance(values, np.ma.MaskedArray):
-        return values
-    return np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
 
 
 def read_run_table(

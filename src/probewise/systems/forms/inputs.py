@@ -8,19 +8,26 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error
-from probewise.effects.effect import PHASE, sine_and_cosine_entries
+from probewise.effects.effect import PHASE, Act, WaveEffect, in_words, sine_and_cosine_entries
 from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActInTime, Form, WaveForm, in_words, says_of_limit
 from probewise.systems.forms.modulations import (
     max_n_trial_frequencies,
     origin_in_words,
     origin_of_column,
-    time_origin,
     trial_frequencies,
 )
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
-from probewise.systems.forms.reference import ReferenceFit, clipped, clipping_levels
+from probewise.systems.forms.reference import (
+    AMPLITUDE,
+    POSITIVE,
+    ActInTime,
+    Form,
+    ReferenceFit,
+    clipped,
+    clipping_levels,
+    says_of_limit,
+)
 from probewise.systems.law_inputs import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 
@@ -53,7 +60,7 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         yield from _forms_on_column(about, name)
     table = about.table
     if table.time is not None:
-        origin = time_origin(table)
+        origin = origin_of_column(table.time_s)
 
         def scaled_clock(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
             return np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
@@ -78,7 +85,8 @@ def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
     yield from _clipped_column_form(about, name)
     if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * span:  # if larger, it is an offset
         within = f"{name} has no effect within {{0}} of 0"
-        yield from _size_form(*of("dead_zone", _column_with_dead_zone), span, name, within, along)
+        with_zone = of("dead_zone", lambda c, theta, rows: np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
+        yield from _size_form(*with_zone, span, name, within, along)
     if _moves_both_ways(values, about.table):
         play = f"{name} has {{0}} of play"
         yield from _size_form(*of("backlash", column_with_play), span, name, play, "previous", along)
@@ -171,12 +179,8 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     priors: dict[str, Marginal] = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
     bank, along = sine_and_cosine_entries(1.0, 1 / frequencies), (covariate_of_column(name),)
     own = (f"periodic_error:{name}", Stage.INPUT, priors, (name, name, "rad"), along, act, bank, says)
-    form = WaveForm(*own, counted_from=origin_in_words(name, origin))
+    form = WaveEffect(*own, counted_from=origin_in_words(name, origin))
     yield from about.scaled(form, 1e-4 * float(np.std(values)))
-
-
-def _column_with_dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
 
 
 def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -10,16 +10,16 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import unit_of_name
+from probewise.effects.effect import Act, in_words
 from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ActInTime, Form, flag, in_words
 from probewise.systems.forms.modulations import (
     Modulation,
     column_proportional_modulation,
     modulated_form,
     modulations_over_rows,
 )
-from probewise.systems.forms.reference import ReferenceFit
+from probewise.systems.forms.reference import ActInTime, Form, ReferenceFit, flag
 from probewise.systems.table import RunTable
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor

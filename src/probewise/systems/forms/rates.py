@@ -11,27 +11,25 @@ import numpy as np
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
-from probewise.effects.effect import PHASE, sine_and_cosine_entries, single_column_bank
+from probewise.effects.effect import PHASE, Fixed, WaveEffect, in_words, sine_and_cosine_entries, single_column_bank
 from probewise.priors import Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import (
-    AMPLITUDE,
-    POSITIVE,
-    Fixed,
-    Form,
-    WaveForm,
-    in_words,
-    period_with_sd,
-    says_of_limit,
-)
 from probewise.systems.forms.modulations import (
     frequency_prior,
     max_n_trial_frequencies,
     origin_in_words,
-    time_origin,
+    origin_of_column,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.reference import ReferenceFit, clipping_levels
+from probewise.systems.forms.reference import (
+    AMPLITUDE,
+    POSITIVE,
+    Form,
+    ReferenceFit,
+    clipping_levels,
+    period_with_sd,
+    says_of_limit,
+)
 from probewise.systems.law import LawWithEffects, Limit
 
 _NO_SHARE = 1e-9  # of what a bound stops: none
@@ -113,7 +111,7 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
 
 def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     table = about.table
-    time, origin = table.time, time_origin(table)
+    time, origin = table.time, origin_of_column(table.time_s)
     frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(table)))
 
     def act(value: LawWithEffects, theta: FloatArray, rows: Any) -> LawWithEffects:
@@ -129,7 +127,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
     priors: dict[str, Marginal] = {"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE}
     units, bank = (unit, f"1/{about.time_unit}", "rad"), sine_and_cosine_entries(1.0, frequencies)
     own = (f"periodic_forcing:{state}", Stage.RATE, priors, units, ("time",), act, bank, says)
-    form = WaveForm(*own, counted_from=origin_in_words(time, origin, about.time_unit))
+    form = WaveEffect(*own, counted_from=origin_in_words(time, origin, about.time_unit))
     yield from about.scaled(form, trial_rate(about, state))
 
 

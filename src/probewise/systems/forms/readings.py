@@ -11,11 +11,10 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
-from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
+from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Fixed, in_words, single_column_bank
 from probewise.effects.reading import decaying_sum
 from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, Act, Fixed, Form, flag, in_words, says_of_limit
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
@@ -24,7 +23,16 @@ from probewise.systems.forms.modulations import (
     modulations_over_rows,
     sinusoid_modulation,
 )
-from probewise.systems.forms.reference import N_SIZES, ReferenceFit, clipped, switch_points
+from probewise.systems.forms.reference import (
+    AMPLITUDE,
+    N_SIZES,
+    Form,
+    ReferenceFit,
+    clipped,
+    flag,
+    says_of_limit,
+    switch_points,
+)
 from probewise.systems.table import RunTable, covariate_of_column
 
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
@@ -328,12 +336,8 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
 
     if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
-    unit, reading = about.reading_unit, about.system.simulator.reading
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, way = value_with_sd(2 * abs(mean[0]), 2 * sd[0], unit), "more" if mean[0] > 0 else "less"
-        return f"{reading} reads {size} {way} while it rises than while it falls"
-
+    unit, way = about.reading_unit, "{more/less} while it rises than while it falls"
+    says = in_words(f"{about.system.simulator.reading} reads {{|0|}} {way}", unit, factors=(2,))
     priors, bank = {"a": about.amplitude_prior(about.sd)}, np.full((1, 1, 1), about.sd)
     yield Form("hysteresis", Stage.HYSTERESIS, priors, (unit,), ("previous",), act, bank, says)
 

@@ -82,8 +82,7 @@ class RunTable:
                 if note:
                     object.__setattr__(self, "notes", (*self.notes, note))
             columns[name] = _checked_column(name, values, are_names=name == self.run)
-            numbers = np.asarray(values)
-            if name == self.run and numbers.dtype.kind == "f" and np.any(np.isfinite(numbers) & (numbers % 1 != 0)):
+            if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
                 note = f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
                 object.__setattr__(self, "notes", (*self.notes, note))
         if not columns:

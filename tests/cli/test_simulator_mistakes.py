@@ -36,7 +36,7 @@ FILES = {
     "readings of another shape": (("return p", "return np.ones(3)\n    return p"), "shape (3,); allowed: (36,)"),
     "an effect of one's own without mass": (
         ("noise =", 'extra = {"drag": {"prior": (1, 1), "null": 0.0, "says": "drag {value}"}}\nnoise ='),
-        "extra['drag']['prior'] is (1, 1); allowed:",
+        "extra['drag'].prior is (1, 1); allowed:",
     ),
     "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "not finite at any of the"),
     "a prior without mass": (("(0, 10)", "(10, 10)"), "parameters['gain'] is (10, 10)"),

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 import pickle
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
 
-from probewise._words import value_with_sd
 from probewise.diagnosis.findings import parameters_found
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
@@ -190,13 +188,6 @@ def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():
     np.testing.assert_allclose(readings, np.repeat(readings[:1], 5, axis=0), atol=1e-12)
 
 
-def test_a_spot_without_a_radius_has_no_density():
-    prior = VOCABULARY["glint"].for_extent(EXTENT).prior
-    theta = np.array([[1.0, 5.0, 0.0, 8.0], [1.0, 5.0, 0.0, 0.0], [1.0, 5.0, 0.0, -8.0]])
-    assert np.isfinite(prior.log_prob(theta)[0])
-    np.testing.assert_array_equal(prior.log_prob(theta)[1:], -np.inf)
-
-
 def test_a_heavy_tail_is_exact_at_both_ends():
     prior = HeavyTailedPrior(0.5)
     u = np.array([1e-9, 1e-3, 0.2, 0.5, 0.8, 0.999, 1 - 1e-9])
@@ -231,13 +222,6 @@ def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
     assert np.trapezoid(np.exp(shown.log_prob(x)), x) == pytest.approx(1.0, abs=1e-6)
     below = [float(prior.to_unit(np.array([0.25]))[0]) for prior in (wide, shown)]
     assert below[0] > 2.5 * below[1]
-
-
-def test_a_heavy_tail_refuses_a_size_of_zero():
-    with pytest.raises(ParameterError, match="greater than 0"):
-        HeavyTailedPrior(0.0)
-    with pytest.raises(ParameterError, match="smallest"):
-        HeavyTailedPrior(1.0, smallest=30.0)
 
 
 def test_an_effect_that_could_not_show_is_not_built():
@@ -440,27 +424,6 @@ def test_a_shadow_falls_on_the_patterns_with_raised_edges_alone():
     assert alone.patterns == ()
 
 
-def test_effects_stack_alike_whatever_the_order_given():
-    """Three of one stage among others: names, columns and readings do not depend on who came first."""
-    sizes = {
-        "edge_misplacement": [0.5],
-        "albedo_gradient": [2e-3, 1e-3],
-        "flicker": [0.5, 0.1, 1.0],
-        "ambient_gradient": [0.01, 0.0],
-        "backlash": [0.4],
-        "halo": [0.05, 25.0],
-    }
-    plan = PLAN.take(np.arange(60, 130, 7))
-    found = []
-    for order in [*permutations(VOCABULARY[name]() for name in sizes)][::97]:
-        chain = base().with_effects(*order)
-        theta = np.array([[x for effect in chain.effects for x in sizes[effect.name]]])
-        found.append((chain.names, chain.predict(theta, plan)))
-    for names, readings in found[1:]:
-        assert names == found[0][0]
-        np.testing.assert_array_equal(readings, found[0][1])
-
-
 def between_s(step):
     """The ends of the prior of its moment."""
     return tuple(step.prior.from_unit_cube(np.array([[0.5, 0.0], [0.5, 1.0]]))[:, 1])
@@ -645,13 +608,6 @@ def test_the_extent_of_a_recording_does_not_depend_on_the_unit():
     spans = [Extent.of(Recording(there_and_back(), unit * readings)).span / unit for unit in (1e-9, 1.0, 1e9)]
     np.testing.assert_allclose(spans, 4.0)
     assert Extent.of(Recording(there_and_back(), np.zeros(6))).span == 1e-6
-
-
-def test_a_value_with_a_tiny_sd_is_written_with_the_digits_of_the_sd():
-    assert value_with_sd(3.14e-9, 2.3e-10, "A") == "3.14e-09 ± 2.3e-10 A"
-    assert value_with_sd(0.25, 2.3e-9) == "0.25 ± 2.3e-09"
-    assert value_with_sd(-0.0, 2.3e-10) == "0 ± 2.3e-10"
-    assert value_with_sd(3.14e-6, 2.3e-7) == "0.00000314 ± 0.00000023"
 
 
 def test_what_all_samples_have_in_common_is_written_as_it_is():

@@ -44,14 +44,6 @@ def test_a_reading_far_beyond_every_prediction_keeps_a_finite_density() -> None:
     assert out[0] == pytest.approx(out[1])
 
 
-def test_the_masses_of_all_cells_sum_to_one() -> None:
-    cells = np.arange(-60, 61) * 0.5
-    total = (
-        np.exp(log_rounding_cell_density(cells, np.full(cells.size, 0.123), np.full(cells.size, 0.9), 0.5)).sum() * 0.5
-    )
-    assert total == pytest.approx(1.0, abs=1e-12)
-
-
 LOW, HIGH, SD = 0.0, 10.0, 2.0
 OUTLIERS = NoiseParameters(
     np.full((1, 1), SD), np.zeros((1, 1)), wide_share=np.full((1, 1), 0.2), wide_times=np.full((1, 1), 4.0)

@@ -159,23 +159,6 @@ def test_the_step_is_halved_until_readings_stand_still():
     assert far.max() < 1e-4
 
 
-def test_rates_may_change_what_they_are_given():
-    """They get copies, as `simulate` does: otherwise each call would go on from what the last one left."""
-
-    def plain(s, p, u):
-        return {"x": u["force"] - 2 * p["k"] * s["x"]}
-
-    def changing(s, p, u):
-        p["k"] = 2 * p["k"]
-        u["force"] = u["force"] + 1
-        u["net"] = u["force"] - 1
-        return {"x": u["net"] - p["k"] * s["x"]}
-
-    table = _table([0.0, 1.0, 2.0, 3.0], force=np.array([1.0, 2.0, 0.0, 0.0]))
-    expected, found = (_states(Law({"x": 1.0}, rates), table, {"k": 0.3}, 0.1)["x"] for rates in (plain, changing))
-    np.testing.assert_array_equal(found, expected)
-
-
 def _pendulum_with_changes_in_place(s, p, u):
     speed, damping, turn = s["omega"], p["c"], u["turn"]
     damping /= 60

@@ -374,6 +374,45 @@ def test_a_prediction_over_longer_gaps_does_not_run_away_with_the_fastest_sample
     np.testing.assert_allclose(found.mean[1:], held, atol=2e-3)  # after 30 s, ten time constants, the drive is reached
 
 
+_DECAY = Law({"x": 8.0}, lambda s, p, u: {"x": -p["k"] * s["x"]})
+
+
+def _decaying(effects, known):
+    """x' = -k x from 8, and an offset; a recording of the first half, from 0 to 1.9 s."""
+    simulator = Simulator("x", "K", {"k": (0, 10)}, law=_DECAY, time="t", run="run")
+    t = np.arange(0.0, 4.0, 0.1)
+    whole = RunTable({"t": t, "x": 8 * np.exp(-0.5 * t), "run": np.full(40, "a")}, "t", "run")
+    early = whole.take(t < 1.95)
+    names, samples = ["k", *(f"{name}.a" for name in effects)], [0.5, *(1.0 for _ in effects)]
+    stored = StoredFit(early, early.columns["x"], 0.1, {"x": early.columns["x"]}) if known else None
+    draws = np.tile(samples, (500, 1))
+    model = FittedSystem(simulator, names, draws, np.full(500, 0.1), effects=effects, known=stored, max_step=0.1)
+    return model, whole
+
+
+@pytest.mark.parametrize("rows", [slice(20, 40), slice(30, 35), slice(5, 12)], ids=["next", "later", "within"])
+def test_later_rows_of_a_recorded_run_go_on_from_its_recorded_state(rows):
+    model, whole = _decaying(("offset_drift",), known=True)
+    part = whole.take(np.arange(40)[rows])
+    found = predicted(model, part.with_columns({"humidity": np.ones(len(part))}))
+    np.testing.assert_allclose(found.mean, part.columns["x"] + part.time_s, atol=1e-5)
+    assert (len(found.table), found.notes) == (len(part), ())
+
+
+def test_later_rows_are_said_to_start_again_where_the_model_has_no_recorded_rows():
+    model, whole = _decaying((), known=False)
+    found = predicted(model, whole.take(np.arange(20, 40)))
+    np.testing.assert_allclose(found.mean[0], 8.0)
+    assert "note: run a: started again at its first row here" in found.summary()
+    assert predicted(model, whole).notes == ()  # it begins at 0
+
+
+def test_runs_named_by_numbers_with_decimals_are_pointed_out():
+    assert "1.10 is 1.1" in RunTable({"y": [1.0, 2.0], "run": [1.1, 1.10]}, run="run").notes[0]
+    for names in ([1.0, 2.0], ["1.1", "1.10"]):
+        assert RunTable({"y": [1.0, 2.0], "run": names}, run="run").notes == ()
+
+
 def test_an_infinite_reading_is_refused_with_its_row():
     """The table keeps a column with such a cell as text; its first cells are numbers all the same."""
     table = RunTable({"power_w": [1.0, 2.0, 3.0], "temp_c": ["20.1", "", "inf"]}, time=None, run=None)

@@ -32,13 +32,12 @@ def run(arguments: argparse.Namespace) -> int:
     read = common.tables_and_descriptions([arguments.plan]) if arguments.simulator is None else [arguments.plan]
     read += [] if arguments.simulator is None else [arguments.simulator]
     out = checked_output_file(arguments.out, arguments.sensor, *read)
-    notes: tuple[str, ...] = ()
     earlier = common.note_if_replaced(out)
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
             fitted = systems.read_fitted_system(arguments.sensor, arguments.simulator)  # a changed file is not run
             table = systems.read_table_for(fitted.simulator, arguments.plan)
-            notes, rng = table.notes, np.random.default_rng(arguments.seed)
+            rng = np.random.default_rng(arguments.seed)
             by_system = systems.predict_system(fitted, table, rng=rng, progress=progress)
             out.parent.mkdir(parents=True, exist_ok=True)
             systems.write_system_prediction(by_system, out)
@@ -51,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
             out.parent.mkdir(parents=True, exist_ok=True)
             recordings.write_prediction(prediction, out)
             summary = prediction.summary()
-    for note in (*(f"note: {note}" for note in notes), *earlier):
+    for note in earlier:
         common.print_result(note, quiet=arguments.quiet)
     common.print_result(f"{summary}\nwritten to {out}", quiet=arguments.quiet)
     return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -31,9 +30,10 @@ from probewise.nested import Weighted
 from probewise.nested.repartition import repartitioned
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
-from probewise.systems import FittedSystem, RunTable, Simulator, System, run_table_csv, table_for
+from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.binding import StoredFit, extract_stored_fit
+from probewise.systems.table import table_digest
 
 
 @own_arithmetic
@@ -92,7 +92,7 @@ def fitted_system_from_samples(
         max_step=system.max_step,
         stiff=system.stiff,
         known=known,
-        recording=hashlib.sha256(run_table_csv(cast(RunTable, recording.plan)).encode()).hexdigest()[:16],
+        recording=table_digest(cast(RunTable, recording.plan)),
         source=recording.source,
         notes=recording.notes,
     )

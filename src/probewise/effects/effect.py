@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, distinct_values
 from probewise._kinds import require_mapping
-from probewise._words import unit_after_number
+from probewise._words import unit_after_number, value_with_sd
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import ZERO, Extent, Origin
 from probewise.errors import ParameterError
@@ -298,13 +299,18 @@ class StepEffect(Effect):
     is_thinned: bool = True
     has_change_point: ClassVar[bool] = True  # type: ignore[misc]
 
+    @property
+    def places(self) -> Sequence[tuple[Uniform, ...]]:
+        """The prior of the last parameters, those that are a place, in each variant."""
+        return [(Uniform(*interval),) for interval in self.change_points.intervals]
+
     @cached_property
     def _variants(self) -> tuple[Effect, ...]:
         out = []
-        for low, high in self.change_points.intervals:
-            entries = self.entries.copy()
-            entries[:, :, -1] = 0.5 * (low + high)
-            priors = {**self.marginals, list(self.marginals)[-1]: Uniform(low, high)}
+        for last in self.places:
+            entries, n = self.entries.copy(), len(last)
+            entries[:, :, -n:] = [0.5 * (prior.low + prior.high) for prior in last]
+            priors = {**self.marginals, **dict(zip(list(self.marginals)[-n:], last, strict=True))}
             out.append(replace(self, parameters=priors, entries=entries))
         return tuple(out)
 
@@ -514,10 +520,11 @@ def require_effect_kinds(effects: object) -> None:
 class NoiseEffect(NamedEffect[NoiseParameters]):
     """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True.
 
-    A class declares name, words and covariates, prior and units of its parameters, `apply` and `sentence`.
+    A class declares name, words and covariates, prior and units of its parameters, `apply`, and `says` or `sentence`.
     """
 
     stage = Stage.NOISE
+    says: ClassVar[Say]
 
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""
@@ -541,6 +548,9 @@ class NoiseEffect(NamedEffect[NoiseParameters]):
         Where a fit determines a parameter better than its nodes lie apart, they are refined.
         """
         return (self.n_nodes,)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        return type(self).says(mean, sd)
 
     def bank(self) -> FloatArray:
         """Return equally weighted nodes of the prior, (n_nodes, 1, n_params): midpoints along each parameter."""
@@ -568,11 +578,13 @@ class NoiseEffect(NamedEffect[NoiseParameters]):
 def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
     """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0.
 
-    Of an amplitude that is not 0, but of either sign, it says so and between what values it lies.
+    Of an amplitude with samples on both sides of 0, but hardly any near it, it says between what values it lies.
     """
     sentence = effect.sentence(*mean_and_sd_of_samples(samples))
     for k in effect.amplitudes:
-        if _is_of_either_sign(samples[:, k]):
+        positive, sizes = np.mean(samples[:, k] > 0), np.abs(samples[:, k])
+        near = np.mean(sizes < _NEAR_ZERO * np.median(sizes))
+        if _BOTH_SIGNS < positive < 1 - _BOTH_SIGNS and near < _FEW_NEAR_ZERO:
             low, high = np.quantile(samples[:, k], [0.025, 0.975])
             between = f"between {low:.2g} and {high:.2g} {unit_after_number(effect.units[k])}".rstrip()
             name = "size" if effect.prior.names[k] == "a" else f"size {effect.prior.names[k]}"
@@ -580,11 +592,22 @@ def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
     return f"{sentence} ({effect.counted_from})" if effect.counted_from else sentence
 
 
-def _is_of_either_sign(values: FloatArray) -> bool:
-    """Return whether samples, (n_samples,), are on both sides of 0, but hardly any near it."""
-    positive = np.mean(values > 0)
-    near = np.mean(np.abs(values) < _NEAR_ZERO * np.median(np.abs(values)))
-    return bool(_BOTH_SIGNS < positive < 1 - _BOTH_SIGNS and near < _FEW_NEAR_ZERO)
+def in_words(text: str, *units: str, factors: Sequence[float] = ()) -> Say:
+    """Return a sentence with {0}, {1} ... in place of the parameters' values with their sds, in these units.
+
+    Values are given times `factors`, by default 1; {|0|} is an absolute value, and of {rises/falls} the first words
+    are those of a first parameter above 0.
+    """
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        out = re.sub(r"\{([^{}]*)/([^{}]*)\}", r"\1" if mean[0] > 0 else r"\2", text)
+        for k, (m, s) in enumerate(zip(mean, sd, strict=True)):
+            unit, factor = units[k] if k < len(units) else "", factors[k] if k < len(factors) else 1.0
+            out = out.replace(f"{{{k}}}", value_with_sd(m, s, unit, factor=factor))
+            out = out.replace(f"{{|{k}|}}", value_with_sd(abs(m), s, unit, factor=factor))
+        return out
+
+    return says
 
 
 def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.effect import NoiseEffect
+from probewise.effects.effect import NoiseEffect, in_words
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import Extent
 from probewise.priors import LogHeavyTailedPrior, LogUniform, Product, Uniform
@@ -33,15 +33,12 @@ class CorrelatedNoise(NoiseEffect):
     units = ("1",)
     prior = Product({"rho": Uniform(-0.5, 0.95)})
     n_nodes = 28  # dense enough to integrate the posterior of a thousand readings
+    says = in_words(
+        "the noise of successive readings has correlation {0}: part of each error returns in the next reading"
+    )
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, rho=theta[:, :1])
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"the noise of successive readings has correlation {value_with_sd(mean[0], sd[0])}: "
-            "part of each error returns in the next reading"
-        )
 
 
 class SignalDependentNoise(NoiseEffect):
@@ -55,10 +52,8 @@ class SignalDependentNoise(NoiseEffect):
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        times = value_with_sd(1 + mean[0], sd[0])
-        return (
-            f"the noise grows with the reading: its variance at the highest level is {times} times that at the lowest"
-        )
+        times = f"{value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
+        return f"the noise grows with the reading: its variance at the highest level is {times}"
 
 
 class DriftingNoise(NoiseEffect):
@@ -72,13 +67,11 @@ class DriftingNoise(NoiseEffect):
     name, words, covariates = "drifting_noise", "noise that changes in time", ("time",)
     units = ("1",)
     prior = Product({"growth": LogUniform(0.2, 5.0)})
+    says = in_words("the sd of the noise at the end is {0} times that at the start")
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
         return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the sd of the noise at the end is {value_with_sd(mean[0], sd[0])} times that at the start"
 
 
 @dataclass(frozen=True)
@@ -94,12 +87,10 @@ class RandomWalk(NoiseEffect):
     units = ("noise sd",)
     prior = Product({"sd_per_row": LogUniform(5e-3, 3.0)})
     n_nodes = 16
+    says = in_words("the offset is a random walk with steps of sd {0} noise sds from row to row")
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, walk=theta[:, :1], walked=self.n_before + 1.0 + np.arange(float(len(plan))))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the offset is a random walk with steps of sd {value_with_sd(mean[0], sd[0])} noise sds from row to row"
 
 
 @dataclass(frozen=True)
@@ -217,15 +208,10 @@ class Outliers(NoiseEffect):
     units = ("1", "noise sd")
     prior = Product({"share": _SHARES, "size": LogUniform(2.5, LARGEST_SIZE)})
     nodes_per_parameter = (4, 4)
+    says = in_words("outliers: {0} % of the readings scatter {1} times as widely as the others", factors=(100,))
 
     def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"outliers: {value_with_sd(mean[0], sd[0], factor=100)} % of the readings scatter "
-            f"{value_with_sd(mean[1], sd[1])} times as widely as the others"
-        )
 
 
 @dataclass(frozen=True)
@@ -343,9 +329,7 @@ class Quantisation(NoiseEffect):
         return replace(value, step=theta[:, :1])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"the readings are rounded to steps of {value_with_sd(mean[0], sd[0], self.unit)}, which were not declared"
-        )
+        return in_words("the readings are rounded to steps of {0}, which were not declared", self.unit)(mean, sd)
 
 
 def lattice_step(readings: FloatArray) -> float:

@@ -12,13 +12,13 @@ from typing import ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._words import value_with_sd
 from probewise.effects.effect import (
     Act,
     Effect,
     LightEffect,
     Say,
     Where,
+    in_words,
     light_effect,
     one_of,
     scans_in_words,
@@ -57,9 +57,7 @@ def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
         {"offset_mm": "mm"},
         0.003 * of.length_mm,
         lambda value, theta, plan: _with_shifted_patterns(value, theta * np.ones(len(plan)), plan),
-        lambda mean, sd: (
-            f"the printed edges lie {value_with_sd(mean[0], sd[0])} mm from their described place, in all scans"
-        ),
+        in_words("the printed edges lie {0} mm from their described place, in all scans"),
     )
 
 
@@ -73,10 +71,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
             {"offset_mm": "mm"},
             0.003 * of.length_mm,
             lambda value, theta, plan: _with_shifted_patterns(value, theta * scan_indicator(plan, (name,)), plan),
-            lambda mean, sd: (
-                f"in {scans_in_words((name,))} the pattern lies {value_with_sd(mean[0], sd[0])} mm from where it lies "
-                "in the others"
-            ),
+            in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others"),
             where=Where(scans=(name,)),
         )
 
@@ -144,19 +139,14 @@ def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
             continue
         line = ScanLine(angle, float(across.mean()), float(along.min()), float(along.max()))
         for k, other in enumerate(found):
-            if _are_one_line(line, other):
+            apart = line.offset_mm / line.length_mm - other.offset_mm / other.length_mm
+            if abs(line.angle_rad - other.angle_rad) < _ONE_DIRECTION_RAD and abs(apart) < 0.5 * _STRAIGHT:
                 low_mm, high_mm = min(line.low_mm, other.low_mm), max(line.high_mm, other.high_mm)
                 found[k] = replace(other, low_mm=low_mm, high_mm=high_mm)
                 break
         else:
             found.append(line)
     return tuple(found)
-
-
-def _are_one_line(line: ScanLine, other: ScanLine) -> bool:
-    """Return whether two lines have one direction and, as shares of their lengths, one offset."""
-    apart = line.offset_mm / line.length_mm - other.offset_mm / other.length_mm
-    return abs(line.angle_rad - other.angle_rad) < _ONE_DIRECTION_RAD and abs(apart) < 0.5 * _STRAIGHT
 
 
 def _principal_angle_rad(places_mm: FloatArray) -> float:
@@ -244,6 +234,9 @@ def _patch(kind: LightEffect, of: Extent, size: str, unit: str, typical: float, 
     return one_of([on_line(line) for line in distinct_scan_lines(of.plan)])
 
 
+_NEAR = "within {3} mm of the place ({1}, {2}) mm"
+
+
 @light_effect("glint", Stage.OFFSET, "a glint at one place", ("place",))
 def glint(kind: LightEffect, of: Extent) -> Effect | None:
     """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y)."""
@@ -252,15 +245,8 @@ def glint(kind: LightEffect, of: Extent) -> Effect | None:
         amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
         return value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r)
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
-            f"{value_with_sd(mean[2], sd[2])}) mm the readings are "
-            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} too {'high' if mean[0] > 0 else 'low'}, over black "
-            "and white alike: a reflection"
-        )
-
-    return _patch(kind, of, "amp", "reading", 0.02 * of.span, act, says)
+    says = f"{_NEAR} the readings are {{|0|}} too {{high/low}}, over black and white alike: a reflection"
+    return _patch(kind, of, "amp", "reading", 0.02 * of.span, act, in_words(says, of.reading_unit))
 
 
 @light_effect("albedo_gradient", Stage.SCENE, "unevenly white paper", ("place",), counts="place")
@@ -273,17 +259,12 @@ def albedo_gradient(kind: LightEffect, of: Extent) -> Effect:
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return _with_changed_regions(value, plan, lambda region: RegionWithGradient(region, theta, of.origin))
 
-    return kind.linear(
-        of,
-        {"per_mm_x": "1/mm", "per_mm_y": "1/mm"},
-        0.02 / of.length_mm,
-        act,
-        lambda mean, sd: (
-            f"the signal over white changes by {value_with_sd(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
-            f"{value_with_sd(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
-            "its illumination is uneven"
-        ),
+    says = (
+        "the signal over white changes by {0} % per 100 mm along X and by {1} % per 100 mm along Y, that over black "
+        "does not: the paper or its illumination is uneven"
     )
+    units = {"per_mm_x": "1/mm", "per_mm_y": "1/mm"}
+    return kind.linear(of, units, 0.02 / of.length_mm, act, in_words(says, factors=(1e4, 1e4)))
 
 
 @light_effect("albedo_patch", Stage.SCENE, "a stain on the paper", ("place",))
@@ -293,14 +274,8 @@ def albedo_patch(kind: LightEffect, of: Extent) -> Effect | None:
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return _with_changed_regions(value, plan, lambda region: RegionWithPatch(region, theta))
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        return (
-            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
-            f"{value_with_sd(mean[2], sd[2])}) mm every pattern is {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
-            f"{'whiter' if mean[0] > 0 else 'darker'} than it should be: a stain or a worn area"
-        )
-
-    return _patch(kind, of, "albedo", "1", 0.05, act, says)
+    says = f"{_NEAR} every pattern is {{|0|}} % {{whiter/darker}} than it should be: a stain or a worn area"
+    return _patch(kind, of, "albedo", "1", 0.05, act, in_words(says, factors=(100,)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,9 +386,9 @@ def height_gradient(kind: LightEffect, of: Extent) -> Effect:
         {"mm_per_mm": "mm/mm"},
         0.01 * _nominal_height_mm(of.plan) / of.length_mm,
         act,
-        lambda mean, sd: (
-            f"the sensor's height above the surface {'grows' if mean[0] > 0 else 'shrinks'} by "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} mm per 100 mm along X: the table slopes"
+        in_words(
+            "the sensor's height above the surface {grows/shrinks} by {|0|} mm per 100 mm along X: the table slopes",
+            factors=(100,),
         ),
     )
 
@@ -435,10 +410,7 @@ def height_offset(kind: LightEffect, of: Extent) -> Effect | None:
             {"mm": "mm"},
             0.01 * _nominal_height_mm(of.plan),
             act,
-            lambda mean, sd: (
-                f"in {scans_in_words(scans)} the sensor hangs {value_with_sd(abs(mean[0]), sd[0])} mm "
-                f"{'higher' if mean[0] > 0 else 'lower'} than in the others"
-            ),
+            in_words(f"in {scans_in_words(scans)} the sensor hangs {{|0|}} mm {{higher/lower}} than in the others"),
             where=Where(scans=scans),
         )
 
@@ -461,9 +433,8 @@ def slow_sinking(kind: LightEffect, of: Extent) -> Effect:
         {"per_hour": "1/h"},
         0.01 / (of.duration_s / 3600),
         lambda value, theta, plan: footprint_at_added_height(value, theta[:, :1] * of.origin.hours(plan), plan),
-        lambda mean, sd: (
-            f"the sensor {'rises' if mean[0] > 0 else 'sinks'} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
-            "of its height per hour: it is loose in its holder"
+        in_words(
+            "the sensor {rises/sinks} by {|0|} % of its height per hour: it is loose in its holder", factors=(100,)
         ),
     )
 
@@ -492,7 +463,7 @@ def edge_blur(kind: LightEffect, of: Extent) -> Effect:
         {"sd_mm": "mm"},
         0.02 * of.length_mm,
         act,
-        lambda mean, sd: f"the printed edges are soft: blurred by {value_with_sd(mean[0], sd[0])} mm (sd)",
+        in_words("the printed edges are soft: blurred by {0} mm (sd)"),
         positive=True,
         kind=_BlurEffect,
     )
@@ -536,9 +507,9 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
         ("1", "mm"),
         act,
         single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5)),
-        lambda mean, sd: (
-            f"a wide halo around the sensor's spot, of sd {value_with_sd(mean[1], sd[1])} mm, contributes "
-            f"{value_with_sd(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
+        in_words(
+            "a wide halo around the sensor's spot, of sd {1} mm, contributes {0} % of the light: the lens scatters it",
+            factors=(100,),
         ),
     )
 
@@ -579,22 +550,18 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
             distance[:, rows] = part
         return replace(value, seen=value.seen - theta[:, :1] * gaussian_bump(distance**2, theta[:, 1:2]))
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        where = f" of pattern {', '.join(patterns)}" if patterns else ""
-        why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"
-        return (
-            f"within {value_with_sd(mean[1], sd[1])} mm of an edge{where} the surface looks "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'darker' if mean[0] > 0 else 'brighter'} than the "
-            f"pattern explains: {why}"
-        )
-
+    where = f"of an edge of pattern {', '.join(patterns)}" if patterns else "of an edge"
+    says = (
+        f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains: the edge "
+        "{casts a shadow/reflects light}"
+    )
     found = kind.bind(
         of,
         {"amp": HeavyTailedPrior(typical), "w": LogUniform(narrowest_mm, widest_mm)},
         ("1", "mm"),
         act,
         single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6)),
-        says,
+        in_words(says, factors=(100,)),
         where=Where(patterns=patterns),
     )
     return replace(found, source=partial(edge_shadow_of_patterns, kind, of, patterns))
@@ -618,19 +585,18 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
         share = np.clip(theta[:, :1, None], 0.0, 1.0)
         turn = plan.orientation_rad[None, :, None]
         dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
+        shapes = {"var_u": value.var_u, "var_v": value.var_v, "cov_uv": value.cov_uv}
 
         def doubled(first: FloatArray, second: FloatArray) -> FloatArray:
             shape = np.broadcast_shapes(first.shape, second.shape)
             return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)
 
-        return Footprint(
+        return replace(
+            value,
             weight=doubled(value.weight * (1 - share), value.weight * share),
             u_mm=doubled(value.u_mm, value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy),
             v_mm=doubled(value.v_mm, value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy),
-            var_u=doubled(value.var_u, value.var_u),
-            var_v=doubled(value.var_v, value.var_v),
-            cov_uv=doubled(value.cov_uv, value.cov_uv),
-            brightness=value.brightness,
+            **{name: doubled(own, own) for name, own in shapes.items()},
         )
 
     angles, reach = 2 * math.pi * np.arange(_ANGLES) / _ANGLES, Uniform(-farthest_mm, farthest_mm)
@@ -641,8 +607,9 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
         ("1", "mm", "mm"),
         act,
         single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()),
-        lambda mean, sd: (
-            f"a second spot, {value_with_sd(mean[1], sd[1])} mm along X and {value_with_sd(mean[2], sd[2])} mm along Y "
-            f"from the first, contributes {value_with_sd(mean[0], sd[0], factor=100)} % of the light: a reflection"
+        in_words(
+            "a second spot, {1} mm along X and {2} mm along Y from the first, contributes {0} % of the light: a "
+            "reflection",
+            factors=(100,),
         ),
     )

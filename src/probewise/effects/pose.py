@@ -16,6 +16,7 @@ from probewise.effects.effect import (
     LightEffect,
     WaveEffect,
     Where,
+    in_words,
     light_effect,
     one_of,
     scans_in_words,
@@ -31,12 +32,17 @@ from probewise.sensor.stages import Poses, Stage
 _STILL_MM = 1e-6  # a smaller step of an axis is rounding
 _TURN_DEG = 3.0  # of a mount set by eye
 _LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
+_FURTHER = "{|0|} degrees further {anticlockwise/clockwise} than commanded"
 _UNIT_MM = 10.0
 _MOST_PLACES = 160
 _N_PERIODS, _N_LONG = 40, 8  # of the bank of a periodic error, within the range and longer
 _N_WAVES, _N_PHASES = 32, 6  # of the bank of stick-slip
 _ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of the period
 _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
+
+
+def _always(plan: Plan) -> bool:
+    return True
 
 
 def _moved(poses: Poses, dx_mm: FloatArray, dy_mm: FloatArray) -> Poses:
@@ -99,31 +105,16 @@ def position_scale(kind: LightEffect, of: Extent) -> Effect:
     x_mm, y_mm, typical = of.origin.x_mm, of.origin.y_mm, 0.01
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return replace(
-            value,
-            x_mm=x_mm + (value.x_mm - x_mm) * (1 + theta[:, :1]),
-            y_mm=y_mm + (value.y_mm - y_mm) * (1 + theta[:, 1:2]),
-        )
+        x, y = x_mm + (value.x_mm - x_mm) * (1 + theta[:, :1]), y_mm + (value.y_mm - y_mm) * (1 + theta[:, 1:2])
+        return replace(value, x_mm=x, y_mm=y)
 
-    found = kind.linear(
-        of,
-        {"x": "1", "y": "1"},
-        typical,
-        act,
-        lambda mean, sd: (
-            f"the arm moves {value_with_sd(mean[0], sd[0], factor=100)} % too far along X and "
-            f"{value_with_sd(mean[1], sd[1], factor=100)} % along Y: the scale of its positions is wrong"
-        ),
-    )
+    says = "the arm moves {0} % too far along X and {1} % along Y: the scale of its positions is wrong"
+    found = kind.linear(of, {"x": "1", "y": "1"}, typical, act, in_words(says, factors=(100, 100)))
     return replace(found, entries=np.array([typical, *_LARGE_SCALES])[:, None, None] * np.eye(2))
 
 
 @light_effect(
-    "orientation_error",
-    Stage.POSE,
-    "a wrong sensor angle in all scans",
-    ("orientation",),
-    is_absorbed_by_ssf=lambda plan: True,
+    "orientation_error", Stage.POSE, "a wrong sensor angle in all scans", ("orientation",), is_absorbed_by_ssf=_always
 )
 def orientation_error(kind: LightEffect, of: Extent) -> Effect:
     """The sensor is turned by deg more than was commanded, in all scans, anticlockwise: its SSF absorbs this."""
@@ -132,7 +123,7 @@ def orientation_error(kind: LightEffect, of: Extent) -> Effect:
         {"deg": "deg"},
         _TURN_DEG,
         lambda value, theta, plan: _turned(value, np.radians(theta)),
-        lambda mean, sd: f"in all scans the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}",
+        in_words(f"in all scans the sensor is turned {_FURTHER}"),
     )
 
 
@@ -146,17 +137,12 @@ def scan_angle_error(kind: LightEffect, of: Extent) -> Effect | None:
             {"deg": "deg"},
             _TURN_DEG,
             lambda value, theta, plan: _turned(value, np.radians(theta) * scan_indicator(plan, scans)),
-            lambda mean, sd: f"in {scans_in_words(scans)} the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}",
+            in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"),
             sizes=(1.0, -8.0, 8.0, -14.0, 14.0),
             where=Where(scans=scans),
         )
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
-
-
-def _extra_turn_in_words(deg: float, sd: float) -> str:
-    way = "anticlockwise" if deg > 0 else "clockwise"
-    return f"{value_with_sd(abs(deg), sd)} degrees further {way} than commanded"
 
 
 @light_effect("sensor_tilt", Stage.POSE, "a tilted sensor", ("orientation", "slope"))
@@ -170,16 +156,10 @@ def sensor_tilt(kind: LightEffect, of: Extent) -> Effect:
         ratio = height_ratio(plan)
         return _moved(value, *(theta[:, k : k + 1] if ratio is None else theta[:, k : k + 1] * ratio for k in (0, 1)))
 
-    return kind.linear(
-        of,
-        {"dx_mm": "mm", "dy_mm": "mm"},
-        0.003 * of.length_mm,
-        act,
-        lambda mean, sd: (
-            f"the sensor's spot is off by {value_with_sd(mean[0], sd[0])} mm along X and "
-            f"{value_with_sd(mean[1], sd[1])} mm along Y, whatever the orientation: the sensor is tilted"
-        ),
+    says = in_words(
+        "the sensor's spot is off by {0} mm along X and {1} mm along Y, whatever the orientation: the sensor is tilted"
     )
+    return kind.linear(of, {"dx_mm": "mm", "dy_mm": "mm"}, 0.003 * of.length_mm, act, says)
 
 
 @light_effect("bent_rails", Stage.POSE, "bent rails", ("place", "slope"), counts="place")
@@ -220,10 +200,7 @@ def missing_tooth(kind: LightEffect, of: Extent) -> Effect | None:
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         axis = "Y" if mean[2] > 0.5 else "X"
-        return (
-            f"beyond {axis} = {value_with_sd(mean[1], sd[1])} mm the arm is {value_with_sd(mean[0], sd[0])} mm off "
-            f"along {axis}: a tooth is missing"
-        )
+        return in_words(f"beyond {axis} = {{1}} mm the arm is {{0}} mm off along {axis}: a tooth is missing")(mean, sd)
 
     def between(low_mm: float, high_mm: float, axis: int) -> Effect:
         at, which = Uniform(low_mm, high_mm), Uniform(axis - 0.5, axis + 0.5)
@@ -246,17 +223,12 @@ def arm_knock(kind: LightEffect, of: Extent) -> Effect | None:
         moved = _moved(value, theta[:, :1] * after, theta[:, 1:2] * after)
         return _turned(moved, np.deg2rad(theta[:, 2:3]) * after)
 
-    typical_mm = 0.005 * of.length_mm
-    return kind.step(
-        of,
-        {"dx_mm": (typical_mm, "mm"), "dy_mm": (typical_mm, "mm"), "turn_deg": (2.0, "deg")},
-        act,
-        lambda mean, sd: (
-            f"from {value_with_sd(mean[3], sd[3])} s on, all positions are off by {value_with_sd(mean[0], sd[0])} mm "
-            f"along X and {value_with_sd(mean[1], sd[1])} mm along Y, and the sensor is turned by "
-            f"{value_with_sd(mean[2], sd[2])} degrees: the arm or the paper was pushed"
-        ),
+    says = in_words(
+        "from {3} s on, all positions are off by {0} mm along X and {1} mm along Y, and the sensor is turned by {2} "
+        "degrees: the arm or the paper was pushed"
     )
+    typical = 0.005 * of.length_mm, "mm"
+    return kind.step(of, {"dx_mm": typical, "dy_mm": typical, "turn_deg": (2.0, "deg")}, act, says)
 
 
 @light_effect("slow_turn", Stage.POSE, "a sensor that slowly turns", ("time", "orientation"), counts="time")
@@ -267,18 +239,12 @@ def slow_turn(kind: LightEffect, of: Extent) -> Effect:
         {"deg_per_hour": "deg/h"},
         2.0 / (of.duration_s / 3600),
         lambda value, theta, plan: _turned(value, np.deg2rad(theta[:, :1]) * of.origin.hours(plan)),
-        lambda mean, sd: (
-            f"the sensor turns by {value_with_sd(mean[0], sd[0])} degrees per hour: it is loose in its holder"
-        ),
+        in_words("the sensor turns by {0} degrees per hour: it is loose in its holder"),
     )
 
 
 @light_effect(
-    "periodic_position_error",
-    Stage.POSE,
-    "a periodic position error of the arm",
-    ("place", "slope"),
-    counts="place",
+    "periodic_position_error", Stage.POSE, "a periodic position error of the arm", ("place", "slope"), counts="place"
 )
 def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
     """A gear or lead screw that is not round: X + amp_mm sin(2 pi (X - X0) / period_mm + phase), X0 of the origin."""
@@ -300,9 +266,9 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
         ("mm", "mm", "rad"),
         act,
         sine_and_cosine_entries(typical_mm, np.maximum(periods, shortest_mm * 1.001)),
-        lambda mean, sd: (
-            f"the arm's position along X is off by up to {value_with_sd(mean[0], sd[0])} mm, with a period of "
-            f"{value_with_sd(mean[1], sd[1])} mm: a gear or lead screw is not round"
+        in_words(
+            "the arm's position along X is off by up to {0} mm, with a period of {1} mm: a gear or lead screw is not "
+            "round"
         ),
         kind=WaveEffect,
     )
@@ -330,9 +296,8 @@ def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
         ("mm", "mm", "1"),
         act,
         single_column_bank(typical_mm, periods.ravel(), phases.ravel()),
-        lambda mean, sd: (
-            f"the slide sticks and then jumps by {value_with_sd(abs(mean[0]), sd[0], factor=2)} mm, once every "
-            f"{value_with_sd(mean[1], sd[1])} mm along X: it lacks lubrication"
+        in_words(
+            "the slide sticks and then jumps by {|0|} mm, once every {1} mm along X: it lacks lubrication", factors=(2,)
         ),
     )
 

@@ -11,6 +11,7 @@ from probewise.effects.effect import (
     Effect,
     LightEffect,
     WaveEffect,
+    in_words,
     light_effect,
     sine_and_cosine_entries,
     single_column_bank,
@@ -77,10 +78,10 @@ def gain_drift(kind: LightEffect, of: Extent) -> Effect:
         ("1", "s"),
         act,
         single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 7)),
-        lambda mean, sd: (
-            f"the signal starts {value_with_sd(abs(mean[0]), sd[0], factor=100)} % "
-            f"{'too strong' if mean[0] > 0 else 'too weak'} at time 0 and settles "
-            f"with a time constant of {value_with_sd(mean[1], sd[1])} s: the lamp warms up"
+        in_words(
+            "the signal starts {|0|} % {too strong/too weak} at time 0 and settles with a time constant of {1} s: the "
+            "lamp warms up",
+            factors=(100,),
         ),
     )
 
@@ -102,9 +103,9 @@ def battery_sag(kind: LightEffect, of: Extent) -> Effect | None:
         {"per_volt": "1/V"},
         _SHARE / fall,
         lambda value, theta, plan: value * (1 + theta[:, :1] * _volts_above_reference(plan)),
-        lambda mean, sd: (
-            f"the signal {'loses' if mean[0] > 0 else 'gains'} {value_with_sd(abs(mean[0]), sd[0], factor=100)} % for "
-            "each volt that the battery falls: the lamp follows the battery"
+        in_words(
+            "the signal {loses/gains} {|0|} % for each volt that the battery falls: the lamp follows the battery",
+            factors=(100,),
         ),
     )
 
@@ -128,10 +129,9 @@ def gain_jump(kind: LightEffect, of: Extent) -> Effect | None:
         of,
         {"frac": (_SHARE, "1")},
         lambda value, theta, after: value * (1 + theta[:, :1] * after),
-        lambda mean, sd: (
-            f"from {value_with_sd(mean[1], sd[1])} s on, the signal is "
-            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {'stronger' if mean[0] > 0 else 'weaker'}: "
-            "the lamp or the lens changed suddenly"
+        in_words(
+            "from {1} s on, the signal is {|0|} % {stronger/weaker}: the lamp or the lens changed suddenly",
+            factors=(100,),
         ),
     )
 
@@ -166,15 +166,17 @@ def ambient_gradient(kind: LightEffect, of: Extent) -> Effect | None:
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from the origin."""
     if not (varies(of.plan.x_mm) or varies(of.plan.y_mm)):
         return None
-    at, unit = of.origin, of.reading_unit
+    at = of.origin
     return kind.linear(
         of,
         {"per_mm_x": "reading/mm", "per_mm_y": "reading/mm"},
         0.01 * of.span / of.length_mm,
         lambda value, theta, plan: value + theta[:, :1] * (plan.x_mm - at.x_mm) + theta[:, 1:2] * (plan.y_mm - at.y_mm),
-        lambda mean, sd: (
-            f"the reading changes by {value_with_sd(mean[0], sd[0], unit, factor=100)} per 100 mm along X and by "
-            f"{value_with_sd(mean[1], sd[1], unit, factor=100)} per 100 mm along Y, {_ALIKE}: stray light from one side"
+        in_words(
+            f"the reading changes by {{0}} per 100 mm along X and by {{1}} per 100 mm along Y, {_ALIKE}: stray light "
+            "from one side",
+            *(of.reading_unit, of.reading_unit),
+            factors=(100, 100),
         ),
     )
 
@@ -187,10 +189,9 @@ def offset_drift(kind: LightEffect, of: Extent) -> Effect:
         {"per_hour": "reading/h"},
         0.01 * of.span / (of.duration_s / 3600),
         lambda value, theta, plan: value + theta[:, :1] * of.origin.hours(plan),
-        lambda mean, sd: (
-            f"the reading {'rises' if mean[0] > 0 else 'falls'} by "
-            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} per hour, {_ALIKE}: "
-            "the electronics or the room light drift"
+        in_words(
+            f"the reading {{rises/falls}} by {{|0|}} per hour, {_ALIKE}: the electronics or the room light drift",
+            of.reading_unit,
         ),
     )
 
@@ -202,10 +203,9 @@ def ambient_step(kind: LightEffect, of: Extent) -> Effect | None:
         of,
         {"amp": (0.01 * of.span, "reading")},
         lambda value, theta, after: value + theta[:, :1] * after,
-        lambda mean, sd: (
-            f"the reading {'jumps up' if mean[0] > 0 else 'drops'} by "
-            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit)} at {value_with_sd(mean[1], sd[1])} s and stays "
-            f"there, {_ALIKE}: the room light changed"
+        in_words(
+            f"the reading {{jumps up/drops}} by {{|0|}} at {{1}} s and stays there, {_ALIKE}: the room light changed",
+            of.reading_unit,
         ),
         is_thinned=False,
     )
@@ -254,10 +254,11 @@ def hysteresis(kind: LightEffect, of: Extent) -> Effect | None:
         {"amp": "reading"},
         0.01 * of.span,
         lambda value, theta, plan: value + theta[:, :1] * sign_of_motion(plan),
-        lambda mean, sd: (
-            f"readings {_IN_DIRECTION[most]} are "
-            f"{value_with_sd(abs(mean[0]), sd[0], of.reading_unit, factor=most - least)} "
-            f"{'higher' if mean[0] > 0 else 'lower'} than those {_IN_DIRECTION[least]}, {_ALIKE}: hysteresis"
+        in_words(
+            f"readings {_IN_DIRECTION[most]} are {{|0|}} {{higher/lower}} than those {_IN_DIRECTION[least]}, {_ALIKE}: "
+            "hysteresis",
+            of.reading_unit,
+            factors=(most - least,),
         ),
     )
 
@@ -282,10 +283,7 @@ def lag(kind: LightEffect, of: Extent) -> Effect:
         ("s",),
         act,
         single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7)),
-        lambda mean, sd: (
-            f"each reading keeps part of the previous one, with a time constant of {value_with_sd(mean[0], sd[0])} s: "
-            "the electronics lag"
-        ),
+        in_words("each reading keeps part of the previous one, with a time constant of {0} s: the electronics lag"),
         amplitudes=(),
         absent={0: 0.0},
     )
@@ -307,19 +305,17 @@ def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
         rise = np.maximum(np.diff(value, axis=1, prepend=value[:, :1]), 0.0)
         return value + theta[:, :1] * decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        share, tau = value_with_sd(abs(mean[0]), sd[0], factor=100), value_with_sd(mean[1], sd[1])
-        if mean[0] > 0:
-            return f"each rise of the signal overshoots by {share} %, which decay with a time constant of {tau} s"
-        return f"{share} % of each rise of the signal comes late, with a time constant of {tau} s"
-
+    above = "each rise of the signal overshoots by {0} %, which decay"
+    late = "{|0|} % of each rise of the signal comes late,"
     return kind.bind(
         of,
         {"share": HeavyTailedPrior(_SHARE), "tau_s": LogUniform(shortest_s, longest_s)},
         ("1", "s"),
         act,
         single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 6)),
-        says,
+        lambda mean, sd: in_words(f"{above if mean[0] > 0 else late} with a time constant of {{1}} s", factors=(100,))(
+            mean, sd
+        ),
     )
 
 

@@ -108,30 +108,6 @@ class TrajectoryCache:
                 del self.known[key]
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedSteps:
-    """States (n_states, n_samples, n_steps + 1, n_runs), and the mask `done` (n_samples,) of converged samples.
-
-    `bands` holds the last Jacobian, as of `_bands_of_jacobian`, by sample index, where one was computed. `moved`
-    (n_samples,) is the largest change of any state from the trajectory that a sample began from, in that state's
-    largest absolute value. `n_evaluated`, the cost, is the number of steps evaluated, of all samples and runs.
-    """
-
-    states: FloatArray
-    done: BoolArray
-    bands: Mapping[int, FloatArray]
-    moved: FloatArray
-    n_evaluated: int
-
-    def new_trajectories_to_cache(self, theta: FloatArray) -> list[KnownTrajectory]:
-        """Return up to eight converged trajectories, of samples theta, that are far from the known ones."""
-        worth = np.flatnonzero(self.done & (self.moved > _FAR))[:_MOST_NEW]
-        return [
-            KnownTrajectory(theta[k].copy(), self.states[:, k].copy(), [self.bands[k]] if k in self.bands else [])
-            for k in worth.tolist()
-        ]
-
-
 def integrate_from_known_trajectories(
     law_and_inputs: LawAndInputs,
     steps: Steps,
@@ -162,10 +138,11 @@ def integrate_from_known_trajectories(
     if known:
         try:
             with np.errstate(all="ignore"):
-                solved = solve_all_steps(law_and_inputs, steps, known, nearest)
+                solved, new = _solve_all_steps(law_and_inputs, steps, known, nearest)
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
-            memory.add(steps, effects, solved.new_trajectories_to_cache(theta))
+            found = [KnownTrajectory(theta[k].copy(), states[:, k].copy(), bands) for k, bands in new.items()]
+            memory.add(steps, effects, found)
             memory.n_refused = 0
         except Exception:  # of the law: for these samples, or for more columns than there are runs
             refused = True
@@ -179,19 +156,22 @@ def integrate_from_known_trajectories(
         else:
             states[:, left] = there
         cost += n_parts_of_steps(motion, steps)
-        finite = np.isfinite(there).all(axis=(0, 2, 3))
-        new = np.flatnonzero(finite)[:_MOST_NEW].tolist()
-        memory.add(steps, effects, [KnownTrajectory(theta[left[k]], there[:, k]) for k in new])
+        finite = np.flatnonzero(np.isfinite(there).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
+        memory.add(steps, effects, [KnownTrajectory(theta[left[k]], there[:, k]) for k in finite])
     assert states is not None
     motion = law_and_inputs(np.arange(1))[0]
     cost *= evaluations_per_step(motion, steps.method)
     return dict(zip(motion.law.states, steps.states_at_rows(states), strict=True)), cost
 
 
-def solve_all_steps(
+def _solve_all_steps(
     law_and_inputs: LawAndInputs, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray
-) -> SolvedSteps:
-    """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known."""
+) -> tuple[_NewtonState, dict[int, list[FloatArray]]]:
+    """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known.
+
+    With the solution come up to eight converged samples that are far from the trajectories they began from, each with
+    its last Jacobian, as of `_bands_of_jacobian`, where one was computed.
+    """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
     _iterate_with_shared_jacobians(search, known, nearest)
@@ -200,8 +180,8 @@ def solve_all_steps(
     search.states[:, astray, 1:] = guess[:, astray, 1:]
     search.change[~search.done] = np.inf
     bands = _iterate_with_own_jacobians(search)
-    moved = _largest_relative_change(search.states - guess, guess)
-    return SolvedSteps(search.states, search.done, bands, moved, search.n_evaluated)
+    far = search.done & (_largest_relative_change(search.states - guess, guess) > _FAR)
+    return search, {k: [bands[k]] if k in bands else [] for k in np.flatnonzero(far)[:_MOST_NEW].tolist()}
 
 
 def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
@@ -327,7 +307,7 @@ def _stepping_function(
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
     n_steps = len(gap) * steps.n_runs
-    return states_after_each_step, sum(n_steps if part.columns is None else len(part.columns) for part in parts)
+    return states_after_each_step, sum(n_steps if columns is None else len(columns) for columns, *_ in parts)
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import FileError, ParameterError, ShapeError, message_of
 from probewise.progress import Progress
+from probewise.recordings.cells import first_cell_without_number
 from probewise.recordings.io import EndedByFile
 from probewise.systems.simulator import Simulate, Simulator, read_simulator
 
@@ -229,7 +230,11 @@ class Caller:
         if changed not in self._taken_together:
             trial = Caller(self.simulate, broadcasts=True, name=self.name)
             own = {name: values[[0, -1]] for name, values in parameters.items()}
-            given = {n: _column_and_altered_copy(v[0]) if n in changed else v for n, v in columns.items()}
+            given = dict(columns)
+            for name in changed:  # a column, and a copy raised by about 1 % of its size
+                own_column = columns[name][0]
+                size = float(np.nanmax(np.abs(own_column), initial=0.0)) or 1.0
+                given[name] = np.stack([own_column, 1.01 * own_column + 0.01 * size])
             shape = 2, max(np.shape(v)[-1] for v in columns.values())
             try:
                 together = trial._call_together(own, given, shape, strict=True)
@@ -288,7 +293,10 @@ class Caller:
     def _interpolation(
         self, own: Mapping[str, Any], n_points: int
     ) -> Iterator[tuple[FloatArray | None, Mapping[str, Any]]]:
-        """Yield arguments of calls for one sample, and the share of each in every reading; None for a single call."""
+        """Yield arguments of calls for one sample, and the share of each in every reading; None for a single call.
+
+        A share is that of Lagrange's interpolation.
+        """
         vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
         if not vary:
             yield None, own
@@ -297,7 +305,8 @@ class Caller:
         for at in itertools.product(*(range(len(each)) for each in nodes)):
             share = np.ones(n_points)
             for name, each, i in zip(vary, nodes, at, strict=True):
-                share = share * _lagrange_basis(each, i, own[name])
+                others = np.delete(each, i)
+                share = share * np.prod((own[name][:, None] - others) / (each[i] - others), axis=1)
             yield share, {**own, **{name: float(each[i]) for name, each, i in zip(vary, nodes, at, strict=True)}}
 
 
@@ -438,12 +447,6 @@ def _values_of_sample(
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
 
 
-def _column_and_altered_copy(values: FloatArray) -> FloatArray:
-    """Return a column (n_points,) and a copy raised by about 1 % of its size, (2, n_points)."""
-    size = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
-    return np.stack([values, 1.01 * values + 0.01 * size])
-
-
 def _chebyshev_nodes(values: FloatArray) -> FloatArray:
     """Return five interpolation nodes over the range of values; one if they are equal."""
     low, high = float(np.min(values)), float(np.max(values))
@@ -451,12 +454,6 @@ def _chebyshev_nodes(values: FloatArray) -> FloatArray:
         return np.array([low])
     places = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))
     return low + (high - low) * places
-
-
-def _lagrange_basis(nodes: FloatArray, i: int, at: FloatArray) -> FloatArray:
-    """Return the Lagrange polynomial that is 1 at node i and 0 at the others, at `at`, (n_points,)."""
-    others = np.delete(nodes, i)
-    return np.asarray(np.prod((at[:, None] - others) / (nodes[i] - others), axis=1))
 
 
 def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
@@ -514,7 +511,8 @@ def user_function_error(
     elif is_of_values and way_out:
         allowed = way_out
     elif is_of_values and texts:
-        shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
+        cells = {name: columns[name].tolist() for name in texts[:4]}
+        shown = ", ".join(f"{name} ({v[first_cell_without_number(v) or 0]!r})" for name, v in cells.items())
         allowed = f"calculations with numeric columns; these contain text: {shown}"
     elif law is not None and what == "rates":
         allowed = f"a function that returns a rate for each state somewhere in the prior: {', '.join(law.states)}"
@@ -522,13 +520,3 @@ def user_function_error(
         n_rows = max((np.shape(values)[-1] for values in columns.values()), default=0)
         allowed = f"a function that returns a reading for each of the {n_rows} rows somewhere in the prior"
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
-
-
-def _first_non_numeric_cell(values: NDArray[Any]) -> str:
-    """Return the first cell that is not a number; the first cell if all are numbers, "" if there is none."""
-    for cell in values.tolist():
-        try:
-            float(cell)
-        except ValueError:
-            return str(cell)
-    return str(values[0]) if len(values) else ""

@@ -328,11 +328,12 @@ def step_in_part(
 
     `gap` is the time of the gap in which each column's step lies, (1 or n_samples, n_columns).
     """
-    if part.columns is None:
-        return Stepper(motion, method, part.inputs, gap).step(s, part.begin, part.length)
-    stepper = Stepper(motion, method, part.inputs, of_columns(gap, part.columns))
-    some = {state: values[:, part.columns] for state, values in s.items()}
-    return _with_columns(s, part.columns, stepper.step(some, part.begin, part.length))
+    columns, inputs, begin, length = part
+    if columns is None:
+        return Stepper(motion, method, inputs, gap).step(s, begin, length)
+    stepper = Stepper(motion, method, inputs, of_columns(gap, columns))
+    some = {state: values[:, columns] for state, values in s.items()}
+    return _with_columns(s, columns, stepper.step(some, begin, length))
 
 
 def _with_columns(s: Mapping[str, Any], columns: IntArray, new: Mapping[str, Any]) -> dict[str, Any]:

@@ -159,62 +159,46 @@ def _with_added(known: Mapping[str, FloatArray], name: str, value: FloatArray) -
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """Values by name between the rows: `held` over a gap, read-only, or on straight `lines` with their rise over it.
+class StepInputs:
+    """Parameters and columns, in that order, by name: `held` over a gap, read-only, or on straight `lines` over it.
 
     Over a table arrays are (1 or n_samples, n_places, n_runs), those of a constant (1 or n_samples, 1, 1 or n_runs);
     of some steps (1 or n_samples, n_columns), with a column for each step and run, the runs of a step in turn, or 1.
     """
 
-    held: Mapping[str, Any]
-    lines: Mapping[str, Line]
-
-    def at(self, share: Any) -> Mapping[str, Any]:
-        """Return the values at a share of the gap: read-only arrays."""
-        if not self.lines:
-            return self.held
-        out = dict(self.held)
-        for name, (low, rise) in self.lines.items():
-            out[name] = value = low + share * rise
-            value.setflags(False)  # of writing; a keyword would double the time
-        return out
-
-    def mapped(self, chosen: Callable[[Any], Any]) -> Course:
-        """Return it with a function applied to every array."""
-        held = {name: chosen(values) for name, values in self.held.items()}
-        for values in held.values():
-            values.setflags(False)
-        return Course(held, {name: (chosen(low), chosen(rise)) for name, (low, rise) in self.lines.items()})
-
-
-@dataclass(frozen=True, eq=False)
-class StepInputs:
-    """Parameters and columns within some steps."""
-
-    parameters: Course
-    columns: Course
+    held: tuple[Mapping[str, Any], Mapping[str, Any]]
+    lines: tuple[Mapping[str, Line], Mapping[str, Line]]
 
     def __call__(self, share: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
         """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
-        return self.parameters.at(share), self.columns.at(share)
+        (p, u), (moving, sloping) = self.held, self.lines
+        return _values_on_lines(p, moving, share), _values_on_lines(u, sloping, share)
 
     def mapped(self, chosen: Callable[[Any], Any]) -> StepInputs:
         """Return them with a function applied to every array."""
-        return StepInputs(self.parameters.mapped(chosen), self.columns.mapped(chosen))
+        p, u = ({name: chosen(values) for name, values in each.items()} for each in self.held)
+        for values in (*p.values(), *u.values()):
+            values.setflags(False)
+        moving, sloping = ({name: (chosen(v), chosen(d)) for name, (v, d) in each.items()} for each in self.lines)
+        return StepInputs((p, u), (moving, sloping))
 
 
-@dataclass(frozen=True, eq=False)
-class StepPart:
-    """A part of some steps in which no input jumps or bends.
+def _values_on_lines(held: Mapping[str, Any], lines: Mapping[str, Line], share: Any) -> Mapping[str, Any]:
+    if not lines:
+        return held
+    out = dict(held)
+    for name, (low, rise) in lines.items():
+        out[name] = value = low + share * rise
+        value.setflags(False)  # of writing; a keyword would double the time
+    return out
 
-    `columns` are the indices of its columns of the states' arrays, None: all; `begin` and `length` are shares of the
-    gap between rows, numbers or arrays with one value per column.
-    """
 
-    columns: IntArray | None
-    inputs: StepInputs
-    begin: Any
-    length: Any
+StepPart = tuple[IntArray | None, StepInputs, Any, Any]
+"""A part of some steps in which no input jumps or bends: columns, inputs, begin and length.
+
+The first are indices of columns of the states' arrays, None: all; the last are shares of the gap between rows, numbers
+or arrays with one value per column.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,19 +240,22 @@ class LawInputs:
                 moving[name] = own, between.drifts[name][:, :, None] * steps.gaps
             else:
                 held[name] = own
-        at_rows = {name: values_at_rows(values, rows) for name, values in columns.items()}
-        sloping = {name for name, v in columns.items() if name == table.time or (linear and v.dtype == np.float64)}
-        of_columns = Course(
-            read_only_views({name: own for name, own in at_rows.items() if name not in sloping}),
-            {name: (own, np.diff(own, axis=1)) for name, own in at_rows.items() if name in sloping},
-        )
+        still: dict[str, Any] = {}
+        sloping: dict[str, Line] = {}
+        for name, values in columns.items():
+            own = values_at_rows(values, rows)
+            if name == table.time or (linear and values.dtype == np.float64):
+                sloping[name] = own, np.diff(own, axis=1)
+            else:
+                still[name] = own
+        over_table = StepInputs((read_only_views(held), read_only_views(still)), (moving, sloping))
         timeline = Timeline.of(table) if between.dead_times else None
         late = {
             name: LateColumn.of(timeline, columns[name], dead_time, linear=linear)
             for name, dead_time in between.dead_times.items()
             if timeline is not None
         }
-        return cls(steps, StepInputs(Course(read_only_views(held), moving), of_columns), late, between.jumps)
+        return cls(steps, over_table, late, between.jumps)
 
     def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
         """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""
@@ -291,7 +278,7 @@ class LawInputs:
         else those alone that have one.
         """
         if not (self.late or self.jumps):
-            yield StepPart(None, inputs, begin, length)
+            yield None, inputs, begin, length
             return
         rows = self.steps.row_by_position_and_run
         run = np.tile(np.arange(rows.shape[1]), len(gap))
@@ -307,7 +294,7 @@ class LawInputs:
             part = self._with_breaks(inputs, 0.5 * (now + np.where(over, last, stop)), run, start, gap_s)
             with np.errstate(divide="ignore", invalid="ignore"):
                 until = np.where(over, end, (stop - start) / gap_s)
-            yield StepPart(None if len(columns) == n_columns else columns, part, share, until - share)
+            yield None if len(columns) == n_columns else columns, part, share, until - share
             going = ~over.all(axis=0)
             if not going.any():
                 return
@@ -332,8 +319,7 @@ class LawInputs:
         self, inputs: StepInputs, at: FloatArray, run: IntArray, start: FloatArray, gap_s: FloatArray
     ) -> StepInputs:
         """Return inputs with the late columns and the parameters with jumps as they are around the times `at`."""
-        p, moving = dict(inputs.parameters.held), dict(inputs.parameters.lines)
-        u, sloping = dict(inputs.columns.held), dict(inputs.columns.lines)
+        (p, u), (moving, sloping) = map(dict, inputs.held), map(dict, inputs.lines)
         for name, late in self.late.items():
             value, slope = late.line_at(at, run, start)
             if late.linear:
@@ -346,7 +332,7 @@ class LawInputs:
                 moving[name] = moving[name][0] + own, moving[name][1]
             else:
                 p[name] = p[name] + own
-        return StepInputs(Course(read_only_views(p), moving), Course(read_only_views(u), sloping))
+        return StepInputs((read_only_views(p), read_only_views(u)), (moving, sloping))
 
 
 def of_columns(values: Any, columns: IntArray) -> Any:

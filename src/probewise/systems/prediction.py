@@ -15,7 +15,7 @@ from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
-from probewise.effects import AGAIN, EFFECTS, PROPOSAL, NamedEffect
+from probewise.effects import EFFECTS, NamedEffect
 from probewise.effects.noise import NoisePerRun, RandomWalk
 from probewise.effects.noise_distribution import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError
@@ -26,7 +26,7 @@ from probewise.recordings.prediction import prediction_summary
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
-from probewise.systems.forms.binding import has_value_per_run, rebind_forms
+from probewise.systems.forms.binding import has_value_per_run, jumps_at_row, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import STANDS_STILL, System, SystemChain, with_converged_step
 from probewise.systems.table import (
@@ -37,6 +37,7 @@ from probewise.systems.table import (
     median_sd_of_column,
     relative_sds_of_column,
     run_table_csv,
+    table_digest,
 )
 
 _FEW = 20  # samples used to find rows that cannot be predicted
@@ -54,7 +55,7 @@ class SystemPrediction(ShowsItself):
     together, in the unit of the readings as `mean`; it ignores the range. `log_density` is the natural logarithm of the
     predictive density of that row's reading alone, per unit of the reading, NaN without a reading; for a reading at an
     end of the declared range, it is the log probability of reading that end. `n_failed` of `n_samples` samples were
-    left out because the simulator gives no finite readings for them.
+    left out because the simulator gives no finite readings for them. `notes` say how runs were read and started.
     """
 
     table: RunTable
@@ -64,10 +65,12 @@ class SystemPrediction(ShowsItself):
     log_density: FloatArray
     n_samples: int
     n_failed: int = 0
+    notes: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """Return a text: the number of predicted readings; chi-square and log density per recorded reading."""
-        return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
+        """Return a text: notes; number of predicted readings; chi-square and log density per recorded reading."""
+        found = prediction_summary(self.readings, self.mean, self.sd, self.log_density)
+        return "\n".join([*(f"note: {note}" for note in self.notes), found])
 
 
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
@@ -121,6 +124,9 @@ def predict_system(
     that look back to it, such as a lag, take the number interpolated within the run. The effect of a column that counts
     from its mean is 0 where the column is missing, as in the fit.
 
+    Later rows of a recorded run follow its recorded rows, if the model has them, so that its state goes on from there;
+    otherwise the run is started again at its first row, which a note says.
+
     `table` is a RunTable, a dict of arrays, or a DataFrame of n_points rows, with the columns that the simulator and
     the effects use; `rng` is for runs outside the recording.
 
@@ -143,26 +149,29 @@ def predict_system(
     require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
+    whole = _with_recorded_rows_before(fitted, own)
+    before = len(whole) - len(own)
     system = replace(
-        System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, own)),
+        System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, whole)),
         max_step=fitted.max_step,
         stiff=fitted.stiff,
         limited=False,  # noise decides which readings are at an end of the range
     )
     chain = system.chain(own, bind_effects(fitted, own))
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
-    n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
-    given, lost = _filled_table_and_unpredictable_mask(chain, theta, own)
+    n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(whole)))
+    given, lost = _filled_table_and_unpredictable_mask(chain, theta, whole)
+    lost = lost[before:]
     chain = _chain_with_converged_step(chain, theta, given, float(np.median(fitted.noise_sd)))
     mixture = PredictiveMixture(
         recording.readings, recording.usable & ~lost, own.instrumentation.step, fitted.simulator.noise.ends
     )
     n_failed, never = 0, np.ones(len(own), dtype=np.bool_)
-    between = _smoothing_width_by_row(chain, theta, given) if is_drawn else None
+    between = _smoothing_width_by_row(chain, theta, given)[before:] if is_drawn else None
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
-        mean = np.where(lost, 0.0, chain.predict(block, given))
+        mean = np.where(lost, 0.0, chain.predict(block, given)[:, before:])
         there = np.isfinite(mean).all(axis=1)
         never &= ~np.isfinite(mean).any(axis=0)
         n_failed += int((~there).sum())
@@ -184,9 +193,48 @@ def predict_system(
         rows = f"{count_with_noun(int(lost.sum()), 'row')} cannot be predicted, first row {first_lost}"
         why = "a number that they need is missing; where an effect looks back to it, it is interpolated"
         warnings.warn(f"{rows}: {why}", DoubtfulResultWarning, stacklevel=2)
-    return SystemPrediction(
-        own, recording.readings, mean=mean, sd=sd, log_density=scores, n_samples=n_samples, n_failed=n_failed
-    )
+    notes = (*own.notes, *_note_on_runs_started_again(fitted, own))
+    counts = {"n_samples": n_samples, "n_failed": n_failed}
+    return SystemPrediction(own, recording.readings, mean=mean, sd=sd, log_density=scores, notes=notes, **counts)
+
+
+def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> RunTable:
+    """Return a table with the recorded rows of its runs before their first rows in it, by time, put first.
+
+    So a state, or an effect that looks back, goes on from where the recording left it. A column that the recording
+    lacks is missing in these rows.
+    """
+    if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
+        return table
+    recorded = fitted.known.table
+    first = {name: table.time_s[rows].min() for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)}
+    begins = np.array([first.get(name, -np.inf) for name in recorded.scan_names])
+    rows = np.flatnonzero(recorded.time_s < begins[recorded.scan])
+    if not rows.size:
+        return table
+    columns = {}
+    for name, values in table.columns.items():
+        earlier = recorded.columns.get(name)
+        if earlier is None or earlier.dtype.kind != values.dtype.kind:
+            earlier = np.full(len(recorded), np.nan if values.dtype == np.float64 else "")
+        columns[name] = np.concatenate([earlier[rows], values])
+    return replace(table, columns=columns, first_line=table.first_line - len(rows), notes=())
+
+
+def _note_on_runs_started_again(fitted: FittedSystem, table: RunTable) -> tuple[str, ...]:
+    """Return a note where a law starts runs again that may have been recorded before their first rows here; else ().
+
+    A model without the recorded rows cannot tell. Runs that begin at time 0, or that have values of their own of which
+    none is recorded, are new ones.
+    """
+    if fitted.simulator.law is None or fitted.known is not None or fitted.recording == table_digest(table):
+        return ()
+    known = {name.partition("[")[2][:-1] for name in fitted.names if name.partition("[")[0] in fitted.simulator.per_run}
+    first = {name: table.time_s[rows].min() for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)}
+    again = [name for name, time in first.items() if time > 0 and (not known or name in known)]
+    runs = f"run{'s' * (len(again) > 1)} {', '.join(again)}" if table.run else "the run"
+    how = "started again at its first row here, as `states` says; give the recorded rows before it to go on from them"
+    return (f"{runs}: {how}",) if again else ()
 
 
 def _chain_with_converged_step(chain: SystemChain, theta: FloatArray, table: RunTable, noise_sd: float) -> SystemChain:
@@ -310,21 +358,12 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
 def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
     """Return the names of the recording's columns of numbers that effects act on or name in formulas.
 
-    A column may be named like a state or a parameter, on which other effects act.
+    A jump at a row may show along a column that it does not read.
     """
     assert fitted.known is not None
     columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
-    in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
-    of_column = [
-        name.removesuffix(AGAIN)
-        for name, form in forms.items()
-        if form.stage in (Stage.INPUT, Stage.OFFSET) or name.startswith("depends:")
-    ]
-    return {
-        name
-        for name in columns
-        if covariate_of_column(name) in in_formulas or any(own.endswith(f":{name}") for own in of_column)
-    }
+    along = {covariate for form in forms.values() if not jumps_at_row(form) for covariate in form.covariates}
+    return {name for name in columns if covariate_of_column(name) in along}
 
 
 def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

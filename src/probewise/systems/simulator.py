@@ -23,10 +23,9 @@ from probewise.sensor import Stage
 from probewise.systems.table import RunTable, read_run_table
 
 _A_RANGE = "(low, high) with low < high; None for an open end"
-_NAMES = (
-    *("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise", "simulate"),
-    *("states", "rates", "observe", "hold", "max_step_s", "vectorized", "extra"),
-)
+_OF_SYSTEM = ("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise")
+_OF_LAW = ("states", "hold", "max_step_s")
+_NAMES = (*_OF_SYSTEM, "simulate", *_OF_LAW, "rates", "observe", "vectorized", "extra")  # in a file
 
 
 Values: TypeAlias = Mapping[str, Any]
@@ -198,11 +197,12 @@ class Simulator:
             from_python = "simulate=..., or law=Law(states, rates)"
             in_a_file = "def simulate(p, data), or states and def rates(s, p, u)"
             raise ParameterError("simulate, rates", found, f"one of them: {from_python}; in a file {in_a_file}")
-        checked_text("reading", self.reading, "the name of the column that is predicted")
-        require_kind("unit", self.unit, str, "a text")
+        checked_text("reading", self.reading, 'the name of the column that is predicted: reading = "..."')
+        require_kind("unit", self.unit, str, 'a text: unit = "..."')
+        checked_text("time_unit", self.time_unit, 'a text, such as "min"')
         for name, column in (("time", self.time), ("run", self.run)):
             if column is not None:
-                checked_text(name, column, "the name of a column, or None")
+                checked_text(name, column, f'the name of a column, {name} = "...", or None')
         if self.simulate is not None:
             way = "a function simulate(parameters, columns); of a file: read_simulator('FILE.py') of probewise.systems"
             require_callable("simulate", self.simulate, way)
@@ -230,24 +230,23 @@ class Simulator:
                 if not (start in self.parameters if isinstance(start, str) else _is_finite_number(start)):
                     allowed = f"a number or a parameter: {', '.join(self.parameters)}"
                     raise ParameterError(f"states[{state!r}]", start, allowed)
-        own = {
-            n: replace(e, prior=parse_prior(f"extra[{n!r}].prior", e.prior)) if isinstance(e, Extra) else e
-            for n, e in self.extra.items()
-        }
-        object.__setattr__(self, "extra", own)
+        own = {}
         for name, effect in self.extra.items():
             require_kind(f"extra[{name!r}]", effect, Extra, "an Extra(prior, null, says), of probewise.systems")
+            own[name] = replace(effect, prior=parse_prior(f"extra[{name!r}].prior", effect.prior))
             if not _is_finite_number(effect.null):
                 raise ParameterError(f"extra[{name!r}].null", effect.null, "a finite number, at which it is absent")
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")
             if name in _TAKEN:
                 raise ParameterError("extra", name, f"names that no effect of this program has: {', '.join(_TAKEN)}")
+        object.__setattr__(self, "extra", own)
 
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
     """Build a simulator's table from columns by name (a dict of arrays, a DataFrame); return a RunTable as it is."""
-    require_simulator(simulator)
+    allowed = "a Simulator(reading, unit, parameters, simulate=...), or read_simulator('FILE.py'), of probewise.systems"
+    require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
     if isinstance(data, RunTable):
         return data
     return RunTable(data, simulator.time, simulator.run, time_unit=simulator.time_unit)
@@ -257,12 +256,6 @@ def read_table_for(simulator: Simulator, path: str | os.PathLike[str]) -> RunTab
     """Read a simulator's table from a file, as `read_run_table` does."""
     own = simulator
     return read_run_table(path, time=own.time, run=own.run, reading=own.reading, time_unit=own.time_unit)
-
-
-def require_simulator(simulator: object) -> None:
-    """Raise ParameterError unless `simulator` is a Simulator; the message says how to obtain one."""
-    allowed = "a Simulator(reading, unit, parameters, simulate=...), or read_simulator('FILE.py'), of probewise.systems"
-    require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
 
 
 def parse_prior(what: str, given: object) -> Marginal:
@@ -332,57 +325,27 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
 
 
 def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
-    def given(name: str, allowed: str, fits: Callable[[Any], bool], default: object = None) -> Any:
-        value = said.get(name, default)
-        if not fits(value):
-            raise ParameterError(name, value, allowed)
-        return value
-
-    def text_of(name: str) -> str:
-        return str(given(name, f'a text: {name} = "..."', lambda v: isinstance(v, str) and v != ""))
-
     def function(name: str) -> Any:
-        return raising_exceptions(given(name, f"a function: def {name}(...)", callable))
+        return raising_exceptions(said[name]) if callable(said.get(name)) else said.get(name)
 
-    def texts(name: str) -> tuple[str, ...]:
-        allowed = f'a list of names: {name} = ["..."]'
-        return tuple(
-            given(name, allowed, lambda v: not isinstance(v, str) and all(isinstance(each, str) for each in v), ())
-        )
-
-    def mapping(name: str, allowed: str, default: object = None) -> Any:
-        return given(name, allowed, lambda v: isinstance(v, Mapping), default)
-
-    parameters = mapping("parameters", 'a dict from names to priors: {"gain": (0, 10)}')
-    law = None
+    law, extra = None, said.get("extra", {})
+    require_mapping("extra", extra, 'effects by name, each a dict with "prior", "null" and "says"')
     if "rates" in said or "states" in said:
-        law = Law(
-            mapping("states", 'a dict from states to where they start: {"temp_c": 20.0}'),
-            function("rates"),
-            function("observe") if "observe" in said else None,
-            said.get("hold", "previous"),
-            said.get("max_step_s"),
-        )
+        given: dict[str, Any] = {"states": None} | {name: said[name] for name in _OF_LAW if name in said}
+        law = Law(rates=function("rates"), observe=function("observe"), **given)
+    given = dict.fromkeys(("reading", "unit", "parameters")) | {name: said[name] for name in _OF_SYSTEM if name in said}
     return Simulator(
-        reading=text_of("reading"),
-        unit=text_of("unit"),
-        parameters=parameters,
-        simulate=function("simulate") if "simulate" in said else None,
+        simulate=function("simulate"),
         law=law,
-        time=text_of("time") if said.get("time") is not None else None,
-        time_unit=text_of("time_unit") if "time_unit" in said else "s",
-        run=text_of("run") if said.get("run") is not None else None,
-        per_run=texts("per_run"),
-        controls=texts("controls"),
-        noise=said.get("noise", {}),
-        extra={name: _parse_extra(name, each) for name, each in mapping("extra", "a dict", {}).items()},
+        extra={name: _parse_extra(name, each) for name, each in extra.items()},
         vectorized=bool(said.get("vectorized", False)),
         source=printable(path.name),
         fingerprint=fingerprint_of_text(text),
+        **given,
     )
 
 
 def _parse_extra(name: str, given: object) -> Extra:
     if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
         raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
-    return Extra(parse_prior(f"extra[{name!r}]['prior']", given["prior"]), float(given["null"]), str(given["says"]))
+    return Extra(given["prior"], float(given["null"]), str(given["says"]))

@@ -304,8 +304,7 @@ class SystemChain:
         if system.caller is not None:
             readings = self._call_for_each_recording(system.caller, parameters, columns, plan)
         else:
-            of_rates = self._columns_of_rates(columns, theta, plan)
-            readings = self._integrated_readings(parameters, columns, of_rates, theta, plan)
+            readings = self._integrated_readings(parameters, columns, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
     def _call_for_each_recording(
@@ -332,15 +331,11 @@ class SystemChain:
         self,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
-        of_rates: Mapping[str, NDArray[Any]],
         theta: FloatArray,
         plan: RunTable,
     ) -> FloatArray:
-        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise.
-
-        `of_rates` are the columns that its rates get, `columns` those at the rows, as `observe` gets them.
-        """
-        system, law = self.system, self.system.simulator.law
+        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise."""
+        system, law, of_rates = self.system, self.system.simulator.law, self._columns_of_rates(columns, theta, plan)
         assert law is not None
 
         def law_and_inputs_of_samples(
@@ -367,12 +362,7 @@ class SystemChain:
             if len(theta) == 1:
                 system.tally.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
-
-        out = np.empty((len(theta), len(plan)))
-        for at in (slice(k, k + 1) for k in range(len(theta))):
-            own, table, inputs = (take_samples(values, at) for values in (parameters, columns, of_rates))
-            out[at] = self._integrated_readings(own, table, inputs, theta[at], plan)
-        return out
+        return np.concatenate([self.simulated_view(theta[k : k + 1], plan) for k in range(len(theta))])
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""

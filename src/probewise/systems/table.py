@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -81,6 +82,9 @@ class RunTable:
                 if note:
                     object.__setattr__(self, "notes", (*self.notes, note))
             columns[name] = _checked_column(name, values, are_names=name == self.run)
+            if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
+                note = f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
+                object.__setattr__(self, "notes", (*self.notes, note))
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -276,7 +280,9 @@ def column_error(
 
 def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     """Return a column as read-only floats or texts; names of runs are texts."""
-    array = np.asarray(_with_missing(values))
+    if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
+        values = np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
+    array = np.asarray(values)
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
     if are_names and array.dtype.kind == "U" and not array.flags.writeable:
@@ -288,13 +294,6 @@ def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     texts = np.array([text_of_name(v) if are_names else str(v) for v in array.tolist()], dtype=np.str_)
     texts.flags.writeable = False
     return texts
-
-
-def _with_missing(values: Any) -> Any:
-    """Return a column with the masked values of a masked array missing, NaN or ""."""
-    if not isinstance(values, np.ma.MaskedArray):
-        return values
-    return np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
 
 
 def read_run_table(
@@ -336,6 +335,11 @@ def read_run_table(
 def run_table_csv(table: RunTable) -> str:
     """Return a table as CSV text, with numbers in full precision."""
     return csv_text({name: [_text(value) for value in values.tolist()] for name, values in table.columns.items()})
+
+
+def table_digest(table: RunTable) -> str:
+    """Return the fingerprint of a table, by which a fitted simulator knows its recording."""
+    return hashlib.sha256(run_table_csv(table).encode()).hexdigest()[:16]
 
 
 def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[RunTable, tuple[str, ...]]:

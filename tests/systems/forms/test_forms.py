@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 
 from probewise.effects import is_out_of_vocabulary
 from probewise.errors import ParameterError
@@ -169,16 +168,6 @@ def test_a_delay_of_nothing_changes_nothing_where_rows_share_a_time():
     np.testing.assert_array_equal(found, [[1.0, 2.0, 3.0, 4.0], [1.0, 1.0, 2.5, 2.5]])
 
 
-def test_a_lag_goes_towards_what_it_should_read():
-    """Route two: exp(-dt/tau) row by row, anew in each run."""
-    expected = NOTHING.copy()
-    for k in range(1, N_ROWS):
-        gap = _T[k] - _T[k - 1]
-        if gap > 0:
-            expected[k] = NOTHING[k] + (expected[k - 1] - NOTHING[k]) * np.exp(-gap / 0.5)
-    np.testing.assert_allclose(_read("lag", 0.5), expected, atol=1e-12)
-
-
 def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
     about = _about(_simulator(
         parameters={"gain": (0, 4)}, simulate=lambda p, u: p["gain"] * u["drive"] * (1 + p["bend"] * u["drive"]),
@@ -191,44 +180,12 @@ def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
     assert form.sentence(np.array([0.25]), np.array([0.01])) == "the amplifier bends by 0.250 ± 0.010 per V"
 
 
-@pytest.mark.slow
-def test_forms_of_a_rate_add_to_the_law():
-    """Closed form: x' = b - a x from x = 0 goes as (b / a) (1 - exp(-a t))."""
-    about = _about_law(_rising)
-    forms = bind_forms(about)
-    found = _read("damping:x", 0.7, about=about, forms=forms)
-    rate = 2.0 * ndtr(0.0)
-    np.testing.assert_allclose(found, rate / 0.7 * (1 - np.exp(-0.7 * _T)), atol=1e-6)
-    capped = _read("limit:x", 2.5, about=about, forms=forms)
-    np.testing.assert_allclose(capped, np.minimum(rate * _T, 2.5), atol=1e-6)
-    assert {"drag:x", "friction:x", "forcing:x", "periodic_forcing:x", "cubic:x:x", "quadratic:x:x"} <= forms.keys()
-
-
 @pytest.mark.parametrize(
     ("a", "told"), [(0.7, "a damping term -a x, a = 0.700 ± 0.020"), (-0.7, "a term +b x, b = -a = 0.700 ± 0.020")]
 )
 def test_a_term_that_adds_to_a_rate_is_told_without_a_double_negative(a, told):
     damping = bind_forms(_about_law(_rising, max_step_s=0.2))["damping:x"]
     assert damping.sentence(np.array([a]), np.array([0.02])) == f"the rate of x lacks {told}"
-
-
-def test_an_input_that_is_held_comes_late_also_where_rows_are_far_apart_and_close():
-    """x' = u - x, u held and late by tau: exactly, in each gap what was held before for tau, then what is held now."""
-    t_s = np.cumsum(np.random.default_rng(3).choice([0.02, 0.14], 40))
-    u, tau = np.random.default_rng(4).normal(size=40), 0.012
-    table = RunTable({"t_s": t_s, "u": u, "y": np.zeros(40)}, time="t_s")
-    law = Law({"x": 0.0}, lambda s, p, c: {"x": p["rate"] * (c["u"] - s["x"])}, max_step_s=0.02)
-    simulator = Simulator("y", "V", {"rate": (0.5, 1.5)}, law=law, time="t_s", noise=Noise(sd=1e-3))
-    system = System.of(simulator, table)
-    about = ReferenceFit(system, table, np.zeros(1), 1e-3)
-    form = bind_forms(about)["input_delay:u"]
-    theta = np.concatenate([about.theta[0], [tau]])[None, :]
-    found = system.chain(table, [form]).predict(theta, table)[0]
-    exact, rate = [0.0], about.theta[0, 0]
-    for k, gap in enumerate(np.diff(t_s)):
-        between = u[max(k - 1, 0)] + (exact[-1] - u[max(k - 1, 0)]) * np.exp(-rate * tau)
-        exact.append(u[k] + (between - u[k]) * np.exp(-rate * (gap - tau)))
-    assert np.abs(found - exact).max() < 0.1 * np.abs(found - about.predicted).max()
 
 
 def test_a_switch_is_proposed_for_each_column_that_takes_many_values():

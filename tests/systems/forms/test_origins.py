@@ -13,7 +13,7 @@ from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, pr
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.modulations import origin_of_column, text_rounded_to_spread, time_origin
+from probewise.systems.forms.modulations import origin_of_column, text_rounded_to_spread
 
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
 FAR = 2.0**21  # of a column
@@ -75,8 +75,8 @@ def test_a_recording_that_begins_within_ten_of_its_lengths_is_counted_from_0():
     assert origin_of_column(np.array([91.0, 101.0])) == 0.0
     assert origin_of_column(np.array([-1.0, 1000.0])) == 0.0
     assert origin_of_column(np.array([7.0, 7.0])) == 0.0
-    assert time_origin(_table(0.0)) == 0.0
-    assert time_origin(_table(EPOCH)) == EPOCH
+    assert origin_of_column(_table(0.0).time_s) == 0.0
+    assert origin_of_column(_table(EPOCH).time_s) == EPOCH
 
 
 @pytest.mark.parametrize("how", [_function, _law])

@@ -11,16 +11,16 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import AGAIN, PROPOSAL
+from probewise.effects.effect import Act, StepEffect, WaveEffect
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, Form, StepForm, WaveForm
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.inputs import INPUT_WORDS, driving_columns, forms_on_inputs
 from probewise.systems.forms.parameters import PARAMETER_WORDS, forms_of_extras, forms_on_parameters
 from probewise.systems.forms.rates import RATE_WORDS, forms_on_rates
 from probewise.systems.forms.readings import READING_WORDS, forms_on_readings
-from probewise.systems.forms.reference import ReferenceFit
+from probewise.systems.forms.reference import Form, ReferenceFit
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import RunTable, covariate_of_column
@@ -40,9 +40,9 @@ def bind_forms(about: ReferenceFit) -> dict[str, Form]:
         named = [form for form in named if form.name.split(":")[0] not in _IN_ORDER]
     if (column := sorting_column(about)) is not None:
         along = covariate_of_column(column)
-        named = [replace(f, covariates=(along, *f.covariates)) if _jumps_at_row(f) else f for f in named]
+        named = [replace(f, covariates=(along, *f.covariates)) if jumps_at_row(f) else f for f in named]
     found = [*named, *forms_of_extras(about)]
-    waves = [_second_wave(form) for form in found if isinstance(form, WaveForm)]
+    waves = [_second_wave(form) for form in found if isinstance(form, WaveEffect)]
     return {form.name: form for form in [*found, *waves]}
 
 
@@ -73,11 +73,12 @@ def sorting_column(about: ReferenceFit) -> str | None:
 
 def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:
     """Return the names of jumps at a row that may be jumps along the column that sorts the rows."""
-    return frozenset(name for name, form in effects.items() if _jumps_at_row(form) and form.covariates[0] != "row")
+    return frozenset(name for name, form in effects.items() if jumps_at_row(form) and form.covariates[0] != "row")
 
 
-def _jumps_at_row(effect: Any) -> bool:
-    return isinstance(effect, StepForm) and effect.change_points.by_row
+def jumps_at_row(effect: Any) -> bool:
+    """Return whether an effect has a change point that is counted in rows."""
+    return isinstance(effect, StepEffect) and effect.change_points.by_row
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +125,6 @@ class _StoredReferenceFit(ReferenceFit):
 
     def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
-
-    def typical_amplitude(
-        self, stage: Stage, act: Act, entries: FloatArray, guess: float, amplitudes: tuple[int, ...] = (0,)
-    ) -> float | None:
-        return guess
-
-    def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        return float(tried[0]), float(tried[-1])
 
 
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:

@@ -15,20 +15,27 @@ import numpy as np
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
-from probewise.effects.effect import PHASE, ChangePoints, sine_and_cosine_entries, single_column_bank, thinned
+from probewise.effects.effect import (
+    PHASE,
+    ChangePoints,
+    StepEffect,
+    WaveEffect,
+    sine_and_cosine_entries,
+    single_column_bank,
+    thinned,
+)
 from probewise.priors import LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Form, StepForm, WaveForm
 from probewise.systems.forms.modulations import (
     frequency_prior,
     origin_in_words,
+    origin_of_column,
     text_rounded_to_spread,
-    time_origin,
     trial_frequencies_in_time,
 )
 from probewise.systems.forms.rates import trial_rate
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
-from probewise.systems.forms.reference import ReferenceFit, switch_points
+from probewise.systems.forms.reference import AMPLITUDE, POSITIVE, Form, ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
@@ -252,7 +259,7 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     priors: _Parameters = {"a": (AMPLITUDE, about.reading_unit), "at": (Uniform(at[0], at[-1]), name)}
     bank, along = np.array([[[1.0, 0.5 * (at[0] + at[-1])]]]), (covariate_of_column(name),)
     own = (f"(1 + sign({name} - at)) / 2", priors, bank, change, along, about.sd)
-    yield from _proposal(about, *own, kind=StepForm, change_points=ChangePoints(at, column=name))
+    yield from _proposal(about, *own, kind=StepEffect, change_points=ChangePoints(at, column=name))
 
 
 def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
@@ -317,7 +324,7 @@ def _covariates_of_term(about: ReferenceFit, side: str, term: _Term) -> tuple[st
 
 def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
-    table, origin = about.table, time_origin(about.table)
+    table, origin = about.table, origin_of_column(about.table.time_s)
     frequencies = trial_frequencies_in_time(about, _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
     def change(v: list[Any], value: Any, rows: RunTable) -> Any:
@@ -366,7 +373,7 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     }
     text = f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}"
     bank = sine_and_cosine_entries(1.0, *np.transpose(settings))
-    yield from _proposal(about, text, priors, bank, change, ("time",), about.sd, kind=WaveForm)
+    yield from _proposal(about, text, priors, bank, change, ("time",), about.sd, kind=WaveEffect)
 
 
 def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:

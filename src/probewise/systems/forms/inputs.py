@@ -8,20 +8,26 @@ from dataclasses import replace
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error
-from probewise._words import value_with_sd
-from probewise.effects.effect import PHASE, sine_and_cosine_entries
+from probewise.effects.effect import PHASE, Act, WaveEffect, in_words, sine_and_cosine_entries
 from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Act, ActInTime, Form, WaveForm, says_value
 from probewise.systems.forms.modulations import (
     max_n_trial_frequencies,
     origin_in_words,
     origin_of_column,
-    time_origin,
     trial_frequencies,
 )
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
-from probewise.systems.forms.reference import ReferenceFit, clipped, clipping_levels
+from probewise.systems.forms.reference import (
+    AMPLITUDE,
+    POSITIVE,
+    ActInTime,
+    Form,
+    ReferenceFit,
+    clipped,
+    clipping_levels,
+    says_of_limit,
+)
 from probewise.systems.law_inputs import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 
@@ -54,13 +60,13 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
         yield from _forms_on_column(about, name)
     table = about.table
     if table.time is not None:
-        origin = time_origin(table)
+        origin = origin_of_column(table.time_s)
 
         def scaled_clock(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
             return np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
 
         act = _column_changer(table.time, scaled_clock)
-        says = "the true time is the recorded time times (1 + a), a = {value}"
+        says = "the true time is the recorded time times (1 + a), a = {0}"
         for form in _amplitude_form(about, "clock_drift", act, 1e-5, "1", says, "time"):
             yield replace(form, counted_from=origin_in_words(table.time, origin, about.time_unit))
 
@@ -73,20 +79,21 @@ def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
     def of(kind: str, change: Change) -> tuple[ReferenceFit, str, Act]:
         return about, f"{kind}:{name}", _column_changer(name, change)
 
-    offset, gain = f"{true} plus {{value}}", f"{true} times (1 + a), a = {{value}}"
+    offset, gain = f"{true} plus {{0}}", f"{true} times (1 + a), a = {{0}}"
     yield from _amplitude_form(*of("input_offset", _column_with_offset), 1e-4 * spread, name, offset, along)
     yield from _amplitude_form(*of("input_gain", _scaled_column), 1e-4, "1", gain, along)
     yield from _clipped_column_form(about, name)
     if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * span:  # if larger, it is an offset
-        within = f"{name} has no effect within {{value}} of 0"
-        yield from _size_form(*of("dead_zone", _column_with_dead_zone), span, name, within, along)
+        within = f"{name} has no effect within {{0}} of 0"
+        with_zone = of("dead_zone", lambda c, theta, rows: np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
+        yield from _size_form(*with_zone, span, name, within, along)
     if _moves_both_ways(values, about.table):
-        play = f"{name} has {{value}} of play"
+        play = f"{name} has {{0}} of play"
         yield from _size_form(*of("backlash", column_with_play), span, name, play, "previous", along)
     yield from _periodic_error_form(about, name)
     if about.table.has_varying_time:
         own = (about, f"input_delay:{name}", _column_delayer(about, name), about.duration, unit)
-        for form in _size_form(*own, f"{name} acts with a delay of {{value}} {unit}", "previous", along):
+        for form in _size_form(*own, f"{name} acts with a delay of {{0}} {unit}", "previous", along):
             yield replace(form, needs_rising_time=True)
 
 
@@ -116,7 +123,7 @@ def _amplitude_form(
     about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: str, *along: str
 ) -> Iterator[Form]:
     own = (name, Stage.INPUT, {"a": AMPLITUDE}, (unit,), along, act, np.ones((1, 1, 1)))
-    yield from about.scaled(Form(*own, says_value(says)), guess)
+    yield from about.scaled(Form(*own, in_words(says)), guess)
 
 
 def _size_form(
@@ -125,7 +132,7 @@ def _size_form(
     """Yield a form of one size without a sign, log-uniform up to half of `most`; none if no size is plausible."""
     parameter = "tau_s" if name.startswith("input_delay:") else "width"
     tried = most * np.geomspace(1e-7, 0.5, 40)
-    return about.sized(name, Stage.INPUT, parameter, unit, along, act, tried, says_value(says))
+    return about.sized(name, Stage.INPUT, parameter, unit, along, act, tried, in_words(says))
 
 
 def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -135,14 +142,19 @@ def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
     act = _column_changer(name, lambda c, theta, table: clipped(c, theta[:, :1], ends.least_ceiling))
     if np.nanmax(about.rms_change_in_sds(Stage.INPUT, act, ends.trial_levels[:, None]), initial=0.0) > 0.05:
-
-        def says(mean: FloatArray, sd: FloatArray) -> str:
-            way = "rises" if mean[0] > ends.least_ceiling else "falls"
-            return f"{name} {way} no further than {value_with_sd(mean[0], sd[0], '')}"
-
+        says = says_of_limit(name, ends.least_ceiling)
         along, bank = (covariate_of_column(name),), ends.trial_levels[:, None, None]
-        own = (f"input_saturation:{name}", Stage.INPUT, {"level": ends.prior}, (name,), along, act, bank, says)
-        yield Form(*own, amplitudes=(), absent={0: ends.level_out_of_reach})
+        own = (
+            f"input_saturation:{name}",
+            Stage.INPUT,
+            {"level": ends.prior},
+            (name,),
+            along,
+            act,
+            bank,
+            says,
+        )
+        yield Form(*own, amplitudes=(), absent=ends.absent)
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -162,21 +174,13 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     frequencies = trial_frequencies(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE, _LEAST_WAVES)
     longest, shortest = (float(1 / frequencies[k]) for k in (0, -1))
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, period = (value_with_sd(mean[k], sd[k], "") for k in (0, 1))
-        return (
-            f"{name} has a periodic error with an amplitude of {size} and a period of {period}, both in units of {name}"
-        )
-
+    size = "an amplitude of {0} and a period of {1}, both in units of"
+    says = in_words(f"{name} has a periodic error with {size} {name}")
     priors: dict[str, Marginal] = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
     bank, along = sine_and_cosine_entries(1.0, 1 / frequencies), (covariate_of_column(name),)
     own = (f"periodic_error:{name}", Stage.INPUT, priors, (name, name, "rad"), along, act, bank, says)
-    form = WaveForm(*own, counted_from=origin_in_words(name, origin))
+    form = WaveEffect(*own, counted_from=origin_in_words(name, origin))
     yield from about.scaled(form, 1e-4 * float(np.std(values)))
-
-
-def _column_with_dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
 
 
 def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -11,23 +11,19 @@ import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
-from probewise.effects.effect import PHASE, ChangePoints, sine_and_cosine_entries
+from probewise.effects.effect import PHASE, Act, ChangePoints, Fixed, StepEffect, WaveEffect, sine_and_cosine_entries
 from probewise.effects.reference import is_far_from_zero
 from probewise.priors import LogUniform, Marginal, SharedScalePrior, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import (
+from probewise.systems.forms.reference import (
     AMPLITUDE,
     POSITIVE,
-    Act,
     ActBetween,
     BlockForm,
-    Fixed,
     Form,
-    StepForm,
-    WaveForm,
+    ReferenceFit,
     period_with_sd,
 )
-from probewise.systems.forms.reference import ReferenceFit
 from probewise.systems.law_inputs import Jump
 from probewise.systems.table import RunTable, covariate_of_column
 
@@ -46,17 +42,10 @@ def origin_of_column(values: FloatArray) -> float:
     """Return the origin from which an effect counts a column, (n_points,): 0, or the least value if that is far away.
 
     Far is more than ten times the column's range, as seconds of the epoch are: a drift from 0 would be a constant.
+    Effects keep the origin of the recording to which they were bound, whatever table they predict.
     """
     least = float(np.nanmin(values))
     return least if is_far_from_zero(values, float(np.nanmax(values)) - least) else 0.0
-
-
-def time_origin(table: RunTable) -> float:
-    """Return the origin from which drifts and waves count the time of a recording: `origin_of_column` of the times.
-
-    Effects keep the origin of the recording to which they were bound, whatever table they predict.
-    """
-    return origin_of_column(table.time_s)
 
 
 def origin_in_words(name: str | None, origin: float, unit: str = "") -> str:
@@ -109,19 +98,12 @@ def frequency_prior(frequencies: FloatArray) -> LogUniform:
     return LogUniform(float(0.9 * frequencies[0]), float(frequencies[-1] * 1.02))
 
 
-@dataclass(frozen=True, eq=False)
-class Peaks:
-    """Frequencies `at` (n_peaks,) where residuals have peaks, rising; `highest` is the end of the range looked at."""
-
-    at: FloatArray
-    highest: float
-
-
-def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
+def residual_peaks(about: ReferenceFit, tried: FloatArray) -> tuple[FloatArray, float]:
     """Find the frequencies in time at which the residuals of a fit have peaks, where those `tried` are too sparse.
 
     Clustered times tell waves apart up to one in two median gaps, far too many to try each. A fast Fourier transform
     finds the eight highest peaks in each of 64 bands, of one width in log frequency, so that slow noise hides no wave.
+    Returns the frequencies, (n_peaks,), rising, and the highest one that was looked at.
     """
     times, groups = _times_of_readings(about)
     residuals, reach = _weighted_residuals(about), float(np.ptp(times))
@@ -129,7 +111,7 @@ def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
     highest = max(1 / (_BINS_PER_WAVE * bin_width), float(tried[-1]))
     is_sparse = float(np.diff(tried).max()) * reach > 0.6
     if len(residuals) < len(times) or (not is_sparse and highest <= 1.001 * tried[-1]):
-        return Peaks(np.zeros(0), float(tried[-1]))
+        return np.zeros(0), float(tried[-1])
     bins = np.rint((times - times.min()) / bin_width).astype(np.int64)
     n_bins = 1 << int(2 * (bins.max() + 1) - 1).bit_length()  # twice the range: steps of half the resolution
     power = np.abs(np.fft.rfft(np.bincount(bins, residuals, n_bins))) ** 2
@@ -141,7 +123,7 @@ def residual_peaks(about: ReferenceFit, tried: FloatArray) -> Peaks:
     falling = np.flatnonzero(is_peak)
     falling = falling[np.lexsort((-power[falling], band[falling]))]
     rank = np.arange(len(falling)) - np.searchsorted(band[falling], band[falling])
-    return Peaks(np.sort(frequencies[falling[rank < _PEAKS_OF_A_BAND]]), highest)
+    return np.sort(frequencies[falling[rank < _PEAKS_OF_A_BAND]]), highest
 
 
 def _times_of_readings(about: ReferenceFit) -> tuple[FloatArray, list[Any]]:
@@ -186,8 +168,8 @@ class Modulation:
 
 
 def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
-    """Return a linear drift a t, with recorded time t from `time_origin`: 0, or the first time if far from 0."""
-    origin = time_origin(table)
+    """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0."""
+    origin = origin_of_column(table.time_s)
     return Modulation(
         at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
         form=lambda what, unit, **own: Form(
@@ -245,7 +227,7 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
         begin: dict[str, Marginal] = {f"at_{place}": Uniform(first, last)}
         if not may_end:
             entries = np.array([[[1.0, middle]]])
-            return StepForm(parameters=size | begin, units=(unit, of_place), entries=entries, **own)
+            return StepEffect(parameters=size | begin, units=(unit, of_place), entries=entries, **own)
         priors, entries = size | {f"until_{place}": never} | begin, np.array([[[1.0, first - 1.5, middle]]])
         return BlockForm(parameters=priors, units=(unit, of_place, of_place), entries=entries, never=never, **own)
 
@@ -300,22 +282,18 @@ def modulations_over_rows(about: ReferenceFit) -> dict[str, Modulation]:
 
 
 def sinusoid_modulation(about: ReferenceFit) -> Modulation:
-    """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from `time_origin`."""
+    """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from its origin."""
     table, time_unit = about.table, about.time_unit
-    origin, frequencies = time_origin(table), trial_frequencies_in_time(about)
-    peaks = residual_peaks(about, frequencies)
+    origin, frequencies = origin_of_column(table.time_s), trial_frequencies_in_time(about)
+    suggested, highest = residual_peaks(about, frequencies)
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
 
     return Modulation(
         at_rows,
-        lambda what, unit, **own: WaveForm(
-            parameters={
-                "a": POSITIVE,
-                "hz": frequency_prior(np.append(frequencies, peaks.highest)),
-                "phase": PHASE,
-            },
+        lambda what, unit, **own: WaveEffect(
+            parameters={"a": POSITIVE, "hz": frequency_prior(np.append(frequencies, highest)), "phase": PHASE},
             units=(unit, f"1/{time_unit}", "rad"),
             covariates=("time",),
             entries=sine_and_cosine_entries(1.0, frequencies),
@@ -324,7 +302,7 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
                 f"{period_with_sd(mean[1], sd[1], time_unit)}"
             ),
             counted_from=origin_in_words(table.time, origin, time_unit),
-            suggested=peaks.at,
+            suggested=suggested,
             **own,
         ),
     )

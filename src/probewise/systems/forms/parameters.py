@@ -10,16 +10,16 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import unit_of_name
+from probewise.effects.effect import Act, in_words
 from probewise.priors import LogUniform, Marginal
 from probewise.sensor import Stage
-from probewise.systems.forms.form import Act, ActInTime, Form, flag, says_value
 from probewise.systems.forms.modulations import (
     Modulation,
     column_proportional_modulation,
     modulated_form,
     modulations_over_rows,
 )
-from probewise.systems.forms.reference import ReferenceFit
+from probewise.systems.forms.reference import ActInTime, Form, ReferenceFit, flag
 from probewise.systems.table import RunTable
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
@@ -120,5 +120,14 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
         if seen.any():
             priors, along = {"value": extra.prior}, ("level", "time", "row")
             entries, absent = values[seen][:, None, None], {0: extra.null}
-            own = (name, Stage.PARAMETER, priors, ("",), along, act, entries, says_value(extra.says))
+            own = (
+                name,
+                Stage.PARAMETER,
+                priors,
+                ("",),
+                along,
+                act,
+                entries,
+                in_words(extra.says.replace("{value}", "{0}")),
+            )
             yield Form(*own, amplitudes=(), absent=absent)

@@ -11,18 +11,25 @@ import numpy as np
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
-from probewise.effects.effect import PHASE, sine_and_cosine_entries, single_column_bank
+from probewise.effects.effect import PHASE, Fixed, WaveEffect, in_words, sine_and_cosine_entries, single_column_bank
 from probewise.priors import Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, POSITIVE, Fixed, Form, WaveForm, period_with_sd
 from probewise.systems.forms.modulations import (
     frequency_prior,
     max_n_trial_frequencies,
     origin_in_words,
-    time_origin,
+    origin_of_column,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.reference import ReferenceFit, clipping_levels
+from probewise.systems.forms.reference import (
+    AMPLITUDE,
+    POSITIVE,
+    Form,
+    ReferenceFit,
+    clipping_levels,
+    period_with_sd,
+    says_of_limit,
+)
 from probewise.systems.law import LawWithEffects, Limit
 
 _NO_SHARE = 1e-9  # of what a bound stops: none
@@ -98,17 +105,13 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
     tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
     along = f"state:{state}", "level"
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size = value_with_sd(mean[0], sd[0], "")
-        return f"dry friction slows {state} by {size} per {about.time_unit}, and holds it at rest"
-
+    says = in_words(f"dry friction slows {state} by {{0}} per {about.time_unit}, and holds it at rest")
     return about.sized(f"friction:{state}", Stage.RATE, "a", unit, along, act, tried, says)
 
 
 def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     table = about.table
-    time, origin = table.time, time_origin(table)
+    time, origin = table.time, origin_of_column(table.time_s)
     frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(table)))
 
     def act(value: LawWithEffects, theta: FloatArray, rows: Any) -> LawWithEffects:
@@ -124,7 +127,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
     priors: dict[str, Marginal] = {"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE}
     units, bank = (unit, f"1/{about.time_unit}", "rad"), sine_and_cosine_entries(1.0, frequencies)
     own = (f"periodic_forcing:{state}", Stage.RATE, priors, units, ("time",), act, bank, says)
-    form = WaveForm(*own, counted_from=origin_in_words(time, origin, about.time_unit))
+    form = WaveEffect(*own, counted_from=origin_in_words(time, origin, about.time_unit))
     yield from about.scaled(form, trial_rate(about, state))
 
 
@@ -144,21 +147,23 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
         return value.with_limit(ceiling).with_limit(floor)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if mean[0] > ends.least_ceiling else "falls"
         taken = (
-            f"; {other} takes up {value_with_sd(mean[k], sd[k], '')} of the rest"
+            f"; {other} takes up {value_with_sd(mean[k], sd[k])} of the rest"
             for k, other in enumerate(others, 1)
             if mean[k] > _NO_SHARE
         )
-        return f"{state} {way} no further than {value_with_sd(mean[0], sd[0], '')}{''.join(taken)}"
+        return says_of_limit(state, ends.least_ceiling)(mean, sd) + "".join(taken)
 
     def variant(taking: str | None) -> Form:
         shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
         tried = [0.5 * (other == taking) for other in others]
-        priors = {"level": ends.prior, **{f"share[{other}]": prior for other, prior in shares.items()}}
+        priors = {
+            "level": ends.prior,
+            **{f"share[{other}]": prior for other, prior in shares.items()},
+        }
         units, bank = (state, *("1" for _ in others)), single_column_bank(ends.trial_levels, *tried)
         own = (f"limit:{state}", Stage.RATE, priors, units, (f"state:{state}", "level"), act, bank, says)
-        return Form(*own, amplitudes=(), absent={0: ends.level_out_of_reach})
+        return Form(*own, amplitudes=(), absent=ends.absent)
 
     alone = variant(None)
     if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:

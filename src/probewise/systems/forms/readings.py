@@ -11,11 +11,10 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
-from probewise.effects.effect import ROWS_OF_A_SIDE, single_column_bank
+from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Fixed, in_words, single_column_bank
 from probewise.effects.reading import decaying_sum
 from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.form import AMPLITUDE, Act, Fixed, Form, flag, says_value
 from probewise.systems.forms.modulations import (
     Modulation,
     change_point_step_modulation,
@@ -24,7 +23,16 @@ from probewise.systems.forms.modulations import (
     modulations_over_rows,
     sinusoid_modulation,
 )
-from probewise.systems.forms.reference import N_SIZES, ReferenceFit, clipped, switch_points
+from probewise.systems.forms.reference import (
+    AMPLITUDE,
+    N_SIZES,
+    Form,
+    ReferenceFit,
+    clipped,
+    flag,
+    says_of_limit,
+    switch_points,
+)
 from probewise.systems.table import RunTable, covariate_of_column
 
 _SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
@@ -56,8 +64,8 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
     """Yield the forms of a reading that comes late, `lag` and `delay`, with a smooth variant where rows tell it."""
     reading, unit = about.system.simulator.reading, about.time_unit
     for name, act, tried, says in (
-        ("lag", lagged_readings, np.geomspace(0.02, 200.0, 33), f"{reading} lags with a time constant of"),
-        ("delay", delayed_readings, np.geomspace(1e-3, 100.0, 41), f"{reading} is delayed by"),
+        ("lag", lagged_readings, np.geomspace(0.02, 200.0, 33), f"{reading} lags with a time constant of {{0}}"),
+        ("delay", delayed_readings, np.geomspace(1e-3, 100.0, 41), f"{reading} is delayed by {{0}}"),
     ):
 
         def at_rows(value: FloatArray, theta: FloatArray, table: RunTable, act: Act = act) -> FloatArray:
@@ -71,9 +79,8 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
             value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
             priors: dict[str, Marginal] = {"tau_s": prior, _SMOOTH: of_flag}
             bank = np.stack([sizes, np.full(N_SIZES, value)], axis=1)
-            own = (name, Stage.LAG, priors, (unit, "1"), ("previous",), act, bank[:, None, :])
-            sentence = says_value(f"{says} {{value}}", unit)
-            variants.append(Form(*own, sentence, amplitudes=(), absent={0: 0.0}, needs_rising_time=True))
+            own = (name, Stage.LAG, priors, (unit, "1"), ("previous",), act, bank[:, None, :], in_words(says, unit))
+            variants.append(Form(*own, amplitudes=(), absent={0: 0.0}, needs_rising_time=True))
         first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
         apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
         yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
@@ -295,14 +302,10 @@ def _settling_form(about: ReferenceFit) -> Iterator[Form]:
 
     prior = settling_time_prior(about)
     bank = single_column_bank(1.0, np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES))
-    unit, time_unit, reading = about.reading_unit, about.time_unit, about.system.simulator.reading
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, tau = value_with_sd(mean[0], sd[0], unit), value_with_sd(mean[1], sd[1], time_unit)
-        return f"{reading} is off by {size} at the start of each run, and settles with a time constant of {tau}"
-
+    units, reading = (about.reading_unit, about.time_unit), about.system.simulator.reading
+    says = f"{reading} is off by {{0}} at the start of each run, and settles with a time constant of {{1}}"
     priors: dict[str, Marginal] = {"a": AMPLITUDE, "tau_s": prior}
-    own = ("settling", Stage.OFFSET, priors, (unit, time_unit), ("time", "run"), act, bank, says)
+    own = ("settling", Stage.OFFSET, priors, units, ("time", "run"), act, bank, in_words(says, *units))
     yield from about.scaled(Form(*own), 1.0)
 
 
@@ -333,12 +336,8 @@ def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
 
     if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
-    unit, reading = about.reading_unit, about.system.simulator.reading
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, way = value_with_sd(2 * abs(mean[0]), 2 * sd[0], unit), "more" if mean[0] > 0 else "less"
-        return f"{reading} reads {size} {way} while it rises than while it falls"
-
+    unit, way = about.reading_unit, "{more/less} while it rises than while it falls"
+    says = in_words(f"{about.system.simulator.reading} reads {{|0|}} {way}", unit, factors=(2,))
     priors, bank = {"a": about.amplitude_prior(about.sd)}, np.full((1, 1, 1), about.sd)
     yield Form("hysteresis", Stage.HYSTERESIS, priors, (unit,), ("previous",), act, bank, says)
 
@@ -375,13 +374,9 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
         bent = np.sign(share) * np.abs(share) ** theta[:, 1:2]
         return np.asarray(value + theta[:, :1] * (high - low) * (bent - share))
 
-    unit, reading = about.reading_unit, about.system.simulator.reading
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        a, power = (value_with_sd(mean[k], sd[k], "") for k in (0, 1))
-        bend = f"y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at {high:.4g} {unit}"
-        return f"{reading} has a bent response, {bend}, a = {a}, power = {power}"
-
+    z = f"z from 0 at {low:.4g} to 1 at {high:.4g} {about.reading_unit}"
+    bend = f"y + a (hi - lo) (z^power - z) with {z}, a = {{0}}, power = {{1}}"
+    says = in_words(f"{about.system.simulator.reading} has a bent response, {bend}")
     priors: dict[str, Marginal] = {"a": AMPLITUDE, "power": LogUniform(0.4, 5.0)}
     bank = single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0]))
     own = ("nonlinearity", Stage.BEND, priors, ("1", "1"), ("level",), act, bank, says)
@@ -406,14 +401,11 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     levels = np.concatenate([ceilings[ceilings > middle], floors[floors < middle]])
     if not levels.size:
         return
-    unit, reading = about.reading_unit, about.system.simulator.reading
+    unit = about.reading_unit
+    says = says_of_limit(about.system.simulator.reading, middle, unit)
 
     def clip(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         return clipped(value, theta[:, :1], middle)
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if mean[0] > middle else "falls"
-        return f"{reading} {way} no further than {value_with_sd(mean[0], sd[0], unit)}"
 
     priors, absent = {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)}, {0: float(top + 1e3 * span)}
     own = ("saturation", Stage.SATURATION, priors, (unit,), ("level",), clip, levels[:, None, None], says)

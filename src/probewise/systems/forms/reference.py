@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, cast
+from itertools import combinations
+from typing import Any, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
-from probewise.effects import HeavyTailedPrior
-from probewise.effects.effect import ROWS_OF_A_SIDE
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise._words import value_with_sd
+from probewise.effects.effect import (
+    ROWS_OF_A_SIDE,
+    Act,
+    Effect,
+    Fixed,
+    Say,
+    StepEffect,
+    VariantMasks,
+    in_words,
+    thinned,
+)
+from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
-from probewise.systems.forms.form import POSITIVE, Act, Form, Say
 from probewise.systems.law import integrate_states
+from probewise.systems.law_inputs import BetweenRows
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
@@ -32,11 +43,94 @@ _WILD = 4.0  # times the range of the other values, from which some are wild
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
-_TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
 _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
 N_SIZES = 9  # in the bank of a form of one size
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
+
+AMPLITUDE, POSITIVE = HeavyTailedPrior(1.0), HeavyTailedPrior(1.0, positive=True)
+"""Priors of amplitudes of a form before `ReferenceFit.scaled` finds their typical size: of either sign, or positive."""
+
+_FLAG_WIDTH = 1e-9  # of its prior
+_BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
+_BLOCKS = 0.1  # odds of a step that goes back: as those of a second wave
+
+ActBetween = Callable[[BetweenRows, FloatArray], BetweenRows]
+"""Function of what other effects do between the rows and parameters (n_samples, n_params); adds the effect's."""
+
+Form: TypeAlias = Effect
+"""An effect that is bound to a target of a simulator: its act takes the table of the runs."""
+
+
+@dataclass(frozen=True)
+class ActInTime:
+    """An act `at_rows` of an effect that acts otherwise between the rows of a law than the law's `hold` says."""
+
+    at_rows: Act
+    between_rows: ActBetween
+
+    def __call__(self, value: Any, theta: FloatArray, table: RunTable) -> Any:
+        """Return the stage's value at the rows with the effect."""
+        return self.at_rows(value, theta, table)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlockForm(StepEffect):
+    """A step that may go back: its last parameters are its end, of prior `never` where it stays, and its begin.
+
+    In so many intervals, `most`, a block of rows may begin or end; all blocks have a tenth of the odds of all steps.
+    """
+
+    never: Fixed
+    most: int = _BLOCK_ENDS
+
+    @cached_property
+    def _ends(self) -> list[tuple[tuple[float, float], tuple[float, float] | None]]:
+        """Intervals of the begin and of the end, None for a step, of each variant."""
+        thinner = replace(self.change_points, at=thinned(np.array(self.change_points.at), self.most))
+        return [*((begin, None) for begin in self.change_points.intervals), *combinations(thinner.intervals, 2)]
+
+    @property
+    def places(self) -> Sequence[tuple[Uniform, ...]]:
+        """The priors of end and begin in each variant."""
+        n_steps = len(self.change_points.intervals)
+        never = replace(self.never, odds=max(len(self._ends) - n_steps, 1) / (_BLOCKS * n_steps))
+        return [(never if end is None else Uniform(*end), Uniform(*begin)) for begin, end in self._ends]
+
+    def with_fewer_variants(self) -> Self:
+        """Return the form with fewer begins and ends."""
+        return replace(self, change_points=self.change_points.fewer(), most=_FEW_BLOCK_ENDS)
+
+    def variant_masks(self, plan: Any) -> VariantMasks | None:
+        """Return the masks of the rows from each begin to each end."""
+        along, always = self.change_points.variable_at_rows(plan), self.entries[0].copy()
+        always[:, 1:] = -np.inf
+        between = [(sum(begin) / 2, np.inf if end is None else sum(end) / 2) for begin, end in self._ends]
+        return VariantMasks(always, np.array([(along > begin) & (along < end) for begin, end in between]))
+
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw end and begin: a variant by `weights`, (n_variants,), each uniform within its interval."""
+        low, high = np.array([[(prior.low, prior.high) for prior in last] for last in self.places]).transpose(2, 0, 1)
+        chosen = rng.choice(len(weights), len(theta), p=weights)
+        drawn = low[chosen] + (high - low)[chosen] * rng.random((len(theta), 3))[:, 1:]
+        return np.concatenate([theta[:, :1], drawn], axis=1)
+
+
+def says_of_limit(what: str, least_ceiling: float, unit: str = "") -> Say:
+    """Return the sentence of a quantity with a level: a ceiling above `least_ceiling`, otherwise a floor."""
+    ceiling, floor = (in_words(f"{what} {way} no further than {{0}}", unit) for way in ("rises", "falls"))
+    return lambda mean, sd: (ceiling if mean[0] > least_ceiling else floor)(mean, sd)
+
+
+def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
+    """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
+    value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH
+    return value, Fixed(value - 0.5 * _FLAG_WIDTH, value + 0.5 * _FLAG_WIDTH, odds)
+
+
+def period_with_sd(frequency: float, sd: float, time_unit: str) -> str:
+    """Return the period of a frequency, per `time_unit`, with its sd to first order, as `value_with_sd` does."""
+    return value_with_sd(1 / frequency, sd / frequency**2, time_unit)
 
 
 def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
@@ -119,9 +213,9 @@ class ClippingLevels:
         return Uniform(self.low, self.high)
 
     @property
-    def level_out_of_reach(self) -> float:
-        """A level far above all values: a ceiling without effect."""
-        return self.top + (self.high - self.low)
+    def absent(self) -> dict[int, float]:
+        """A level far above all values, a ceiling without effect, by the index of the parameter."""
+        return {0: self.top + (self.high - self.low)}
 
 
 def clipped(values: FloatArray, level: FloatArray, least_ceiling: float) -> FloatArray:
@@ -320,45 +414,39 @@ class ReferenceFit:
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
-    def typical_amplitude(
-        self, stage: Stage, act: Act, entries: FloatArray, guess: float, amplitudes: tuple[int, ...] = (0,)
-    ) -> float | None:
-        """Find the amplitude at which the readings change by one sd (median over entries); None if they do not change.
+    def _typical_amplitude(self, form: Form, guess: float) -> float:
+        """Find the amplitude at which the readings change by one sd (median over entries); 0 if they do not change.
 
-        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`, to which the change is proportional;
-        `amplitudes` are the indices of the parameters with that amplitude.
+        The form is declared with amplitudes of 1; the readings change in proportion to them up to `guess`.
         """
-        settings = entries.reshape(-1, entries.shape[-1])
-        settings = settings[:: max(len(settings) // 16, 1)]
+        settings, amplitudes = form.entries.reshape(-1, form.entries.shape[-1]), list(form.amplitudes)
+        settings = settings[:: max(len(settings) // 16, 1)].copy()
+        settings[:, amplitudes] *= guess
         # In the unit of a column or a time a term may be minute. What is added to a reading, or to its gain, is
         # proportional at any amplitude; elsewhere a larger one could act where a small one does not.
-        for times in _GROWTH if stage in (Stage.OFFSET, Stage.GAIN) else (1.0,):
+        for times in _GROWTH if form.stage in (Stage.OFFSET, Stage.GAIN) else (1.0,):
             larger = settings.copy()
-            larger[:, list(amplitudes)] *= times
-            rms = self.rms_change_in_sds(stage, act, larger)
+            larger[:, amplitudes] *= times
+            rms = self.rms_change_in_sds(form.stage, form.act, larger)
             rms = rms[np.isfinite(rms)]
             if rms.size and rms.max() > _UNSEEN:
-                return _TYPICAL * times * guess / float(np.median(rms[rms > _UNSEEN]))
-        return None
+                return times * guess / float(np.median(rms[rms > _UNSEEN]))
+        return 0.0
 
     def scaled(self, form: Form, guess: float) -> Iterator[Form]:
         """Yield a form, declared with amplitudes of 1, with typical ones and their priors; none if without effect.
 
         `guess` is an amplitude so small that the readings change in proportion.
         """
-
-        def at_size(size: float) -> FloatArray:
+        typical = self._typical_amplitude(form, guess)
+        if np.isfinite(typical) and typical > 0:
             entries = form.entries.copy()
-            entries[..., list(form.amplitudes)] *= size
-            return entries
-
-        typical = self.typical_amplitude(form.stage, form.act, at_size(guess), guess, form.amplitudes)
-        if typical is not None and np.isfinite(typical) and typical > 0:
+            entries[..., list(form.amplitudes)] *= typical
             priors = dict(cast(Mapping[str, Marginal], form.parameters))
             for k in form.amplitudes:
                 name = form.prior.names[k]
                 priors[name] = self.amplitude_prior(typical, positive=priors[name] is POSITIVE)
-            yield replace(form, parameters=priors, entries=at_size(typical))
+            yield replace(form, parameters=priors, entries=entries)
 
     def sized(
         self,
@@ -383,19 +471,15 @@ class ReferenceFit:
         plain = HeavyTailedPrior(typical, positive=positive)
         return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
-    def range_of_plausible_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        """Return the range of those sizes `tried` that change the readings by 0.05 to 10,000 sds (rms); or None.
+    def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
+        """Return a log-uniform prior over those sizes `tried` that change the readings by 0.05 to 10,000 sds (rms).
 
-        A misfit above 1 raises the upper limit. If one size alone qualifies, the range ends at the next.
+        A misfit above 1 raises the upper limit. If one size alone qualifies, the range ends at the next; None without.
         """
         rms = self.rms_change_in_sds(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
             return None
-        low, high = int(there.min()), int(there.max())
-        return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
-
-    def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
-        """Return a log-uniform prior over `range_of_plausible_sizes`; None if there is no range."""
-        between = self.range_of_plausible_sizes(stage, act, tried)
-        return None if between is None or not between[0] < between[1] else LogUniform(*between)
+        first, last = int(there[0]), int(there[-1])
+        low, high = float(tried[first]), float(tried[last if last > first else min(last + 1, len(tried) - 1)])
+        return LogUniform(low, high) if low < high else None

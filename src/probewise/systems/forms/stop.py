@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Self
@@ -84,12 +84,7 @@ def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading")
     unless the meter saturates after the noise. None also if rounding is too coarse to tell, or if that end was
     declared.
     """
-
-    def is_stop(rows: _RowsInTurn, stands: BoolArray) -> bool:
-        elsewhere = rows.steps[~stands[1:][rows.in_turn]]
-        return bool(np.mean(elsewhere == 0) <= _OFTEN) and _longest_streak(stands, rows.in_turn) >= _LEAST_IN_TURN
-
-    return next(_stops_and_masks(recording, reading, is_stop), None)
+    return next(_stops_and_masks(recording, reading, scattered=False), None)
 
 
 def possible_meter_stops_and_masks(
@@ -100,24 +95,30 @@ def possible_meter_stops_and_masks(
     Few other readings may have an exact equal. Lost readings look alike: only a fit tells whether the signal is beyond
     (`is_signal_beyond`). A declared end is no stop.
     """
-
-    def is_stop(rows: _RowsInTurn, stands: BoolArray) -> bool:
-        n_each = np.unique(rows.readings[~stands], return_counts=True)[1]
-        return bool(n_each[n_each > 1].sum() / max(n_each.sum(), 1) <= _OFTEN)
-
-    return _stops_and_masks(recording, reading, is_stop)
+    return _stops_and_masks(recording, reading, scattered=True)
 
 
-def _stops_and_masks(
-    recording: Recording, reading: str, is_stop: Callable[[_RowsInTurn, BoolArray], bool]
-) -> Iterator[tuple[MeterStop, BoolArray]]:
-    rows, unit = _RowsInTurn.of(recording), recording.plan.instrumentation.unit
-    for is_ceiling in (True, False) if rows.are_fine else ():
-        level = float(rows.readings.max() if is_ceiling else rows.readings.min())
-        stands, there = rows.readings == level, recording.readings == level
-        is_declared = recording.censored[there].any()
-        if stands.sum() >= _LEAST_IN_ALL and not is_declared and is_stop(rows, stands):
-            yield MeterStop(level, is_ceiling, reading, unit), there
+def _stops_and_masks(recording: Recording, reading: str, *, scattered: bool) -> Iterator[tuple[MeterStop, BoolArray]]:
+    usable = np.flatnonzero(recording.usable)
+    readings, scan = recording.readings[usable], recording.plan.scan[usable]
+    in_turn = (np.diff(usable) == 1) & (np.diff(scan) == 0)  # of successive rows of a run
+    steps = np.abs(np.diff(readings))[in_turn]
+    typical = float(np.median(steps)) if steps.size else 0.0
+    if len(readings) <= _LEAST_IN_ALL or not typical > 0 or lattice_step(readings) > _FINE * typical:
+        return  # they are too few or too coarse for equal ones to tell of a stop
+    for is_ceiling in (True, False):
+        level = float(readings.max() if is_ceiling else readings.min())
+        stands, there = readings == level, recording.readings == level
+        if stands.sum() < _LEAST_IN_ALL or recording.censored[there].any():
+            continue
+        if scattered:
+            n_each = np.unique(readings[~stands], return_counts=True)[1]
+            is_stop = n_each[n_each > 1].sum() / max(n_each.sum(), 1) <= _OFTEN
+        else:
+            elsewhere = steps[~stands[1:][in_turn]]
+            is_stop = np.mean(elsewhere == 0) <= _OFTEN and _longest_streak(stands, in_turn) >= _LEAST_IN_TURN
+        if is_stop:
+            yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), there
 
 
 def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
@@ -127,28 +128,6 @@ def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
     """
     beyond = (predicted - stop.level) * (1.0 if stop.is_ceiling else -1.0)
     return bool(np.mean(beyond > -2 * sd) >= _NEARLY_ALL and np.median(beyond) > 0)
-
-
-@dataclass(frozen=True, eq=False)
-class _RowsInTurn:
-    """Usable readings, and the steps, (n_steps,), between those in successive rows of a run, marked by `in_turn`."""
-
-    readings: FloatArray
-    in_turn: BoolArray
-    steps: FloatArray
-
-    @classmethod
-    def of(cls, recording: Recording) -> Self:
-        usable = np.flatnonzero(recording.usable)
-        readings, scan = recording.readings[usable], recording.plan.scan[usable]
-        in_turn = (np.diff(usable) == 1) & (np.diff(scan) == 0)
-        return cls(readings, in_turn, np.abs(np.diff(readings))[in_turn])
-
-    @property
-    def are_fine(self) -> bool:
-        """Whether readings are so many and so fine that equal ones tell of a stop."""
-        typical = float(np.median(self.steps)) if self.steps.size else 0.0
-        return len(self.readings) > _LEAST_IN_ALL and typical > 0 and lattice_step(self.readings) <= _FINE * typical
 
 
 def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -151,15 +151,18 @@ def sampled_about_points(
     points: FloatArray, problem: KindProblem, n_draws: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Sample a posterior by draws from kernels about points near it, (n_points, n_params); None if none is possible."""
-    density = _KernelDensity.fitted_to(points, rng=rng)
-    draws = density.draw(n_draws, rng=rng)
+    near, far = (LocalKernels.fitted_to(points, rng=rng, widened=times) for times in (1.0, _WIDE))
+    n_far = round(_OF_WIDE * n_draws)
+    draws = np.concatenate([near.draw(n_draws - n_far, rng=rng), far.draw(n_far, rng=rng)])
     theta = draws[np.isfinite(problem.prior.log_prob(draws))]
     log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
     alive = np.isfinite(log_likelihood)
     if not alive.any():
         return None
     theta, log_likelihood = theta[alive], log_likelihood[alive]
-    log_ratio = problem.prior.log_prob(theta) + log_likelihood - density.log_density(theta)
+    log_near, log_far = (kernels.log_density(theta) for kernels in (near, far))
+    log_density = np.logaddexp(log_near + math.log1p(-_OF_WIDE), log_far + math.log(_OF_WIDE))
+    log_ratio = problem.prior.log_prob(theta) + log_likelihood - log_density
     log_sum = float(logsumexp(log_ratio))
     n_eff = n_effective(log_ratio - log_sum)
     return Weighted(
@@ -173,23 +176,3 @@ def sampled_about_points(
         n_calls=n_draws,
         pareto_k=pareto_k(log_ratio),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class _KernelDensity:
-    """A density of local kernels, mixed with the same kernels three times as wide (15 %)."""
-
-    near: LocalKernels
-    far: LocalKernels
-
-    @classmethod
-    def fitted_to(cls, points: FloatArray, *, rng: np.random.Generator) -> _KernelDensity:
-        return cls(LocalKernels.fitted_to(points, rng=rng), LocalKernels.fitted_to(points, rng=rng, widened=_WIDE))
-
-    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        n_far = round(_OF_WIDE * n)
-        return np.concatenate([self.near.draw(n - n_far, rng=rng), self.far.draw(n_far, rng=rng)])
-
-    def log_density(self, points: FloatArray) -> FloatArray:
-        near, far = self.near.log_density(points), self.far.log_density(points)
-        return np.asarray(np.logaddexp(near + math.log1p(-_OF_WIDE), far + math.log(_OF_WIDE)))

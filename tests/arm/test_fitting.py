@@ -16,7 +16,7 @@ from probewise.arm.fitting import (
     write_marks,
 )
 from probewise.arm.geometry_file import text_with_fitted_values
-from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.errors import FileError, ParameterError
 
 GEOMETRY = read_geometry(shipped_geometry_path())
 BLOCK_MM = 32.0
@@ -113,8 +113,6 @@ def test_marks_that_do_not_determine_the_geometry_are_refused():
         fit_geometry(GEOMETRY, turned, places)
     with pytest.raises(ParameterError, match="marks is 4; allowed: 5 or more"):
         fit_geometry(GEOMETRY, turned[:4], places[:4])
-    with pytest.raises(ShapeError):
-        fit_geometry(GEOMETRY, turned[:, :2], places)
 
 
 def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probewise.arm import Geometry, Joint, read_geometry, shipped_geometry_path
-from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.errors import FileError, ShapeError
 
 SHIPPED = read_geometry(shipped_geometry_path())
 RELATIVE = dataclasses.replace(
@@ -178,13 +178,9 @@ def test_the_examples_hold_the_shipped_file():
     assert example.read_text() == shipped_geometry_path().read_text()
 
 
-@pytest.mark.parametrize(("stop_rad", "side", "counts"), [(1.1, 1, 447), (-1.0, -1, -407), (None, None, None)])
+@pytest.mark.parametrize(("stop_rad", "side", "counts"), [(1.1, 1, 447), (-1.0, -1, -407)])
 def test_the_count_at_a_stop_has_the_play_on_its_side(stop_rad, side, counts):
     """7 turns of 180 / pi degrees for a radian: 401.07 counts, and half the play, 0.03 / 2, beyond the stop."""
     joint = Joint(0, 7.0, 0.0, -1.0, 1.0, 0.03, stop_rad)
     assert joint.stop_side == side
-    if counts is None:
-        with pytest.raises(ParameterError, match="no stop"):
-            _ = joint.stop_counts
-    else:
-        assert joint.stop_counts == counts
+    assert joint.stop_counts == counts

@@ -5,7 +5,7 @@ import pytest
 
 from probewise.arm.nxt import BrickError, Link, NoAnswerError, TelegramError, Timing
 from probewise.arm.nxt import telegram as t
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError
 
 ASLEEP, AWAKE = "02 00 00 0D", "07 00 02 0D 00 C0 27 09 00"
 BATTERY, VOLTS = "02 00 00 0B", "05 00 02 0B 00 F4 1C"
@@ -275,11 +275,3 @@ def test_a_cut_line_is_an_error_at_once(link, script, clock):
     with pytest.raises(LinkError, match="cut"):
         link.ask(read)
     assert clock.now_s - before < 0.1
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"answer_s": 0.0}, {"silence_s": -1.0}, {"turn_s": -0.1}, {"n_repeats": -1}], ids=str
-)
-def test_a_timing_without_sense_is_refused(wrong):
-    with pytest.raises(ParameterError):
-        Timing(**wrong)

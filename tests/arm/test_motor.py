@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.arm.nxt import BrickError, DriveParameters, Link, Motor, MotorError, NoAnswerError
-from probewise.errors import LinkError, ParameterError, ReachError
+from probewise.errors import LinkError, ReachError
 
 
 @pytest.fixture
@@ -245,21 +245,3 @@ def test_a_dead_line_is_an_error_within_its_deadline(motor, paper_brick, clock):
         motor.move_to(500, 1)
     assert not isinstance(caught.value, NoAnswerError)
     assert clock.now_s - before < 15
-
-
-WRONG = [
-    {"slow_power": 0},
-    {"fast_power": 101},
-    {"slow_power": 70},
-    {"seek_power": 1},
-    {"settle_s": -1.0},
-    {"n_moves": 0},
-    {"stuck_s": 0.0},
-    {"lead_counts": -1},
-]
-
-
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
-def test_a_drive_without_sense_is_refused(wrong):
-    with pytest.raises(ParameterError):
-        DriveParameters(**wrong)

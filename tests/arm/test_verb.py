@@ -162,6 +162,7 @@ def test_a_scan_that_leaves_the_reach_moves_nothing_and_prints_nothing(dry, monk
 def test_without_an_arm_there_is_nothing_to_move(capsys):
     assert "--arm is missing: name the brick" in said(capsys, "arm", "read", status=2).err
     assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "simulated", status=2).err
+    assert "that of `probewise emulate-nxt`" in said(capsys, "arm", "read", "--arm", "emulator", status=2).err
     assert "nxt:PORT" in said(capsys, "arm", "read", "--arm", "ev3:/dev/x", status=2).err
 
 

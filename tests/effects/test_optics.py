@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from mixtures import mean_albedo_under_gaussians
 from scipy.special import ndtr
 
 from probewise.effects import EFFECTS, Extent, Known

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from probewise.arm.instrument import Pose, Reading
-from probewise.calibration.sensor_file import read_sensor
+from probewise.calibration import FittedSensor, posterior_mean_ssf_field, read_sensor
 from probewise.experiment import experiment_for, read_journal
 from probewise.experiment.evidence import posterior_from_prior
 from probewise.experiment.kinds import prior_posterior
 from probewise.inquiry.smc import nested_sampling_from_scratch, prior_particles
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import experiment_of
+from probewise.recordings import Instrumentation
 from probewise.scene import Circle, Field
+from probewise.sensor import mixture_parameter_names
 
 NAMES = ("", "ambient_step", "backlash", "dark_level", "dropouts", "saturation")
 STUCK = Path(__file__).parents[3] / "shared" / "faults" / "robot"
@@ -91,6 +93,40 @@ def test_a_rival_that_leaves_the_shape_open_has_the_evidence_of_nested_sampling(
     found = {name: from_nothing(kinds[name], rng=rng) for name in ("ambient_step", "saturation")}
     assert found["ambient_step"].log_z > found["saturation"].log_z + 1.0
     assert found["ambient_step"].log_z == pytest.approx(truth.log_z, abs=1.0)
+
+
+# Readings (x_mm, y_mm, value) with gear play of 2.5 mm on each axis, about a circle of 62 mm at (761.5, 420.5).
+_PLAYED = (
+    (371, 260, 11.1), (822, 114, 10.7), (709, 382, 26.6), (709, 390, 46.8), (693, 431, 15.5), (830, 398, 12.0),
+    (806, 447, 57.3),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", [10, 25, 26])
+def test_a_search_that_ends_in_a_false_mode_is_set_right_where_the_leader_has_the_shape(seed):
+    """Nested sampling with 600 live points: -23.6 +- .2. The search of these seeds ends at -400 or below."""
+    samples = np.tile([1.0, 0.2716, 1.4052, 0.03227, 0.07622, -0.00658, 10.97, 58.02], (500, 1))
+    sensor = FittedSensor(
+        names=(*mixture_parameter_names(1), "I_min", "I_max"),
+        samples=samples,
+        n_gaussians=1,
+        noise_sd=np.full(500, 0.4478),
+        field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
+        instrumentation=Instrumentation(unit="LEGO", height_mm=14.0),
+    )
+    experiment = experiment_for(sensor, Circle(Field()), Field())
+    places = experiment.grid.places_mm
+    nearest = [places[np.hypot(*(places - at[:2]).T).argmin()].tolist() for at in _PLAYED]
+    taken = [Reading(at[2], Pose(*place), 5.0 * k) for k, (place, at) in enumerate(zip(nearest, _PLAYED, strict=True))]
+    recording, rng = experiment.problem(taken).recording, np.random.default_rng(seed)
+    kinds = experiment.kinds[0], [kind for kind in experiment.kinds if kind.left_out == "backlash"][3]
+    start = prior_posterior(kinds, 600, rng=rng)
+    led = from_nothing(kinds[0].problem(recording), rng=rng)
+    leader = replace(start.particles[0], weighted=led, ancestor=np.arange(len(led.theta)), searched_at=len(taken))
+    lost = replace(start.particles[1].with_zero_evidence(), strained=True)
+    now = replace(start, particles=(leader, lost))
+    found = experiment.inference_method.reconsidered(now, recording, rng=rng).particles[1]
+    assert found.log_z == pytest.approx(-23.6, abs=1.5)
 
 
 @pytest.mark.slow

@@ -129,8 +129,6 @@ def test_readings_chosen_together_do_not_repeat_each_other(made):
     table = [[0.0, 0.0, 0.0], [0.0, 40.0, 0.0], [40.0, 0.0, 30.0], [40.0, 40.0, 30.0]]
     chosen = choose_several(made.listed(table), 2, rng=np.random.default_rng(6))
     assert set(chosen) in ({0, 1}, {1, 2})
-    with pytest.raises(ParameterError, match="n is 0"):
-        choose_several(made.listed(table), 0, rng=np.random.default_rng(6))
 
 
 def test_a_single_reading_chosen_together_is_the_best_one(made):

@@ -27,7 +27,7 @@ from probewise.arm.geometry import (
     place_jacobian,
     places_at_parameters,
 )
-from probewise.errors import ParameterError, ProbewiseError, ReachError, ShapeError
+from probewise.errors import ParameterError, ProbewiseError, ReachError
 from probewise.recordings.table import csv_text, number_text, read_table
 
 LEAST_MARKS = 5
@@ -134,9 +134,8 @@ def fit_geometry(
 ) -> FittedGeometry:
     """Fit home angles, links and base to marks; return the fitted geometry with its errors.
 
-    Raises ShapeError if there is not one row of three numbers per mark; ParameterError if there are fewer than five
-    marks, they do not determine the geometry, or `touch_mm` is not above 0; MarksDisagreeError if the best fit has a
-    p-value below 0.001.
+    Raises ParameterError if there are fewer than five marks, or they do not determine the geometry; MarksDisagreeError
+    if the best fit has a p-value below 0.001.
 
     Parameters
     ----------
@@ -150,10 +149,6 @@ def fit_geometry(
         Sd of a mark's place and height, from positioning by eye and from the motors.
     """
     turned, marks = floats(turned_rad, "turned_rad"), floats(marks_mm, "marks_mm")
-    if turned.ndim != 2 or turned.shape[1] != 3 or marks.shape != turned.shape:
-        raise ShapeError(f"turned_rad and marks_mm have shapes {turned.shape} and {marks.shape}; allowed: (n_marks, 3)")
-    if not touch_mm > 0:
-        raise ParameterError("touch_mm", touch_mm, "greater than 0")
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
     values, p_value, jacobian = _least_squares_fit(geometry, turned, marks, touch_mm)

@@ -74,12 +74,9 @@ class Joint:
 
     @property
     def stop_counts(self) -> int:
-        """Motor count with the joint at its stop.
-
-        Raises ParameterError if the joint has no stop.
-        """
-        if self.stop_rad is None or self.stop_side is None:
-            raise ParameterError("stop_deg", None, "an angle: without one the joint has no stop to be found")
+        """Motor count with the joint, which has a stop, at that stop."""
+        assert self.stop_rad is not None
+        assert self.stop_side is not None
         return self.counts_at(self.stop_rad, self.stop_side)
 
     def counts_at(self, angle_rad: float, side: int = 0) -> int:

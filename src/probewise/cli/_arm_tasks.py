@@ -92,7 +92,8 @@ def nxt_port(name: str) -> str:
     if chosen.kind == "file":
         raise ParameterError("--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
     if chosen.kind != "nxt":
-        raise ParameterError("--arm", name, f"nxt:PORT; {name} has no bench, --dry-run prints the moves")
+        allowed = "nxt:PORT, also that of `probewise emulate-nxt`, a brick in software; --dry-run prints the moves"
+        raise ParameterError("--arm", name, allowed)
     return chosen.where
 
 

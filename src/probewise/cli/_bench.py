@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -136,25 +136,13 @@ def world_and_instrumentation(sensor: Path | None) -> tuple[World, recordings.In
 
 
 class InstrumentWithCallbacks:
-    """An instrument that calls `moving` with the pose before each move, and `read` with each reading."""
+    """An instrument, already entered, that calls `moving` with each pose before it moves, `read` with each reading."""
 
     def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
         self._instrument, self._moving, self._read = instrument, moving, read
-        self.reachable, self.orientation_rad = instrument.reachable, instrument.orientation_rad
-        self.travel_s = instrument.travel_s
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the instrument declares of itself: `turns`, `lifts`, `read_height_mm`."""
         return getattr(self._instrument, name)
-
-    def __enter__(self) -> Self:
-        self._instrument.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._instrument.__exit__(kind, error, trace)
 
     def measure(self, pose: Pose) -> Reading:
         """Call `moving`, measure, call `read`, and return the reading."""

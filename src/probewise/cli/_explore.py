@@ -395,14 +395,14 @@ def explore(arguments: argparse.Namespace) -> int:
     with (
         reporting_what_is_kept(kept_message),
         progress_shown(quiet=arguments.quiet) as progress,
-        _bench.InstrumentWithCallbacks(
-            site.arm,
-            lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
-            lambda reading: report_activity(f"thinking about a reading of {reading.value:g}"),
-        ) as reporting,
+        site.arm as arm,
         closing(
             experiments.explore(
-                reporting,
+                _bench.InstrumentWithCallbacks(
+                    arm,
+                    lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
+                    lambda reading: report_activity(f"thinking about a reading of {reading.value:g}"),
+                ),
                 inputs.experiment,
                 rng=inputs.streams.run,
                 max_readings=arguments.max_readings,

@@ -1,17 +1,19 @@
 """The evidence of kinds of hypotheses, from the prior.
 
 Samples that are carried from reading to reading keep only the modes that they have, and their evidence accumulates
-errors. One rule sets that right: at a doubt, a few at a time, and before a run ends the kinds whose samples had
-difficulties are solved from the prior, whatever these say, those that were ruled out among them. A quick run of nested
-sampling finds the modes; importance sampling about its samples and the carried ones gives evidence and samples. A kind
-that is so far behind that perfect predictions of all readings since could not bring it back sleeps until they could.
+errors. One rule sets that right: kinds are solved from the prior, at a doubt a few at a time, and before a run ends
+all whose samples had difficulties, or that were not solved since half of the readings were taken, those that were ruled
+out among them. A quick run of nested sampling finds the modes; importance sampling about its samples and the carried
+ones gives evidence and samples. A kind that is so far behind that perfect predictions of all readings since could not
+bring it back sleeps until they could.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,9 +28,11 @@ _MATTERS = 1e-4  # probability, by the raised odds, from which on a kind is solv
 _HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
 _SLEEPS = 1e-8  # probability, by the raised odds, below which a kind falls asleep
 _EACH = 2  # kinds that are solved after a reading: the most probable of the unsure, and those solved longest ago
+_OLD = 0.5  # share of the readings: a kind that was solved with fewer is solved again before a run ends
 _MOVES = 4.0  # of each new live point: its samples are only where draws are made
 _BEHIND = 20.0  # nats behind what the prior's search found, from which on carried samples are not drawn about
 _LOST_SHARE = 0.05  # of a posterior that may lie outside the samples' range, besides what chance leaves there
+_LOST_NATS = 3.0  # few draws overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
 _FOUND, _WELL_FOUND = 15.0, 100.0  # effective draws from which on importance sampling counts, and need not go on
 _ROUNDS = 3  # of importance sampling, each about the draws of those before
 _WIDE, _OF_WIDE = 3.0, 0.15  # factor on the width of some kernels, beyond the samples they are fitted to; their share
@@ -54,12 +58,13 @@ def with_evidence_from_prior(
     at_end: bool,
     rng: np.random.Generator,
 ) -> Posterior:
-    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those never solved too.
+    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those of few readings too.
 
     `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. Unsure is a
     kind whose samples followed a reading with difficulty or were woken, and in doubt one never solved, too. After a
-    reading, a few of these are solved; before a run ends, all. Where no effect can be left out, the end changes samples
-    only if they had lost a mode.
+    reading, a few of these are solved; before a run ends, all, with those that were last solved with fewer than half of
+    the readings: samples lose a mode without a sign. Where no effect can be left out, the end changes samples only if
+    they had lost a mode.
     """
     n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
     raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
@@ -67,6 +72,7 @@ def with_evidence_from_prior(
     searched_at, matters = np.array([p.searched_at for p in now.particles]), raised > _MATTERS
     unsure = np.where(asleep, matters, doubtful | (searched_at == -math.inf))
     if at_end:
+        unsure |= searched_at < _OLD * n_readings
         due = np.flatnonzero(unsure & (now.doubts_sensor | (raised > _HAS_A_SAY)))
     else:
         in_doubt = raised[doubtful].sum() > 0.5 or (now.doubts_sensor and possible and now.left_out[""] < 0.5)
@@ -80,10 +86,12 @@ def with_evidence_from_prior(
         own, kind, problem = particles[k], now.kinds[k], problems[k]
         n = max(len(own.ancestor), n_samples_of_kind(kind, float(raised[k]), n_particles))
         carried = own.with_zero_evidence() if own.asleep else own
-        shapes = None
-        if kind.effect is None and kind.shape == now.kinds[leader].shape and k != leader:
-            shapes = leading.samples(n // 2, rng=rng)[:, : len(kind.prior.names)]
-        found = posterior_from_prior(carried.weighted, problem, n, n_live, rng, others=shapes)
+        others = None
+        if kind.shape == now.kinds[leader].shape and k != leader:
+            others = kind.prior.from_unit_cube(rng.random((n // 2, len(kind.prior.names))))
+            n_shared = sum(map(operator.eq, kind.prior.names, leading.names))  # the sensor's and the shape's come first
+            others[:, :n_shared] = leading.samples(n // 2, rng=rng)[:, :n_shared]
+        found = posterior_from_prior(carried.weighted, problem, n, n_live, rng, others=others)
         keep = not own.is_doubtful and not now.doubts_sensor and not (found and _has_lost_mode(own.weighted, found))
         if found is None:
             none = own.with_zero_evidence()
@@ -107,9 +115,9 @@ def posterior_from_prior(
 ) -> Weighted | None:
     """Return samples and evidence of a problem by a search of the prior; None if nothing could give the readings.
 
-    `own` are samples that were carried, `others` those of the leading kind, for modes that the search may miss, as it
-    does where noise excuses any reading. Where importance sampling has few effective draws (modes too many or too
-    bent), the better of search and carried samples counts as it is.
+    `own` are samples that were carried; `others` have the shape as the leading kind has it, all else from the prior,
+    for modes that the search may miss. Where importance sampling has few effective draws (modes too many or too bent),
+    the better of search and carried samples counts as it is, unless both have lost a mode that the draws found.
     """
     try:
         with warnings.catch_warnings():
@@ -130,7 +138,7 @@ def posterior_from_prior(
         drawn = sampled_about_points(points, problem, 2 * n, rng)
         if drawn is None:
             break
-        if drawn.n_eff > _FOUND:
+        if drawn.n_eff > _FOUND or drawn.log_z > best.log_z + _LOST_NATS:
             best = drawn
         if drawn.n_eff > _WELL_FOUND:
             break
@@ -149,33 +157,16 @@ def sampled_about_points(
     points: FloatArray, problem: KindProblem, n_draws: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Sample a posterior by draws from kernels about points near it, (n_points, n_params); None if none is possible."""
-    density = _KernelDensity.fitted_to(points, rng=rng)
-    draws = density.draw(n_draws, rng=rng)
+    near, far = (LocalKernels.fitted_to(points, rng=rng, widened=times) for times in (1.0, _WIDE))
+    n_far = round(_OF_WIDE * n_draws)
+    draws = np.concatenate([near.draw(n_draws - n_far, rng=rng), far.draw(n_far, rng=rng)])
     theta = draws[np.isfinite(problem.prior.log_prob(draws))]
     log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
     alive = np.isfinite(log_likelihood)
     if not alive.any():
         return None
     theta, log_likelihood = theta[alive], log_likelihood[alive]
-    log_ratio = problem.prior.log_prob(theta) + log_likelihood - density.log_density(theta)
+    log_near, log_far = (kernels.log_density(theta) for kernels in (near, far))
+    log_density = np.logaddexp(log_near + math.log1p(-_OF_WIDE), log_far + math.log(_OF_WIDE))
+    log_ratio = problem.prior.log_prob(theta) + log_likelihood - log_density
     return weighted_draws(problem.prior.names, theta, log_likelihood, log_ratio, n_draws)
-
-
-@dataclass(frozen=True, eq=False)
-class _KernelDensity:
-    """A density of local kernels, mixed with the same kernels three times as wide (15 %)."""
-
-    near: LocalKernels
-    far: LocalKernels
-
-    @classmethod
-    def fitted_to(cls, points: FloatArray, *, rng: np.random.Generator) -> _KernelDensity:
-        return cls(LocalKernels.fitted_to(points, rng=rng), LocalKernels.fitted_to(points, rng=rng, widened=_WIDE))
-
-    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        n_far = round(_OF_WIDE * n)
-        return np.concatenate([self.near.draw(n - n_far, rng=rng), self.far.draw(n_far, rng=rng)])
-
-    def log_density(self, points: FloatArray) -> FloatArray:
-        near, far = self.near.log_density(points), self.far.log_density(points)
-        return np.asarray(np.logaddexp(near + math.log1p(-_OF_WIDE), far + math.log(_OF_WIDE)))

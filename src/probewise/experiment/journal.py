@@ -43,6 +43,14 @@ _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 # Settings that journals of earlier versions lack.
 _LATER = frozenset({"geometry_sha256"})
 _EFFECT, _WITH_EFFECTS = b"<effect>", "effects-"
+_DIGESTED = {
+    "sensor": "another sensor model, or other cards",
+    "sensor_sha256": "another sensor",
+    "likelihood_sha256": "another likelihood",
+    "fitted_arm": "another geometry of the arm",
+    "geometry_sha256": "another geometry of the arm",
+}  # in words, since their values are digests
+_OF_SENSOR = frozenset({"sensor", "likelihood", "likelihood_sha256", "options.noise_sd"})  # what follows from its file
 
 
 @dataclass(frozen=True)
@@ -256,11 +264,14 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
     with_effects = {name for name, value in here.items() if str(value).startswith(_WITH_EFFECTS)}
     compared -= {name for name in with_effects if not str(there.get(name)).startswith(_WITH_EFFECTS)}
     different = sorted(name for name in compared if there.get(name) != here.get(name))
+    if "sensor_sha256" in different:
+        different = [name for name in different if name not in _OF_SENSOR]
     if different:
-        had = "; ".join(f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
+        plain = (f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
+        words = (_DIGESTED.get(name, told) for name, told in zip(different, plain, strict=True))
         raise FileError(
             journal.path,
-            f"a run with other settings: {had}",
+            f"a run with other settings: {'; '.join(dict.fromkeys(words))}",
             "resume with the settings it was begun with, or begin a new journal under another name",
             row=1,
         )

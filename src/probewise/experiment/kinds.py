@@ -16,7 +16,6 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Estimated
-from probewise.errors import ParameterError
 from probewise.experiment.rivals import DescribedEffect, SensorModelRival, powers_of_s
 from probewise.inference.problem import Likelihood, SensorProblem, checked_log_prob
 from probewise.inquiry import TabulatedChain
@@ -144,10 +143,9 @@ def kinds_of(
     """Return the kinds of hypotheses of an experiment: for every shape, the sensor model alone and with each rival.
 
     `prior` and `likelihood` are those of all parameters, of which those of `sensor_prior` (None: the sensor is known)
-    come first. `models` are the sensor model, from tables where possible, and the chain to which effects are added;
-    ParameterError if that is no `Chain`. `trust` is the prior probability that the sensor model is complete; the names
-    of the rivals share the rest equally. Below 1, the kinds without a rival also infer the effects that a repair of the
-    sensor estimated.
+    come first. `models` are the sensor model, from tables where possible, and the chain to which effects are added.
+    `trust` is the prior probability that the sensor model is complete; the names of the rivals share the rest equally.
+    Below 1, the kinds without a rival also infer the effects that a repair of the sensor estimated.
     """
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)
@@ -160,8 +158,7 @@ def kinds_of(
             if rival.effect is None:
                 kinds.append(part.kind(rival.name, share, part.prior, quick, rival.likelihood or likelihood))
                 continue
-            if not isinstance(chain, Chain):
-                raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
+            assert isinstance(chain, Chain)
             both = Joint((part.prior, _PrefixedPrior(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
             model = TabulatedChain.of(acting, quick) or acting

@@ -393,8 +393,6 @@ def run_from_place(
     The instrument, already entered, has to reach that place; `rng` is the generator of the whole run. Errors are those
     of `explore`.
     """
-    if max_readings < 1:
-        raise ParameterError("max_readings", max_readings, "1 or more")
     state = replace(begin(experiment, instrument, rng=rng), next_pose=first, planned=())
     steps: list[Step] = []
     while not steps or steps[-1].stop_reason is None:

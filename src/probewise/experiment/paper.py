@@ -16,7 +16,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Instrument, Pose, Reading
-from probewise.errors import ParameterError
 from probewise.experiment.journal import PATTERN, recording_of
 from probewise.inference.likelihoods import StudentT
 from probewise.inference.problem import Likelihood, SensorProblem
@@ -92,12 +91,6 @@ class OneScan:
 
     sd_floor: float
     sd_ceiling: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.sd_floor < self.sd_ceiling < math.inf:
-            raise ParameterError(
-                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < ceiling, finite"
-            )
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the log likelihood, (n_samples,), of readings (n_points,) given predictions (n_samples, n_points)."""

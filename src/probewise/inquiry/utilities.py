@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, require_finite
-from probewise.errors import ParameterError, ShapeError, did_you_mean
+from probewise.errors import ParameterError, did_you_mean
 from probewise.inquiry.entropy import UtilityMap, choose, label_entropy, map_of_rows
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
@@ -50,7 +50,7 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class UtilityInput:
-    """Posterior, designs and sensor, with the quantities that utilities need; ShapeError if the arrays do not match.
+    """Posterior, designs and sensor, with the quantities that utilities need.
 
     Attributes
     ----------
@@ -82,18 +82,6 @@ class UtilityInput:
     rows: IntArray
     cost_s: FloatArray
     goal: Goal | None = None
-
-    def __post_init__(self) -> None:
-        if self.theta.ndim != 2 or self.weight.shape != (len(self.theta),) or 0 in self.theta.shape:
-            raise ShapeError(
-                f"theta has shape {self.theta.shape}, weight {self.weight.shape}; "
-                "allowed: (n_samples, n_params), (n_samples,)"
-            )
-        if len(self.plan) != len(self.designs) or self.cost_s.shape != self.rows.shape:
-            raise ShapeError(
-                f"{len(self.designs)} designs, {len(self.plan)} rows of a plan, {self.cost_s.size} costs of "
-                f"{self.rows.size}; allowed: as many rows as designs, a cost for each that can be taken"
-            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -496,8 +484,6 @@ def choose_several(
     Return indices of designs, from `utility_input.rows`, in the order in which they were chosen; two may be the same.
     `chance` is the probability that a reading at each of these returns a value, (n,), by which its information counts.
     """
-    if n < 1:
-        raise ParameterError("n", n, "1 or more")
     everywhere = np.ones(len(utility_input.rows), dtype=np.bool_)
     weighing = np.ones(1) if chance is None else chance
     chosen = [choose(utility_input.information(utility_input.weight) * weighing, everywhere, rng=rng)]

@@ -30,7 +30,7 @@ from probewise.arm.nxt.telegram import (
     encode,
     framed,
 )
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError
 
 if TYPE_CHECKING:
     import serial
@@ -73,21 +73,6 @@ class Timing:
     silence_s: float = 0.2  # after which the stream counts as drained
     keep_awake_s: float = 60.0  # between keep-alive commands; a third of the brick's sleep limit if that is shorter
     n_repeats: int = 2  # of a question without a valid answer, if repeating it is harmless
-
-    def __post_init__(self) -> None:
-        for name in ("answer_s", "silence_s", "keep_awake_s"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "greater than 0")
-        for name in ("turn_s", "gap_s", "n_repeats"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(name, getattr(self, name), "0 or more")
-
-    @property
-    def longest_s(self) -> float:
-        """Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
-        draining_s = self.answer_s + self.silence_s
-        waiting_s = 2 * self.turn_s + self.answer_s
-        return (1 + self.n_repeats) * (waiting_s + draining_s + len(FENCES) * (waiting_s + draining_s))
 
 
 class NoAnswerError(LinkError):

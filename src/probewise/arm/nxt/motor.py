@@ -27,7 +27,7 @@ from probewise.arm.nxt.telegram import (
     SetOutputState,
     TelegramError,
 )
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError
 
 Guard: TypeAlias = Callable[[int, int], None]
 """Function that raises ReachError if the motor must not go from one rotation count to another."""
@@ -59,22 +59,6 @@ class DriveParameters:
     settle_s: float = 0.2  # from stopping until the count is read
     stuck_s: float = 1.5  # without a change of count after which a running motor is stuck
     n_moves: int = 12  # for one goal
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.slow_power <= self.fast_power <= 100:
-            raise ParameterError(
-                "slow_power, fast_power",
-                (self.slow_power, self.fast_power),
-                "1 to 100, the fast one not below the slow",
-            )
-        if not FAINT_POWER < self.seek_power <= 100:
-            raise ParameterError("seek_power", self.seek_power, f"{FAINT_POWER + 1} to 100, enough to turn the motor")
-        for name in ("coast_counts", "tolerance_counts", "lead_counts", "runaway_counts", "settle_s"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(name, getattr(self, name), "0 or more")
-        for name in ("stuck_s", "n_moves"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "greater than 0")
 
 
 class Motor:

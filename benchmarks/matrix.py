@@ -206,7 +206,7 @@ def commands(cell: Cell, folder: Path) -> tuple[list[list[str]], float | None]:
     path = str(folder / "recording.csv")
     write_recording(world.simulate(plan, rng=rng), path)
     if verb == "investigate":
-        truth = [f"{e.name}:{','.join(map(repr, vars(e).values()))}" for e in world.concealed] or ["nothing"]
+        truth = [f"{e.name}:{','.join(map(repr, e.parameters.values()))}" for e in world.concealed] or ["nothing"]
         return [[verb, "--plan", path, "--truth", *truth, "--readings", "60", "--rounds", "2"]], size
     first = [verb, path, *(known if what in (*LEVELS, *NEEDS_SENSOR, "a known sensor") else [])]
     return [first, *([["predict", "sensor.json", path]] if verb == "diagnose" else [])], size

@@ -107,7 +107,7 @@ def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value
 @pytest.mark.slow
 def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     """A lamp that fades and a sensor that sinks look the same here: the one in the vocabulary speaks for both."""
-    found = diagnose(recording("two_way", hidden.GainDrift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
+    found = diagnose(recording("two_way", hidden.gain_drift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"  # a battery that tires as the lamp does
     assert found.combination in (("gain_drift",), ("battery_sag",))
     assert found.judged.unknown_probability < 0.05
@@ -118,14 +118,14 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_name_is_not_outdone_by_bases_that_hold_it(seed):
     """What differs between ways to come holds hysteresis and more; were it not spoken for, a tenth would be unknown."""
-    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=seed), rng=np.random.default_rng(0))
+    found = diagnose(recording("two_way", hidden.hysteresis(0.25), seed=seed), rng=np.random.default_rng(0))
     assert found.combination == ("hysteresis",)
     assert found.judged.unknown_probability < 0.03
 
 
 @pytest.mark.slow
 def test_backlash_is_named_measured_located_and_repaired():
-    found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    found = diagnose(recording("forth_and_back", hidden.backlash(0.7), seed=2), rng=np.random.default_rng(0))
     document = strict(found)
     assert found.verdict == "named"
     assert found.combination == ("backlash",)
@@ -150,7 +150,7 @@ def test_backlash_is_named_measured_located_and_repaired():
 @pytest.mark.slow
 def test_a_recording_far_from_0_is_diagnosed_as_one_at_0():
     """Times in seconds since 1970: the lamp warms up from the first reading on, and its sensor knows since when."""
-    near = recording("paper", hidden.GainDrift(-0.1, 100.0), seed=3)
+    near = recording("paper", hidden.gain_drift(-0.1, 100.0), seed=3)
     near = dataclasses.replace(near, plan=dataclasses.replace(near.plan, time_s=near.plan.time_s - near.plan.time_s[0]))
     far = dataclasses.replace(near, plan=dataclasses.replace(near.plan, time_s=near.plan.time_s + 1.7e9))
     found, there = (diagnose(each, rng=np.random.default_rng(0)) for each in (near, far))
@@ -169,7 +169,7 @@ def test_a_recording_far_from_0_is_diagnosed_as_one_at_0():
 def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     worse = HeldOutGain(-4.0, 0.5, 50, (("edge_0", -4.0),))
     monkeypatch.setattr("probewise.diagnosis.best_repair.held_out_gain", lambda *_, **__: worse)
-    found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    found = diagnose(recording("forth_and_back", hidden.backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
     assert "backlash (play) of the arm fits these readings best" in found.reason
@@ -180,7 +180,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
 @pytest.mark.slow
 def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     """Both shift every edge alike, and so does a tilt; scans that also go back tell them apart."""
-    found = diagnose(recording("paper", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    found = diagnose(recording("paper", hidden.backlash(0.7), seed=2), rng=np.random.default_rng(0))
     strict(found)
     assert found.verdict == "cannot_tell"
     assert found.p_value < 1e-6
@@ -209,17 +209,17 @@ def test_too_few_readings_are_said_to_be_too_few():
 
 
 CASES = [
-    (hidden.GainDrift(0.05, 200.0), ("gain_drift",)),
-    (hidden.AmbientGradient(0.012, 0.0), ("ambient_gradient",)),
-    (hidden.Saturation(57.0), ("saturation",)),
-    (hidden.Nonlinearity(1.08), ("nonlinearity",)),
-    (hidden.Backlash(0.4), ("backlash",)),
-    (hidden.CorrelatedNoise(0.5), ("correlated_noise",)),
-    (hidden.Outliers(0.03, 8.0), ("outliers",)),
-    (hidden.HeavyTails(4.0), ("outliers",)),
-    (hidden.Dropouts(0.01, 0.0), ("dropouts",)),
-    (hidden.SignalDependentNoise(4.0), ("signal_dependent_noise",)),
-    (hidden.Quantisation(1.5), ("quantisation",)),
+    (hidden.gain_drift(0.05, 200.0), ("gain_drift",)),
+    (hidden.ambient_gradient(0.012, 0.0), ("ambient_gradient",)),
+    (hidden.saturation(57.0), ("saturation",)),
+    (hidden.nonlinearity(1.08), ("nonlinearity",)),
+    (hidden.backlash(0.4), ("backlash",)),
+    (hidden.correlated_noise(0.5), ("correlated_noise",)),
+    (hidden.outliers(0.03, 8.0), ("outliers",)),
+    (hidden.heavy_tails(4.0), ("outliers",)),
+    (hidden.dropouts(0.01, 0.0), ("dropouts",)),
+    (hidden.signal_dependent_noise(4.0), ("signal_dependent_noise",)),
+    (hidden.quantisation(1.5), ("quantisation",)),
 ]
 
 
@@ -296,7 +296,7 @@ def test_an_earlier_sensor_is_taken_as_the_prior():
 @pytest.mark.slow
 def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named():
     """To first order the SSF's width takes a scale up; at a third it does not, though no template shows that."""
-    found = diagnose(recording("paper", hidden.PositionScale(-0.3, 0.0)), rng=np.random.default_rng(0))
+    found = diagnose(recording("paper", hidden.position_scale(-0.3, 0.0)), rng=np.random.default_rng(0))
     strict(found)
     scale = next(effect for effect in found.effects if effect.name == "position_scale")
     assert scale.probability > 0.05
@@ -305,7 +305,7 @@ def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "name"),
-    [(unlisted.PlaceStep(-0.8, 1.4), "missing_tooth"), (unlisted.StickSlip(0.5, 6.0, 0.3), "stick_slip")],
+    [(unlisted.place_step(-0.8, 1.4), "missing_tooth"), (unlisted.stick_slip(0.5, 6.0, 0.3), "stick_slip")],
 )
 def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
     """A step of the arm at one place is among the bases of places too: by that name or as one of those."""
@@ -330,7 +330,7 @@ def test_a_tone_that_slides_is_no_memory_of_the_noise():
 def test_a_rare_effect_is_named_and_its_repair_predicts():
     """The paper slips; the model that finds it moves the arm instead."""
     half_way_s = float(np.median(two_way_plan().time_s))
-    pushed = recording("two_way", unlisted.SlippedPaper(1.5, half_way_s))
+    pushed = recording("two_way", unlisted.slipped_paper(1.5, half_way_s))
     found = diagnose(pushed, rng=np.random.default_rng(0))
     document = strict(found)
     assert found.verdict == "named"
@@ -350,7 +350,7 @@ def test_readings_beyond_the_declared_range_do_not_stop_it():
     """A gradient drives the dark end below what the instrument can read: those rows are lost, the rest is diagnosed."""
     plan = paper_plan()
     limited = dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, min=8.0, max=None))
-    full = recording("paper", hidden.AmbientGradient(0.05, 0.0))
+    full = recording("paper", hidden.ambient_gradient(0.05, 0.0))
     found = diagnose(Recording(limited, full.readings), rng=np.random.default_rng(0))
     strict(found)
     assert 24 < found.recording.usable.sum() < len(plan)
@@ -378,7 +378,7 @@ def test_a_sensor_that_is_known_shows_that_it_was_turned():
     """As by a clean diagnosis; the alarm is not silenced by fine structure that the sensor is known not to have."""
     rng = np.random.default_rng(0)
     earlier = clean_diagnosis().repaired.fitted_sensor(recording("paper", seed=2), rng=rng)
-    turned = recording("paper", hidden.OrientationError(12.0), seed=5)
+    turned = recording("paper", hidden.orientation_error(12.0), seed=5)
     found = diagnose(turned, sensor=earlier, rng=rng)
     assert (found.verdict, found.combination) == ("named", ("orientation_error",))
     assert found.p_value < 1e-6
@@ -387,7 +387,7 @@ def test_a_sensor_that_is_known_shows_that_it_was_turned():
 @pytest.mark.slow
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
     monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: 0.2)
-    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
+    found = diagnose(recording("two_way", hidden.hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("cannot_tell", ())
     assert found.hypotheses[0].effects == ("hysteresis",)
     amp = found.repaired.effect_samples("hysteresis")[:, 0]
@@ -397,7 +397,7 @@ def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_
 
 @pytest.mark.slow
 def test_two_effects_are_both_named():
-    both = recording("two_way", hidden.Backlash(0.5), hidden.GainDrift(0.05, 200.0))
+    both = recording("two_way", hidden.backlash(0.5), hidden.gain_drift(0.05, 200.0))
     found = diagnose(both, rng=np.random.default_rng(0))
     strict(found)
     assert found.combination == ("backlash", "gain_drift")

@@ -222,7 +222,7 @@ def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise
 
 @pytest.mark.slow
 def test_what_moves_readings_by_more_than_a_step_is_found_through_it():
-    found = diagnose(rounded(0.4, 1, hidden.AmbientGradient(0.15, 0.0)), rng=np.random.default_rng(0))
+    found = diagnose(rounded(0.4, 1, hidden.ambient_gradient(0.15, 0.0)), rng=np.random.default_rng(0))
     assert found.combination == ("ambient_gradient", "quantisation")
     slope = next(effect for effect in found.effects if effect.name == "ambient_gradient").parameters[0]
     assert abs(slope.mean - 0.15) < 4 * slope.sd

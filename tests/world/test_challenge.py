@@ -10,7 +10,7 @@ from scipy.stats import kstest
 
 from probewise.errors import NotConvergedError
 from probewise.proof.sensors.cases import WHEEL, Stratum, draw_case, held_out_recordings, stratum_of
-from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, OUTSIDE, SINGLES, CleanSetup
+from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, OUTSIDE, SAMPLERS, SINGLES, CleanSetup
 from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
 from probewise.proof.sensors.sensors import NOISE_LEVELS, NOISE_NAMES, SSFS, draw_sensor
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer, region_of_effect
@@ -216,7 +216,7 @@ def setup(request):
 
 
 def test_every_candidate_makes_effects_of_its_name(setup):
-    for name, candidate in {**INSIDE, **OUTSIDE}.items():
+    for name, candidate in SAMPLERS.items():
         of_amplitude = candidate.draw(setup, np.random.default_rng(6))
         for amplitude in (candidate.first, candidate.limit):
             assert of_amplitude(amplitude).name == name
@@ -236,13 +236,13 @@ def test_a_local_effect_is_found_where_it_is(setup):
     def region(name, amplitude):
         return region_of_effect(INSIDE[name].draw(setup, np.random.default_rng(8))(amplitude), sizer)
 
-    glint = INSIDE["glint"].draw(setup, np.random.default_rng(8))(2.0)
+    glint = INSIDE["glint"].draw(setup, np.random.default_rng(8))(2.0).parameters
     found = region("glint", 2.0)
     # Half as strong at 1.18 sd, seen along y = 0, to the millimetre of the plan.
-    half = glint.r * np.sqrt(2 * np.log(2))
+    half = glint["r"] * np.sqrt(2 * np.log(2))
     assert found.covariate == "place"
-    assert found.low == pytest.approx(glint.x - half, abs=1.01)
-    assert found.high == pytest.approx(glint.x + half, abs=1.01)
+    assert found.low == pytest.approx(glint["x"] - half, abs=1.01)
+    assert found.high == pytest.approx(glint["x"] + half, abs=1.01)
     step = region("ambient_step", 1.0)
     assert (step.covariate, step.high) == ("time", setup.plan.time_s[-1])
     assert region("scan_misplacement", 1.0).scans
@@ -257,6 +257,6 @@ def test_every_single_and_outsider_can_be_drawn_at_its_size():
         for turn, name in enumerate(names):
             truth = case(number_of(kind, size=size, other_noise=False, skip=turn))
             assert truth.hidden[0].name == name
-            if INSIDE.get(name, OUTSIDE.get(name)).scalable:
+            if SAMPLERS[name].scalable:
                 assert truth.hidden[0].size_lambda == pytest.approx(size, rel=0.1)
     assert not NEEDS_SENSOR & set(SINGLES)

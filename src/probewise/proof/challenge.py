@@ -32,8 +32,6 @@ from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup
 from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
-from probewise.world.concealed import Quantisation
-from probewise.world.stages import Disturbs
 from probewise.world.world import World
 
 __all__ = ["run_case", "run_challenge"]
@@ -242,7 +240,7 @@ def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: N
 def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
     """Return an effect as a dict; "cosines" are those above 0.5 with effects of the vocabulary, by name."""
     # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
-    on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
+    on_noise = hidden.effect.disturbs or hidden.name == "quantisation"
     like = (
         {}
         if on_noise

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from probewise.world.concealed import (
-    CorrelatedNoise,
-    Dropouts,
-    HeavyTails,
-    Outliers,
-    RisingNoiseSd,
-    SignalDependentNoise,
+    correlated_noise,
+    drifting_noise,
+    dropouts,
+    heavy_tails,
+    outliers,
+    signal_dependent_noise,
 )
 from probewise.world.spots import Blob, Spot, gaussian_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.stages import Concealed
@@ -103,12 +103,12 @@ def with_noise_model(world: World, model: str, *, duration_s: float) -> World:
     "quantised" readings are rounded to whole units, which the plan should declare.
     """
     more: Mapping[str, Concealed] = {
-        "ar1": CorrelatedNoise(0.3),
-        "drifting": RisingNoiseSd(2.0, duration_s),
-        "t4": HeavyTails(4.0),
-        "outliers": Outliers(0.02, 8.0),
-        "signal_dependent": SignalDependentNoise(2.0),
-        "dropouts": Dropouts(0.01, 0.0),
+        "ar1": correlated_noise(0.3),
+        "drifting": drifting_noise(2.0, duration_s),
+        "t4": heavy_tails(4.0),
+        "outliers": outliers(0.02, 8.0),
+        "signal_dependent": signal_dependent_noise(2.0),
+        "dropouts": dropouts(0.01, 0.0),
     }
     if model in more:
         return replace(world, concealed=(*world.concealed, more[model]))

@@ -16,22 +16,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.proof.sensors.effects import CleanSetup
 from probewise.recordings.plan import Recording
-from probewise.world.concealed import (
-    AlbedoPatch,
-    AmbientStep,
-    CorrelatedNoise,
-    Dropouts,
-    EdgeShadow,
-    Glint,
-    HeightOffset,
-    Outliers,
-    Saturation,
-    ScanAngleError,
-    ScanMisplacement,
-    SignalDependentNoise,
-)
-from probewise.world.stages import AFTER_VIEW, Concealed, Disturbs
-from probewise.world.unlisted import PlaceStep
+from probewise.world.stages import AFTER_VIEW, Concealed
 from probewise.world.world import View
 
 NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]
@@ -122,7 +107,7 @@ class EffectSizer:
 
     def size(self, *concealed: Concealed) -> float:
         """Return the joint lambda of effects: norm after the refit / noise sd; of one on noise, `noise_effect_size`."""
-        if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
+        if len(concealed) == 1 and concealed[0].disturbs:
             return noise_effect_size(
                 concealed[0], self._clean_view, self.clean_recording.readings, self.setup.world.noise_sd
             )
@@ -137,7 +122,7 @@ class EffectSizer:
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
 
 
-def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_sd: float) -> float:
+def noise_effect_size(effect: Concealed, view: View, readings: FloatArray, noise_sd: float) -> float:
     """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
 
     lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
@@ -148,19 +133,19 @@ def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_
     (`World.view`), and the noise-free readings, shape (n_points,); `noise_sd`: sd of the noise's Gaussian core, reading
     units. Raises ParameterError if the effect is any other.
     """
-    n_points = len(view.seen)
-    match effect:
-        case CorrelatedNoise():
+    n_points, known = len(view.seen), effect.parameters
+    match effect.name:
+        case "correlated_noise":
             n_correlated = n_points - int(view.rows.scan_start_mask().sum())
-            return math.sqrt(-n_correlated * math.log(1 - effect.rho**2))
-        case SignalDependentNoise():
-            variance = 1 + effect.ratio * view.seen
+            return math.sqrt(-n_correlated * math.log(1 - known["rho"] ** 2))
+        case "signal_dependent_noise":
+            variance = 1 + known["ratio"] * view.seen
             return math.sqrt(n_points * (math.log(variance.mean()) - float(np.log(variance).mean())))
-        case Outliers():
-            return math.sqrt(2 * n_points * _outlier_divergence(effect.share, effect.size))
-        case Dropouts():
+        case "outliers":
+            return math.sqrt(2 * n_points * _outlier_divergence(**known))
+        case "dropouts":
             # As for the mean: a lost reading deviates by its distance from the right value.
-            return math.sqrt(effect.share * float(((effect.value - readings) ** 2).sum())) / noise_sd
+            return math.sqrt(known["share"] * float(((known["value"] - readings) ** 2).sum())) / noise_sd
         case _:
             raise ParameterError("effect", effect.name, "a noise effect of the vocabulary")
 
@@ -193,19 +178,19 @@ def region_of_effect(effect: Concealed, sizer: EffectSizer) -> CovariateRegion |
     largest reading. Edge shadow: distances at which it is at least half its maximum. Stain, glint, step in X: the range
     of X in which it changes readings of scans along X by at least half its maximum.
     """
-    plan, clean = sizer.clean_recording.plan, sizer.clean_recording.readings
-    match effect:
-        case ScanMisplacement():
-            return CovariateRegion("scan", scans=(effect.scan,))
-        case ScanAngleError() | HeightOffset():
-            return CovariateRegion("scan", scans=effect.scans)
-        case AmbientStep():
-            return CovariateRegion("time", effect.at_s, float(plan.time_s[-1]))
-        case Saturation():
-            return CovariateRegion("level", effect.level, float(clean.max()))
-        case EdgeShadow():
-            return CovariateRegion("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
-        case AlbedoPatch() | Glint() | PlaceStep():
+    plan, clean, known = sizer.clean_recording.plan, sizer.clean_recording.readings, effect.parameters
+    match effect.name:
+        case "scan_misplacement":
+            return CovariateRegion("scan", scans=(known["scan"],))
+        case "scan_angle_error" | "height_offset":
+            return CovariateRegion("scan", scans=known["scans"])
+        case "ambient_step":
+            return CovariateRegion("time", known["at_s"], float(plan.time_s[-1]))
+        case "saturation":
+            return CovariateRegion("level", known["level"], float(clean.max()))
+        case "edge_shadow":
+            return CovariateRegion("edge_distance", 0.0, known["w"] * math.sqrt(2 * math.log(2)))
+        case "albedo_patch" | "glint" | "place_step":
             along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
             strength = np.where(along_x, np.abs(sizer.recording_with_effects(effect).readings - clean), 0.0)
             there = plan.x_mm[strength >= strength.max() / 2]

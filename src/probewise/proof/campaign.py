@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeAlias, TypeVar
 
 from probewise._tasks import results_as_tasks_end
 from probewise._writing import write_and_sync
@@ -21,12 +21,44 @@ from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
 
-__all__ = ["FORMAT", "CampaignContents", "read_campaign", "run_campaign"]
+__all__ = ["FORMAT", "Campaign", "CampaignContents", "read_campaign", "run_campaign"]
 
 FORMAT = "campaign/1"
-T = TypeVar("T")
 Result = Mapping[str, Any]
 Misfit: TypeAlias = Callable[[Result], tuple[str, str] | None]
+T = TypeVar("T")
+
+
+class Keyed(Protocol):
+    """A task: everything that determines its result, a value to be hashed and pickled."""
+
+    @property
+    def key(self) -> str:
+        """The task's key in the campaign's file."""
+        ...
+
+
+K = TypeVar("K", bound=Keyed)
+
+
+@dataclass(frozen=True)
+class Campaign(Generic[K]):
+    """What a campaign runs: its work, its tasks, and the rest as `run_campaign` takes it."""
+
+    work: Callable[[K], Result]
+    tasks: Sequence[K]
+    settings: Mapping[str, Any]
+    misfit: Misfit
+    noun: str = "runs"
+
+    def run(
+        self, *, path: str | os.PathLike[str], executor: Executor | None = None, progress: Progress = silent
+    ) -> dict[K, Result]:
+        """Run it, or resume it, as `run_campaign` does; return the results by task."""
+        tasks = {task.key: task for task in self.tasks}
+        more = {"executor": executor, "progress": progress, "noun": self.noun, "misfit": self.misfit}
+        results = run_campaign(self.work, tasks, path=path, settings=self.settings, **more)  # type: ignore[arg-type]
+        return {tasks[key]: result for key, result in results.items()}
 
 
 @dataclass(frozen=True)

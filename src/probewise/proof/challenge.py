@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -23,8 +21,7 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import DoubtfulResultWarning, ParameterError, ProbewiseError
 from probewise.investigation import investigate
-from probewise.progress import Progress, silent
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import Campaign, Result
 from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
 from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
@@ -34,7 +31,7 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
 from probewise.world.world import World
 
-__all__ = ["run_case", "run_challenge"]
+__all__ = ["challenge", "run_case"]
 
 _RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
@@ -312,31 +309,14 @@ def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Genera
     return {"readings": len(more), **statements_to_score(diagnose([case.recording, more], rng=rng))}
 
 
-def run_challenge(
-    numbers: Iterable[int],
-    *,
-    seed: int,
-    work: Callable[[Task], Mapping[str, Any]] = run_case,
-    of: str = "",
-    path: str | os.PathLike[str],
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> tuple[Mapping[str, Any], ...]:
-    """Run the cases of these numbers, or resume an interrupted challenge; return their results, in this order.
+def challenge(
+    numbers: Iterable[int], *, seed: int, work: Callable[[Task], Result] = run_case, of: str = ""
+) -> Campaign[Task]:
+    """Return the campaign of the cases of these numbers.
 
     `seed`: the secret seed, which with its number determines a case; `work`: function that runs a case; `of`: name of
-    what is diagnosed, if not the light sensor: a file of another name is refused; all else is as in `run_campaign`,
-    which tells the errors too. Cases in the file are not run again.
+    what is diagnosed, if not the light sensor: a file of another name is refused.
     """
-    tasks = [Task(seed, number) for number in numbers]
-    results = run_campaign(
-        work,
-        {task.key: task for task in tasks},
-        path=path,
-        settings={"challenge": __version__, "seed": seed} | ({"of": of} if of else {}),
-        executor=executor,
-        progress=progress,
-        noun="cases",
-        misfit=partial(misfit_of_case, schema=_RESULTS.get(of, ROUNDS_CASE)),
-    )
-    return tuple(results[task.key] for task in tasks)
+    settings = {"challenge": __version__, "seed": seed} | ({"of": of} if of else {})
+    schema = _RESULTS.get(of, ROUNDS_CASE)
+    return Campaign(work, [Task(seed, n) for n in numbers], settings, partial(misfit_of_case, schema=schema), "cases")

@@ -9,9 +9,7 @@ sensor model is complete (`trust`): `TRUST` and 1.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Self, TypeAlias, cast
@@ -24,8 +22,7 @@ from probewise._version import __version__
 from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
 from probewise.inference import Rounded
-from probewise.progress import Progress, silent
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import Campaign, Result
 from probewise.proof.configurations import FIELD, MOST_CIRCLES, POPULATIONS, REFERENCE
 from probewise.proof.estimates import Estimate, estimated_share
 from probewise.proof.results import CONCEALED_TRIAL, misfit
@@ -43,6 +40,7 @@ from probewise.proof.trial import (
     timed_steps,
 )
 from probewise.recordings import Disc
+from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
 from probewise.world import Blob, Concealed, World
 from probewise.world import concealed as known
@@ -297,25 +295,22 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     return SimulatedArm(light_reading, reach=everywhere, speed=Speed(500.0, now.each_s - _MOVE_S), scale=None)
 
 
-def run_concealed(
+def concealed_study(
     n_circles: int,
     *,
-    path: str | os.PathLike[str],
     max_readings: int = 100,
     effects: Sequence[str] = tuple(CONCEALED),
     sizes: Sequence[int] = (0, 1, 2),
     n_clean: int | None = None,
     seed: int = SEED,
     varied: bool = False,
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> dict[ConcealedTrial, dict[str, Any]]:
-    """Run every row over the first circles, with trust `TRUST` and 1, or resume an interrupted study.
+) -> Campaign[ConcealedTrial]:
+    """Return the campaign of every row over the first circles, with trust `TRUST` and 1.
 
-    `n_circles`: circles per row; `path`: the campaign's file, whose runs are not repeated; `max_readings`: a run that
-    has not reached the target precision after so many is a miss; `effects`, `sizes`: names in CONCEALED and indices of
-    sizes to run besides the clean row, which has `n_clean` circles, by default as many as the others; `seed`: of
-    circles, noise and robot; `varied`: whether each circle has conditions of its own; others as for `run_study`.
+    `n_circles`: circles per row; `max_readings`: a run that has not reached the target precision after so many is a
+    miss; `effects`, `sizes`: names in CONCEALED and indices of sizes to run besides the clean row, which has `n_clean`
+    circles, by default as many as the others; `seed`: of circles, noise and robot; `varied`: whether each circle has
+    conditions of its own.
     """
     for n in (n_circles, n_clean or n_circles):
         checked_whole("n_circles", n, most=MOST_CIRCLES)
@@ -327,18 +322,9 @@ def run_concealed(
         if circle < n
         for trust in (TRUST, 1.0)
     ]
-    results = run_campaign(
-        run_concealed_trial,
-        {trial.key: trial for trial in trials},
-        path=path,
-        settings={"concealed": __version__, "max_readings": max_readings, "seed": seed}
-        | ({"varied": True} if varied else {}),
-        executor=executor,
-        progress=progress,
-        noun="runs",
-        misfit=partial(misfit, schema=CONCEALED_TRIAL),
-    )
-    return {trial: dict(results[trial.key]) for trial in trials}
+    settings = {"concealed": __version__, "max_readings": max_readings, "seed": seed}
+    settings |= {"varied": True} if varied else {}
+    return Campaign(run_concealed_trial, trials, settings, partial(misfit, schema=CONCEALED_TRIAL))
 
 
 @dataclass(frozen=True)
@@ -368,61 +354,59 @@ class ConcealedRow:
     cpu_s_95: float
 
 
-_COLUMNS = tuple(column.name for column in fields(ConcealedRow))
-
-
-def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
+def concealed_rows(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedRow]:
     """Summarise the runs of each row (effect, size and trust), in the order of `results`."""
     return _summaries(
         results, lambda t: (t.effect or "nothing", CONCEALED[t.effect][1][t.size] if t.effect else None, t.trust)
     )
 
 
-def concealed_forms(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
+def concealed_forms(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedRow]:
     """Summarise the runs with effects of each form, at each trust, in the order of `results`."""
     form = {name: form for form, rows in CONCEALED_BY_FORM.items() for name in rows}
     hidden = {trial: result for trial, result in results.items() if trial.effect}
     return _summaries(hidden, lambda t: (form[t.effect], None, t.trust))
 
 
-def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise each row as a dict for a CSV file: shares with their intervals as text."""
-    return [{name: _csv_value(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
-
-
 def _summaries(
-    results: Mapping[ConcealedTrial, Mapping[str, Any]],
-    row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]],
+    results: Mapping[ConcealedTrial, Result], row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]]
 ) -> list[ConcealedRow]:
-    rows: dict[tuple[str, float | None, float], list[tuple[tuple[str, ...], Mapping[str, Any]]]] = {}
+    rows: dict[tuple[str, float | None, float], list[tuple[tuple[str, ...], Result]]] = {}
     for trial, result in results.items():
         rows.setdefault(row_of(trial), []).append((trial.right_answers, result))
-    return [_summary_row(key, runs) for key, runs in rows.items()]
+    return [_summary_row(*key, runs) for key, runs in rows.items()]
 
 
 def _summary_row(
-    key: tuple[str, float | None, float], runs: list[tuple[tuple[str, ...], Mapping[str, Any]]]
+    concealed: str, size: float | None, trust: float, runs: list[tuple[tuple[str, ...], Result]]
 ) -> ConcealedRow:
     found = [run for _, run in runs]
+    readings, cpu_s = [run["readings"] for run in found], np.array([run["cpu_s"] for run in found])
     return ConcealedRow(
-        *key,
+        concealed,
+        size,
+        trust,
         runs=len(found),
-        readings=float(np.median([run["readings"] for run in found])),
-        mean_readings=round(float(np.mean([run["readings"] for run in found])), 1),
+        readings=float(np.median(readings)),
+        mean_readings=round(float(np.mean(readings)), 1),
         reached=estimated_share([run["known"] for run in found]),
         intervals_hold=estimated_share([hit for run in found for hit in run["held"]]),
         sure_and_wrong=estimated_share([run["known"] and run["error_mm"] > WRONG_MM for run in found]),
         noticed=estimated_share([run["noticed"] for run in found]),
         in_credible_set=estimated_share([not {*names}.isdisjoint(run["credible"]) for names, run in runs if names]),
         names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
-        cpu_s_median=round(float(np.median([run["cpu_s"][0] for run in found])), 2),
-        cpu_s_95=round(float(np.median([run["cpu_s"][1] for run in found])), 2),
+        cpu_s_median=round(float(np.median(cpu_s[:, 0])), 2),
+        cpu_s_95=round(float(np.median(cpu_s[:, 1])), 2),
     )
 
 
-def _csv_value(value: object) -> object:
+def concealed_csv(rows: Sequence[ConcealedRow]) -> str:
+    """Return rows as CSV text: shares with their intervals as text."""
+    names = [column.name for column in fields(ConcealedRow)]
+    return csv_text_of_rows(names, ([_csv_cell(getattr(row, name)) for name in names] for row in rows))
+
+
+def _csv_cell(value: object) -> object:
     if isinstance(value, Estimate):
-        if not value.n:
-            return ""
-        return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})"
+        return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})" if value.n else ""
     return "" if value is None else value

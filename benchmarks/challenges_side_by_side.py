@@ -19,15 +19,15 @@ from typing import Any
 from scipy.stats import binomtest
 
 from probewise.proof.campaign import Result, read_campaign
-from probewise.proof.scoring import (
+from probewise.proof.tables import (
     credible_set_holds_truth,
     is_confidently_wrong,
     is_leading_name_right,
     is_out_of_vocabulary,
     is_recognised_as_out_of_vocabulary,
     names_effect_on_mean,
+    score,
 )
-from probewise.proof.tables import score
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text_of_rows
 

@@ -28,7 +28,7 @@ from probewise.proof.challenge import Task
 from probewise.proof.estimates import estimated_share
 from probewise.proof.refits import NullRefit
 from probewise.proof.sensors.cases import draw_case
-from probewise.proof.sensors.plans import PLANS
+from probewise.proof.sensors.sensors import PLANS
 
 Result = Mapping[str, Any]
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")

@@ -10,10 +10,26 @@ from scipy.stats import kstest
 
 from probewise.errors import NotConvergedError
 from probewise.proof.sensors.cases import WHEEL, Stratum, draw_case, held_out_recordings, stratum_of
-from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, OUTSIDE, SAMPLERS, SINGLES, CleanSetup
-from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
-from probewise.proof.sensors.sensors import NOISE_LEVELS, NOISE_NAMES, SSFS, draw_sensor
-from probewise.proof.sensors.sizing import CovariateRegion, EffectSizer, region_of_effect
+from probewise.proof.sensors.effects import (
+    INSIDE,
+    NEEDS_SENSOR,
+    OUTSIDE,
+    SAMPLERS,
+    SINGLES,
+    CleanSetup,
+    CovariateRegion,
+    EffectSizer,
+    region_of_effect,
+)
+from probewise.proof.sensors.sensors import (
+    NOISE_LEVELS,
+    NOISE_NAMES,
+    PLANS,
+    SSFS,
+    draw_plan_with_displaced_patterns,
+    draw_sensor,
+    held_out_plans,
+)
 from probewise.recordings import fingerprint, read_recording, write_recording
 
 

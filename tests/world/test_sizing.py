@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.proof.sensors.effects import CleanSetup
-from probewise.proof.sensors.sizing import EffectSizer, amplitude_of_size, noise_effect_size
+from probewise.proof.sensors.effects import CleanSetup, EffectSizer, amplitude_of_size, noise_effect_size
 from probewise.world import World, gaussian_spot
 from probewise.world.concealed import (
     ambient_gradient,

@@ -32,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge; write its table and report; return the exit status."""
     from probewise.proof import pages, tables
-    from probewise.proof.challenge import RunCaseInRounds, challenge, run_case
-    from probewise.proof.system_challenge import run_system_case
+    from probewise.proof.challenge import RunCaseInRounds, challenge, run_case, run_system_case
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")

@@ -30,9 +30,18 @@ from probewise.proof.plots import (
     readings_needed,
     reliability_diagram,
 )
-from probewise.proof.scoring import NOISE, are_names_right, confusion_counts, leading_hypothesis, reliability_bins
 from probewise.proof.study import Summary, summaries, trials_by_row
-from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, gains_on_held_out_runs, name_without_target
+from probewise.proof.tables import (
+    NOISE,
+    ScoreRow,
+    are_names_right,
+    confusion_counts,
+    detected_and_named_by_effect,
+    gains_on_held_out_runs,
+    leading_hypothesis,
+    name_without_target,
+    reliability_bins,
+)
 from probewise.proof.trial import Trial, experiment_of
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import (

@@ -10,8 +10,7 @@ from probewise.cli import main
 from probewise.proof import pages as report
 from probewise.proof import plots
 from probewise.proof.challenge import Task
-from probewise.proof.scoring import confusion_counts, reliability_bins
-from probewise.proof.tables import score
+from probewise.proof.tables import confusion_counts, reliability_bins, score
 
 
 @pytest.fixture

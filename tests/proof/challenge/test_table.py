@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic
-from probewise.proof.scoring import calibration_error, confusion_counts, is_confidently_wrong, reliability_bins
-from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, score
+from probewise.proof.tables import (
+    ScoreRow,
+    calibration_error,
+    confusion_counts,
+    detected_and_named_by_effect,
+    is_confidently_wrong,
+    reliability_bins,
+    score,
+)
 
 
 def row(results, name):

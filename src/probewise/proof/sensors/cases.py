@@ -9,15 +9,30 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.effects import INSIDE, NO_PHYSICS, OUTSIDE, PAIRABLE, SAMPLERS, SINGLES, CleanSetup
-from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
-from probewise.proof.sensors.sensors import NOISE_LEVELS, NOISE_NAMES, OTHER_NOISE, SSFS, draw_sensor, with_noise_model
-from probewise.proof.sensors.sizing import (
+from probewise.proof.sensors.effects import (
+    INSIDE,
+    NO_PHYSICS,
+    OUTSIDE,
+    PAIRABLE,
+    SAMPLERS,
+    SINGLES,
+    CleanSetup,
     CovariateRegion,
     EffectSizer,
     NormAfterRefit,
     amplitude_of_size,
     region_of_effect,
+)
+from probewise.proof.sensors.sensors import (
+    NOISE_LEVELS,
+    NOISE_NAMES,
+    OTHER_NOISE,
+    PLANS,
+    SSFS,
+    draw_plan_with_displaced_patterns,
+    draw_sensor,
+    held_out_plans,
+    with_noise_model,
 )
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.stages import Concealed

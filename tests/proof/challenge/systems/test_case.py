@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from probewise.proof.challenge import Task, run_challenge
-from probewise.proof.system_challenge import run_system_case
+from probewise.proof.challenge import Task, run_challenge, run_system_case
 from probewise.proof.tables import score_systems
 
 

@@ -10,7 +10,6 @@ from probewise.world import (
     World,
     ambient_gradient,
     backlash,
-    correlated_noise,
     gain_drift,
     gaussian_spot,
     nonlinearity,
@@ -81,72 +80,9 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
         assert alone == pytest.approx(together[k], abs=1e-9)
 
 
-def test_noise_is_white_with_the_sd_asked_for(clean):
-    noise = simulate(PLAN, world(noise_sd=0.6), rng=np.random.default_rng(2)).readings - clean
-    z = noise / 0.6
-    n = len(z)
-    # 4 sigma: a right program fails less than once in 10 000.
-    assert abs(z.mean()) < 4 / np.sqrt(n)
-    assert abs(z.var() - 1) < 4 * np.sqrt(2 / n)
-    assert abs(np.mean(z[1:] * z[:-1])) < 4 / np.sqrt(n)
-
-
-def test_a_seed_gives_the_same_recording_again():
-    one, two = (simulate(paper_plan(), world(), rng=np.random.default_rng(7)).readings for _ in range(2))
-    np.testing.assert_array_equal(one, two)
-
-
 def test_readings_are_rounded_to_the_step():
     readings = simulate(paper_plan(), world(step=0.5), rng=np.random.default_rng(7)).readings
     np.testing.assert_array_equal(readings * 2, np.round(readings * 2))
-
-
-def test_backlash_shifts_the_ways_out_and_back_apart():
-    """Vocabulary: position - (width/2) direction, so the two ways differ by the width."""
-    expected = world(backlash(2.0)).expected_readings(PLAN)
-    at = {}
-    for way in ("out", "back"):
-        rows = PLAN.rows_by_scan()[PLAN.scan_names.index(f"edge_0_{way}")]
-        order = np.argsort(expected[rows])
-        at[way] = np.interp(35, expected[rows][order], PLAN.x_mm[rows][order])
-    assert at["out"] - at["back"] == pytest.approx(2.0, abs=0.02)
-
-
-def test_gain_drift_scales_the_signal_and_never_the_dark(clean):
-    got = world(gain_drift(0.1, 300.0)).expected_readings(PLAN)
-    np.testing.assert_allclose(got - 10, (clean - 10) * (1 + 0.1 * np.exp(-PLAN.time_s / 300)), atol=1e-12)
-
-
-def test_an_ambient_gradient_is_a_plane_on_top(clean):
-    got = world(ambient_gradient(0.01, -0.02)).expected_readings(PLAN)
-    np.testing.assert_allclose(got - clean, 0.01 * PLAN.x_mm - 0.02 * PLAN.y_mm, atol=1e-12)
-
-
-def test_saturation_cuts_and_soft_saturation_bends(clean):
-    np.testing.assert_array_equal(world(saturation(50.0)).expected_readings(PLAN), np.minimum(clean, 50))
-    soft = world(saturation(50.0, softness=1.0)).expected_readings(PLAN)
-    assert soft.max() < 50
-    np.testing.assert_allclose(soft[clean < 20], clean[clean < 20], atol=1e-6)
-    np.testing.assert_allclose(
-        world(saturation(50.0, softness=1e-3)).expected_readings(PLAN), np.minimum(clean, 50), atol=1e-3
-    )
-
-
-def test_nonlinearity_is_a_power_of_the_seen_fraction(clean):
-    got = world(nonlinearity(1.2)).expected_readings(PLAN)
-    np.testing.assert_allclose((got - 10) / 50, ((clean - 10) / 50) ** 1.2, rtol=1e-9, atol=1e-12)
-
-
-def test_correlated_noise_is_ar1_within_a_scan_and_keeps_its_sd(clean):
-    rho, n_runs = 0.5, 2
-    effect = world(correlated_noise(rho), noise_sd=1.0)
-    z = np.stack([effect.simulate(PLAN, rng=np.random.default_rng(s)).readings - clean for s in range(n_runs)])
-    within = PLAN.scan[1:] == PLAN.scan[:-1]
-    products = z[:, 1:] * z[:, :-1]
-    n = n_runs * len(PLAN)
-    assert abs(z.var() - 1) < 4 * np.sqrt(2 / n * (1 + rho**2) / (1 - rho**2))
-    assert abs(products[:, within].mean() - rho) < 4 * np.sqrt(1.5 / n * 3)
-    assert abs(products[:, ~within].mean()) < 4 / np.sqrt(products[:, ~within].size)
 
 
 def test_effects_stack_in_the_order_of_the_chain_whatever_their_order_in_the_list():

@@ -11,6 +11,7 @@ from probewise.proof import pages as report
 from probewise.proof import plots
 from probewise.proof.challenge import Task
 from probewise.proof.tables import confusion_counts, reliability_bins, score
+from probewise.report.html import draw_or_raise
 
 
 @pytest.fixture
@@ -37,16 +38,15 @@ def test_the_csv_leaves_out_what_is_not_there(results):
 
 
 def test_the_page_stands_alone_and_tells_of_failures(results):
-    page = report.challenge_html(results, score(results), command="probewise challenge")
+    page = report.challenge_page(results, score, command="probewise challenge", systems=False).html(draw_or_raise)
     assert "no &lt;plan&gt;" in page
     assert page.count("data:image/png;base64,") == 2
     assert "http://" not in page
 
 
 def test_nothing_but_failures_still_makes_a_page(results):
-    assert "Cases that failed" in report.challenge_html(
-        results[-1:], score(results[-1:]), command="probewise challenge"
-    )
+    page = report.challenge_page(results[-1:], score, command="probewise challenge", systems=False)
+    assert "Cases that failed" in page.html(draw_or_raise)
 
 
 def test_the_matrix_writes_every_count(results):

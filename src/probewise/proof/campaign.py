@@ -8,6 +8,7 @@ of the tasks, so that nothing depends on the executor.
 from __future__ import annotations
 
 import json
+import lzma
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -124,7 +125,7 @@ def run_campaign(
 
 
 def read_campaign(path: str | os.PathLike[str], *, misfit: Misfit = lambda result: None) -> CampaignContents:
-    """Read a campaign's file; an incomplete last line is ignored.
+    """Read a campaign's file, packed if its name ends in .xz; an incomplete last line is ignored.
 
     Raises
     ------
@@ -132,8 +133,9 @@ def read_campaign(path: str | os.PathLike[str], *, misfit: Misfit = lambda resul
         If it is missing, not a campaign's, or damaged before its last line, or if `misfit` (see `run_campaign`) finds
         a result that cannot be.
     """
+    content = read_bytes(Path(path), "a campaign's file")
     # After the last line end there is nothing, or an incomplete line.
-    *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
+    *lines, _ = (lzma.decompress(content) if Path(path).suffix == ".xz" else content).split(b"\n")
     rows = [_parsed_line(path, number, line) for number, line in enumerate(lines, start=1)]
     if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
         raise FileError(path, "this is not a campaign file", f'a first line with "format": "{FORMAT}" and its settings')

@@ -23,7 +23,6 @@ from probewise.proof.sensors.effects import (
 )
 from probewise.proof.sensors.sensors import (
     NOISE_LEVELS,
-    NOISE_NAMES,
     PLANS,
     SSFS,
     draw_plan_with_displaced_patterns,
@@ -117,16 +116,6 @@ def test_a_single_case_conceals_its_effect_at_its_size():
     assert abs(noise.std() - 1) < 4 / np.sqrt(2 * len(noise))
 
 
-@pytest.mark.slow
-def test_the_name_of_the_noise_is_part_of_the_truth():
-    clean = number_of("clean", other_noise=True)
-    named = [k for k in range(clean, clean + 120) if stratum_of(k)[0] == stratum_of(clean)[0]]
-    truths = [case(k) for k in named]
-    assert len({truth.noise_model for truth in truths}) > 3
-    for truth in truths:
-        assert truth.combination == ((NOISE_NAMES[truth.noise_model],) if truth.noise_model in NOISE_NAMES else ())
-
-
 def test_a_case_with_an_effect_on_the_noise_has_no_other_kind_of_noise():
     noise_only = SINGLES.index("correlated_noise")
     made = case(number_of("single", size=8.0, other_noise=True, skip=noise_only))
@@ -177,15 +166,6 @@ def test_the_recording_does_not_tell(tmp_path):
     assert fingerprint(read_recording(path)) == fingerprint(made.recording)
     text = path.with_suffix(".json").read_text()
     assert not any(name in text for name in (*INSIDE, *OUTSIDE, *SSFS))
-
-
-@pytest.mark.slow
-def test_what_belongs_to_a_scan_is_not_in_the_readings_kept_back():
-    made = case(number_of("single", size=8.0, skip=SINGLES.index("scan_misplacement")))
-    assert made.combination == ("scan_misplacement",)
-    for plan in made.test_plans.values():
-        clean = replace(made.world, concealed=()).expected_readings(plan)
-        np.testing.assert_array_equal(made.world.expected_readings(plan), clean)
 
 
 @pytest.mark.parametrize("name", PLANS)

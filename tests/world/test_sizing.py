@@ -8,16 +8,7 @@ import pytest
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.proof.sensors.effects import CleanSetup, EffectSizer, amplitude_of_size, noise_effect_size
 from probewise.world import World, gaussian_spot
-from probewise.world.concealed import (
-    ambient_gradient,
-    correlated_noise,
-    dropouts,
-    gain_drift,
-    heavy_tails,
-    outliers,
-    saturation,
-    signal_dependent_noise,
-)
+from probewise.world import concealed as known
 from probewise.world.spots import Blob
 
 SPOT = gaussian_spot([Blob(1.0, (0.4, 1.5), (3.0, 2.0), 0.2)], pixel_mm=0.5)
@@ -74,7 +65,11 @@ def test_an_effect_that_is_too_small_at_its_limit_is_refused():
 
 @pytest.mark.parametrize(
     "of",
-    [lambda a: ambient_gradient(a, 0.3 * a), lambda a: saturation(60 - 50 * a), lambda a: gain_drift(a, 60.0)],
+    [
+        lambda a: known.ambient_gradient(a, 0.3 * a),
+        lambda a: known.saturation(60 - 50 * a),
+        lambda a: known.gain_drift(a, 60.0),
+    ],
     ids=["ambient_gradient", "saturation", "gain_drift"],
 )
 def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
@@ -86,7 +81,7 @@ def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
 
 
 def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
-    one, other = ambient_gradient(0.1, 0.0), gain_drift(0.1, 60.0)
+    one, other = known.ambient_gradient(0.1, 0.0), known.gain_drift(0.1, 60.0)
     clean = sizer.clean_recording.readings
     design = np.stack([np.ones(len(plan)), clean], axis=-1)
     rests = [
@@ -99,7 +94,9 @@ def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
 
 
 @pytest.mark.parametrize(
-    "effect", [correlated_noise(0.5), signal_dependent_noise(3.0), outliers(0.04, 8.0)], ids=lambda e: e.name
+    "effect",
+    [known.correlated_noise(0.5), known.signal_dependent_noise(3.0), known.outliers(0.04, 8.0)],
+    ids=lambda e: e.name,
 )
 def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, plan, sizer):
     """Second route: simulate, and take the mean of the log ratio of the two densities."""
@@ -126,9 +123,9 @@ def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, pl
 
 def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
     clean = sizer.clean_recording.readings
-    assert sizer.size(dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
+    assert sizer.size(known.dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
 
 
 def test_noise_without_a_name_has_no_size(plan):
     with pytest.raises(ParameterError, match="vocabulary"):
-        noise_effect_size(heavy_tails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)
+        noise_effect_size(known.heavy_tails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)

@@ -8,15 +8,10 @@ from probewise.recordings import Disc, HalfPlane, Uniform, paper_plan, two_way_p
 from probewise.world import (
     Blob,
     World,
-    ambient_gradient,
-    backlash,
-    gain_drift,
     gaussian_spot,
-    nonlinearity,
-    saturation,
     simulate,
 )
-from probewise.world.concealed import albedo_patch, edge_shadow, halo, height_gradient, sensor_tilt
+from probewise.world import concealed as known
 from probewise.world.stages import acts_at
 
 SPOT = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)], pixel_mm=0.5)
@@ -56,15 +51,15 @@ def test_the_shift_of_the_spot_parts_90_from_270_degrees(clean):
 
 def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
     effects = world(
-        backlash(1.0),
-        albedo_patch(-0.2, 3.0, 1.0, 6.0),
-        height_gradient(0.01),
-        sensor_tilt(0.5, 0.2),
-        halo(0.1, 15.0),
-        edge_shadow(0.05, 4.0),
-        gain_drift(0.1, 300.0),
-        ambient_gradient(0.01, 0.02),
-        saturation(50.0),
+        known.backlash(1.0),
+        known.albedo_patch(-0.2, 3.0, 1.0, 6.0),
+        known.height_gradient(0.01),
+        known.sensor_tilt(0.5, 0.2),
+        known.halo(0.1, 15.0),
+        known.edge_shadow(0.05, 4.0),
+        known.gain_drift(0.1, 300.0),
+        known.ambient_gradient(0.01, 0.02),
+        known.saturation(50.0),
     )
     together = effects.expected_readings(PLAN)
     for k in range(0, len(PLAN), 53):
@@ -86,7 +81,13 @@ def test_readings_are_rounded_to_the_step():
 
 
 def test_effects_stack_in_the_order_of_the_chain_whatever_their_order_in_the_list():
-    effects = (saturation(45.0), ambient_gradient(0.02, 0.0), gain_drift(0.1, 300.0), nonlinearity(1.1), backlash(1.0))
+    effects = (
+        known.saturation(45.0),
+        known.ambient_gradient(0.02, 0.0),
+        known.gain_drift(0.1, 300.0),
+        known.nonlinearity(1.1),
+        known.backlash(1.0),
+    )
     np.testing.assert_array_equal(
         world(*effects).expected_readings(PLAN), world(*effects[::-1]).expected_readings(PLAN)
     )

@@ -47,11 +47,6 @@ def test_a_sensor_of_one_gaussian_is_taken_for_one(refit, clean):
     assert np.abs(null.residuals).max() < 0.05
 
 
-def test_levels_take_up_an_offset_and_a_gain(refit, clean):
-    assert refit(clean, changed(clean, 0.0)) < 0.05
-    assert refit(clean, changed(clean, 1.0 + 0.1 * clean.readings)) < 0.05
-
-
 def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
     """Two routes: the refit, and least squares on slopes by differences."""
     null = refit.null_fit(clean)
@@ -59,10 +54,6 @@ def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
     _, slopes = null.model.predict_and_differentiate(null.z)
     left = wave - slopes @ np.linalg.lstsq(slopes, wave)[0]
     assert refit(clean, changed(clean, wave)) == pytest.approx(np.linalg.norm(left), rel=0.01)
-
-
-def test_the_null_is_fitted_once_for_each_clean_recording(refit, clean):
-    assert refit.null_fit(clean) is refit.null_fit(clean)
 
 
 def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):

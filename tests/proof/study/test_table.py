@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.proof.configurations import POPULATIONS, SearchConfiguration, noise_of_run_in_sds, standard_rows
+from probewise.proof.configurations import POPULATIONS, SearchConfiguration, noise_of_run_in_sds
 from probewise.proof.estimates import estimated_share
 from probewise.proof.study import summarise
 
@@ -90,11 +90,6 @@ def test_circles_and_noise_are_always_the_same():
     np.testing.assert_array_equal(POPULATIONS["inside"].circles(7), inside[:7])
     np.testing.assert_array_equal(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(5, 100)[:10])
     assert not np.allclose(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(6, 10))
-
-
-def test_every_standard_row_has_a_name_of_its_own():
-    names = [row.name for row in standard_rows()]
-    assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize(

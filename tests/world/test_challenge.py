@@ -23,6 +23,7 @@ from probewise.proof.sensors.effects import (
 )
 from probewise.proof.sensors.sensors import (
     NOISE_LEVELS,
+    NOISE_NAMES,
     PLANS,
     SSFS,
     draw_plan_with_displaced_patterns,
@@ -256,3 +257,13 @@ def test_every_single_and_outsider_can_be_drawn_at_its_size():
             if SAMPLERS[name].scalable:
                 assert truth.hidden[0].size_lambda == pytest.approx(size, rel=0.1)
     assert not NEEDS_SENSOR & set(SINGLES)
+
+
+@pytest.mark.slow
+def test_the_name_of_the_noise_is_part_of_the_truth():
+    clean = number_of("clean", other_noise=True)
+    named = [k for k in range(clean, clean + 120) if stratum_of(k)[0] == stratum_of(clean)[0]]
+    truths = [case(k) for k in named]
+    assert len({truth.noise_model for truth in truths}) > 3
+    for truth in truths:
+        assert truth.combination == ((NOISE_NAMES[truth.noise_model],) if truth.noise_model in NOISE_NAMES else ())

@@ -10,7 +10,7 @@ from probewise.cli import main
 from probewise.proof import pages as report
 from probewise.proof import plots
 from probewise.proof.challenge import Task
-from probewise.proof.tables import reliability_bins, score
+from probewise.proof.tables import confusion_counts, reliability_bins, score
 from probewise.report.html import draw_or_raise
 
 
@@ -67,3 +67,10 @@ def test_the_verb_scores_what_its_file_holds(results, tmp_path, capsys):
     assert "6 cases" in capsys.readouterr().out
     assert (out / "table.csv").read_text().startswith("what,found")
     assert "probewise challenge --cases 6 --seed 5" in (out / "report.html").read_text()
+
+
+def test_the_matrix_writes_every_count(results):
+    truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
+    ax = plots.confusion_matrix(truths, said, counts)
+    assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
+    assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)

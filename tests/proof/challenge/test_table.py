@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.proof.estimates import Estimate, estimated_mean, estimated_statistic
+from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic
 from probewise.proof.tables import (
     ScoreRow,
     calibration_error,
@@ -232,3 +232,8 @@ def test_an_alias_is_no_confusion(make):
     assert truths == ("clean", "lag", "outside")
     assert said == ("clean", "lag", "halo", "several")
     assert counts.tolist() == [[1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 1, 0]]
+
+
+def test_no_case_decides_nothing():
+    assert ScoreRow("x", estimated_share([]), least=0.9).decision == "open"
+    assert ScoreRow("x", estimated_share([])).decision is None

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.proof.configurations import POPULATIONS, SearchConfiguration, noise_of_run_in_sds
+from probewise.proof.configurations import POPULATIONS, SearchConfiguration, noise_of_run_in_sds, standard_rows
 from probewise.proof.estimates import estimated_share
 from probewise.proof.study import summarise
 
@@ -98,3 +98,8 @@ def test_circles_and_noise_are_always_the_same():
 def test_rows_that_mean_nothing_are_refused(wrong):
     with pytest.raises(ParameterError, match=next(iter(wrong))):
         SearchConfiguration(**wrong)
+
+
+def test_every_standard_row_has_a_name_of_its_own():
+    names = [row.name for row in standard_rows()]
+    assert len(set(names)) == len(names)

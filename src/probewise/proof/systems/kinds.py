@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -100,8 +100,10 @@ def draw_values(ranges: Mapping[str, Range], rng: np.random.Generator) -> dict[s
 class SystemKind:
     """A kind of system.
 
-    What the simulator file states (parameters, reading, time, runs, and its formula or law) is taken from its `text`,
-    which is as a user would provide it; `{noise}` stands for its line on noise. True parameters are drawn from the
+    What the simulator file states is taken from its `text`, which is as a user would provide it; `{noise}` stands for
+    its line on noise: names of the predicted column (`reading`), of those of `time` and runs, if any, of parameters,
+    and which have a value in each run; its `law`, whose states and rates the file defines unless it integrates by
+    itself, or its `formula`. True parameters are drawn from the
     ranges `shared` and, in each run, `of_run`. `design` draws the times of a run, from 0, and its columns, from (rng,
     n_rows, regime): the regime is 1, or larger for a run with inputs beyond the others' range. `decimals` are those of
     designed columns and time, `drives` the columns that the law uses, `sd` that of a reading's white noise. Irrelevant
@@ -124,62 +126,34 @@ class SystemKind:
     n_runs: int = 5
     reading_decimals: int = 4
 
-    @cached_property
-    def _file(self) -> dict[str, Any]:
-        names: dict[str, Any] = {}
-        exec(self.text.replace("{noise}\n", ""), names)
-        return names
+    reading: str = field(init=False)
+    time: str | None = field(init=False)
+    run: str | None = field(init=False)
+    per_run: tuple[str, ...] = field(init=False)
+    parameters: tuple[str, ...] = field(init=False)
+    defines_states: bool = field(init=False)
+    law: Law | None = field(init=False)
+    formula: Formula = field(init=False)  # None beside states
 
-    @property
-    def reading(self) -> str:
-        """Name of the predicted column."""
-        return str(self._file["reading"])
-
-    @property
-    def time(self) -> str | None:
-        """Name of the time column, if any."""
-        return self._file.get("time")
-
-    @property
-    def run(self) -> str | None:
-        """Name of the column of runs, if any."""
-        return self._file.get("run")
-
-    @property
-    def per_run(self) -> tuple[str, ...]:
-        """Names of the parameters with a value in each run."""
-        return tuple(self._file.get("per_run", ()))
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(self._file["parameters"])
+    def __post_init__(self) -> None:
+        file: dict[str, Any] = {}
+        exec(self.text.replace("{noise}\n", ""), file)
+        law, start = self.stated_law, file.get("states", {})
+        if "rates" in file:
+            first = next(iter(start))
+            read = file.get("observe", lambda s, p, u: s[first])
+            law = Law(start, file["rates"], read, linear=file.get("hold") == "linear")
+        stated = {name: file.get(name) for name in ("reading", "time", "run")}
+        stated |= {name: tuple(file.get(name, ())) for name in ("per_run", "parameters")}
+        stated |= {"defines_states": "rates" in file, "law": law, "formula": file.get("simulate")}
+        for name, value in stated.items():
+            object.__setattr__(self, name, value)
 
     @property
     def column_decimals(self) -> dict[str, int]:
         """Decimals of each column of the table, and of the reading."""
         logged = {name: int(about[3]) for name, about in self.logged.items()}
         return {**self.decimals, **logged, self.reading: self.reading_decimals}
-
-    @property
-    def defines_states(self) -> bool:
-        """Whether the simulator file defines states and rates; False: a formula, or it integrates by itself."""
-        return "rates" in self._file
-
-    @cached_property
-    def law(self) -> Law | None:
-        """The law in continuous time, if the system has one."""
-        if not self.defines_states:
-            return self.stated_law
-        start = self._file["states"]
-        first = next(iter(start))
-        read = self._file.get("observe", lambda s, p, u: s[first])
-        return Law(start, self._file["rates"], read, linear=self._file.get("hold") == "linear")
-
-    @property
-    def formula(self) -> Formula:
-        """The formula of a system without a law."""
-        return cast(Formula, self._file["simulate"])
 
 
 _PAUSE = 0.15  # pause between runs, as a share of the first run's length

@@ -34,7 +34,7 @@ def _usually(rate: float) -> Any:
 
 @dataclass(frozen=True)
 class Faults:
-    """Rates of faults, 0 to 1; by default a link without faults; in brackets, what the name alone stands for."""
+    """Rates of faults, 0 to 1; by default a link without faults; beside each, what its name alone stands for."""
 
     fragment: float = _usually(1.0)  # a reply comes in pieces, up to 30 ms apart
     merge: float = _usually(0.05)  # a reply is delayed and delivered together with the next one
@@ -48,9 +48,7 @@ class Faults:
     silence: float = _usually(0.05)  # a request is executed but never answered
     deaf: float = _usually(0.05)  # a request is lost on the way to the brick
     unasked: float = _usually(0.05)  # the brick sends a message of its own before a reply
-    disconnect: float = _usually(
-        0.002
-    )  # the link ends when a request arrives; the request is executed and motors run on
+    disconnect: float = _usually(0.002)  # the link ends at a request, which is executed; motors run on
     sag: float = _usually(60.0)  # millivolts that the battery loses per minute
 
     def __post_init__(self) -> None:

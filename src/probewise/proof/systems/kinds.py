@@ -223,11 +223,6 @@ def _irrelevant_columns(kind: SystemKind, n: int, regime: float, rng: np.random.
 Rng = np.random.Generator
 
 
-def _bath_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    t = irregular_times(rng, n, 4.0)
-    return t, {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))}
-
-
 BATH = SystemKind(
     name="thermometer in a bath",
     text="""# A thermometer is dipped from room temperature into a warm bath.
@@ -245,7 +240,10 @@ def simulate(p, data):
 """,
     shared={"tau_s": (18, 45), "scale": ("normal", 1.0, 0.01)},
     of_run={"start_c": ("normal", 21, 2)},
-    design=_bath_design,
+    design=lambda rng, n, regime: (
+        t := irregular_times(rng, n, 4.0),
+        {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))},
+    ),
     decimals={"t_s": 2, "bath_c": 2},
     drives=("bath_c",),
     sd=0.05,
@@ -287,11 +285,6 @@ def simulate(p, data):
 )
 
 
-def _photodiode_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    far = 90.0 * (1.5 if regime > 1 else 1.0)
-    return irregular_times(rng, n, 1.0), {"dist_mm": sweep_there_and_back(rng, n, 20.0, far)}
-
-
 PHOTODIODE = SystemKind(
     name="photodiode against distance",
     text="""# A lamp on a rail is moved to and from a photodiode.
@@ -305,20 +298,16 @@ def simulate(p, data):
     return p["dark_mv"] + p["power"] / (data["dist_mm"] + p["behind_mm"]) ** 2
 """,
     shared={"dark_mv": ("normal", 0, 2), "power": (2e5, 5e5), "behind_mm": (8, 20)},
-    design=_photodiode_design,
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 1.0),
+        {"dist_mm": sweep_there_and_back(rng, n, 20.0, 90.0 * regime)},
+    ),
     decimals={"dist_mm": 2},
     drives=("dist_mm",),
     sd=0.4,
     logged={"board_c": (27, 1.5, 0.05, 2, 6.0), "rail_v": (5.0, 0.01, 0.002, 4), "rh_pct": (42, 3, 0.3, 1)},
     reading_decimals=3,
 )
-
-
-def _flow_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    most = 12.0 * regime
-    return irregular_times(rng, n, 6.0), {
-        "flow_lpm": random_steps(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
-    }
 
 
 FLOW = SystemKind(
@@ -334,18 +323,16 @@ def simulate(p, data):
     return p["zero_kpa"] + p["k"] * data["flow_lpm"] ** 2
 """,
     shared={"zero_kpa": ("normal", 0, 0.2), "k": (0.08, 0.2)},
-    design=_flow_design,
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 6.0),
+        {"flow_lpm": random_steps(rng, n, np.linspace(0.5, 12.0 * regime, 11), 4) * rng.uniform(0.97, 1.03, n)},
+    ),
     decimals={"t_s": 1, "flow_lpm": 3},
     drives=("flow_lpm",),
     sd=0.03,
     logged={"water_c": (18, 1.5, 0.05, 2, 8.0), "pump_v": (24, 0.1, 0.02, 3), "baro_hpa": (1009, 2, 0.1, 1)},
     n_runs=4,
 )
-
-
-def _lens_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    low, high = (440, 640) if regime == 1 else (400, 700)
-    return irregular_times(rng, n, 9.0), {"nm": sweep_there_and_back(rng, n, low, high)}
 
 
 LENS = SystemKind(
@@ -361,7 +348,10 @@ def simulate(p, data):
     return p["radius_mm"] / (2 * (index - 1))
 """,
     shared={"radius_mm": ("normal", 100, 0.5), "b_um2": (0.003, 0.008)},
-    design=_lens_design,
+    design=lambda rng, n, regime: (
+        irregular_times(rng, n, 9.0),
+        {"nm": sweep_there_and_back(rng, n, *((440, 640) if regime == 1 else (400, 700)))},
+    ),
     decimals={"t_s": 1, "nm": 1},
     drives=("nm",),
     sd=0.01,
@@ -475,11 +465,6 @@ def observe(s, p, u):
 )
 
 
-def _oscillator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    t = irregular_times(rng, n, 0.05)
-    return t, {"force_n": random_waves(rng, t, 0.8 * regime, 2.5)}
-
-
 OSCILLATOR = SystemKind(
     name="mass on a spring",
     text="""# A cart of 0.8 kg on a spring with a damper, pushed by a shaker.
@@ -499,7 +484,10 @@ def observe(s, p, u):
 """,
     shared={"k_n_m": (25, 70), "c_kg_s": (0.4, 1.2)},
     of_run={"x0_m": ("normal", 0, 0.03)},
-    design=_oscillator_design,
+    design=lambda rng, n, regime: (
+        t := irregular_times(rng, n, 0.05),
+        {"force_n": random_waves(rng, t, 0.8 * regime, 2.5)},
+    ),
     decimals={"t_s": 4, "force_n": 4},
     drives=("force_n",),
     sd=0.15,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from functools import partial
 
 from probewise._writing import checked_output_directory
 from probewise.cli._common import CommandError, add, add_out, add_seed_and_quiet, parse_count
@@ -32,17 +33,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge; write its table and report; return the exit status."""
     from probewise.proof import pages, tables
-    from probewise.proof.challenge import RunCaseInRounds, challenge, run_case, run_system_case
+    from probewise.proof.challenge import challenge, run_case, run_system_case
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")
     checked_output_directory(arguments.out, "cases.jsonl")
-    work, score, of, options = run_case, tables.score, "", list[str]()
+    work, score, of, options = partial(run_case, rounds=arguments.rounds), tables.score, "", list[str]()
     if arguments.systems:
-        work, score, of, options = run_system_case, tables.score_systems, "systems", ["--systems"]
+        work, score, of, options = partial(run_system_case), tables.score_systems, "systems", ["--systems"]
     elif arguments.rounds > 1:
-        n = arguments.rounds
-        work, score, of, options = RunCaseInRounds(n), tables.score_rounds, f"{n} rounds", ["--rounds", str(n)]
+        score, of, options = tables.score_rounds, f"{arguments.rounds} rounds", ["--rounds", str(arguments.rounds)]
     words = ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
     command = shlex.join(words)
     return run_and_report(

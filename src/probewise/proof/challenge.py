@@ -7,11 +7,11 @@ import math
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -158,7 +158,6 @@ def log_densities_of_scans(
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
 
 
-C = TypeVar("C")
 _BREAKS = (ProbewiseError, ArithmeticError, LookupError, ValueError, TypeError, AttributeError, NotImplementedError)
 _OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 _LEAST_PROBABILITY = 1e-3
@@ -182,52 +181,30 @@ class Task:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.number, _OWN))).spawn(n)
 
 
-@dataclass(frozen=True)
-class RunCaseInRounds:
-    """A function that runs a case in up to `rounds` rounds: record, diagnose, then take the advised readings.
-
-    It is a dataclass, not a closure, so that it can be pickled for another process.
-    """
-
-    rounds: int
-
-    def __call__(self, task: Task) -> dict[str, Any]:
-        """Return the result of `run_case` and, under "rounds", each round's diagnosis and number of readings."""
-        return _case_result(task, partial(_investigation_result, rounds=self.rounds))
-
-
 @own_arithmetic
-def run_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its recording alone; return a `results.SENSOR_CASE`, or what failed."""
-    return _case_result(task, _diagnosis_result)
+def run_case(task: Task, rounds: int = 1) -> dict[str, Any]:
+    """Draw a case and diagnose it from its recording alone; return a `results.SENSOR_CASE`, or what failed.
+
+    In more than one of `rounds`, take the advised readings after each; the result is then a `results.ROUNDS_CASE`.
+    """
+    return _result_or_failure(stratum_of(task.number)[0], _parts_of_result(task, rounds))
 
 
-def _case_result(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[str, Any]:
+def _parts_of_result(task: Task, rounds: int) -> Iterator[dict[str, Any]]:
     refit = NullRefit()
-    return result_or_failure(
-        stratum_of(task.number)[0],
-        lambda: draw_case(task.seed, task.number, norm_after_refit=refit),
-        lambda case: _truth_result(case, refit),
-        lambda case: diagnosed(case, task),
-    )
+    case = draw_case(task.seed, task.number, norm_after_refit=refit)
+    yield _truth_result(case, refit)
+    yield _diagnosis_result(case, task) if rounds == 1 else _investigation_result(case, task, rounds)
 
 
-def result_or_failure(
-    stratum: Stratum,
-    draw: Callable[[], C],
-    truth: Callable[[C], dict[str, Any]],
-    diagnosed: Callable[[C], dict[str, Any]],
-) -> dict[str, Any]:
-    """Draw a case; return stratum, truth and diagnosis or, where drawing or diagnosis fails, what failed."""
-    result: dict[str, Any] = asdict(stratum)
-    at = "drawing"
+def _result_or_failure(stratum: Stratum, parts: Iterator[dict[str, Any]]) -> dict[str, Any]:
+    """Return stratum, truth and diagnosis, the parts of a result, or where drawing or diagnosis fails, what failed."""
+    result, at = asdict(stratum), "drawing"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
         try:
-            case = draw()
-            result |= truth(case)
-            at = "diagnosis"
-            result |= diagnosed(case)
+            for part in parts:
+                result, at = result | part, "diagnosis"
         # A campaign of thousands survives a case that breaks the diagnosis, and reports it.
         except _BREAKS as error:
             result |= {"failed": f"{type(error).__name__}: {error}", "at": at}
@@ -299,7 +276,7 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     }
 
 
-def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
+def _investigation_result(case: Case, task: Task, rounds: int) -> dict[str, Any]:
     thinking, reading = task.generators(2)
 
     def recording_of_round(number: int, plan: Plan, _: str) -> Recording:
@@ -456,13 +433,14 @@ _LIKELY = 0.05
 @own_arithmetic
 def run_system_case(task: Task) -> dict[str, Any]:
     """Draw a case and diagnose it from its files alone; return a `results.SYSTEM_CASE`, or what failed."""
+    return _result_or_failure(system_stratum_of(task.number)[0], _parts_of_system_result(task))
+
+
+def _parts_of_system_result(task: Task) -> Iterator[dict[str, Any]]:
     refit = SystemRefit()
-    return result_or_failure(
-        system_stratum_of(task.number)[0],
-        lambda: draw_system_case(task.seed, task.number, after_refit=refit),
-        lambda case: _system_truth_result(case, refit),
-        lambda case: _system_diagnosis_result(case, task, refit),
-    )
+    case = draw_system_case(task.seed, task.number, after_refit=refit)
+    yield _system_truth_result(case, refit)
+    yield _system_diagnosis_result(case, task, refit)
 
 
 def _system_truth_result(case: SystemCase, refit: SystemRefit) -> dict[str, Any]:

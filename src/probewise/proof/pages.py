@@ -79,16 +79,7 @@ def table_of(columns: Columns[T], rows: Iterable[T], *, caption: str = "") -> Ma
     return table(tuple(columns), (tuple(cell(row) for cell in columns.values()) for row in rows), caption=caption)
 
 
-_COLUMNS: tuple[tuple[str, str], ...] = (
-    ("reached", "share that reached the precision, 95 % interval"),
-    ("mean", "mean readings, standard error (a miss counted as the limit)"),
-    ("median", "median readings, 95 % interval"),
-    ("to_white", "mean readings up to the first on white, standard error (none counted as the limit)"),
-    ("after_white", "mean readings after the first on white, standard error"),
-    ("bits_each", "bits per reading, standard error"),
-    ("held", "share of 95 % intervals that hold the truth, standard error"),
-    ("arm_s", "arm time (s), standard error"),
-)
+_COLUMNS = ("reached", "mean", "median", "to_white", "after_white", "bits_each", "held", "arm_s")
 _INTERVALS = (
     "Readings that a run needs. The 95 % interval of the share is Wilson's, for the number of runs beside it; that of "
     f"the median lies between two of the runs, and takes {LEAST_FOR_MEDIAN} of them."
@@ -166,10 +157,10 @@ def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | 
 
 def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
     """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
-    bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
+    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
     rows = []
     for row, found in table.items():
-        estimates = [getattr(found, name) for name, _ in _COLUMNS]
+        estimates = [getattr(found, name) for name in _COLUMNS]
         values = [value for e in estimates for value in (e.value, e.low, e.high)]
         values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
         rows.append([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])

@@ -17,11 +17,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import binomtest
 
 from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of_readings, shipped_geometry_path
 from probewise.cli._bench import SimulatedBench, plan_for_lego_arm
 from probewise.diagnosis import diagnose
+from probewise.proof.estimates import estimated_share
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
 from probewise.world.shipped import true_world
 
@@ -51,6 +51,12 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     return read_recording(path), off
 
 
+def share(hits: list[bool]) -> list[float]:
+    """Give a share with its 95 % Wilson interval."""
+    found = estimated_share(hits)
+    return [found.value, round(found.low, 3), round(found.high, 3)]
+
+
 def main() -> None:
     """Record, diagnose and count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -74,20 +80,14 @@ def main() -> None:
             off = np.concatenate(offs)
             verdicts = [each["verdict"] for each in said]
             document[label] = {
-                "clean": share(verdicts.count("clean"), given.seeds),
-                "clean or noise": share(verdicts.count("clean") + verdicts.count("noise"), given.seeds),
+                "clean": share([verdict == "clean" for verdict in verdicts]),
+                "clean or noise": share([verdict in ("clean", "noise") for verdict in verdicts]),
                 "place told minus true, mean x, y (mm)": off[:, :2].mean(axis=0).round(3).tolist(),
                 "place told minus true, sd x, y (mm)": off[:, :2].std(axis=0).round(3).tolist(),
                 "height minus that asked, sd (mm)": float(off[:, 2].std().round(3)),
                 "diagnoses": said,
             }
     given.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-
-
-def share(n: int, of: int) -> list[float]:
-    """Give a share with its 95 % Wilson interval."""
-    found = binomtest(n, of).proportion_ci(method="wilson")
-    return [n / of, round(found.low, 3), round(found.high, 3)]
 
 
 if __name__ == "__main__":

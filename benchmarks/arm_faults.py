@@ -60,8 +60,7 @@ FAULTS = {
 
 TRUTH = (600.0, 250.0, 120.0)
 GEOMETRY = read_geometry(shipped_geometry_path())
-MAX_READINGS = 60
-MAX_SESSIONS = 200
+MAX_READINGS, MAX_SESSIONS = 60, 200
 QUIET_S = 10.0  # the longest limited move, with its run-on
 MISSED_MM = 16.0  # four times the sd at which a run stops
 PLACE_MM = 2.0  # a motor's count, play and the way that a count makes at the far end of the arm

@@ -12,9 +12,8 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from challenges_side_by_side import read_cases
-
-from probewise.proof.challenge import run_challenge
+from probewise.proof.campaign import read_campaign
+from probewise.proof.challenge import challenge
 
 
 def main() -> None:
@@ -25,12 +24,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    keys = [key for key, result in read_cases(options.cases).items() if result.get("kind") in options.kind]
+    keys = [key for key, result in read_campaign(options.cases).results.items() if result.get("kind") in options.kind]
     if not keys:
         parser.error(f"{options.cases} holds no case of kind {', '.join(options.kind)}")
     seeds, numbers = zip(*(map(int, key.split(" / ")) for key in keys), strict=True)
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        run_challenge(numbers, seed=seeds[0], path=options.out, executor=pool)
+        challenge(numbers, seed=seeds[0]).run(path=options.out, executor=pool)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,6 @@ cases that changed are counted, with the two-sided probability of such a differe
 from __future__ import annotations
 
 import argparse
-import lzma
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,15 +17,15 @@ from typing import Any
 from scipy.stats import binomtest
 
 from probewise.proof.campaign import Result, read_campaign
-from probewise.proof.scoring import (
+from probewise.proof.tables import (
     credible_set_holds_truth,
     is_confidently_wrong,
     is_leading_name_right,
     is_out_of_vocabulary,
     is_recognised_as_out_of_vocabulary,
     names_effect_on_mean,
+    score,
 )
-from probewise.proof.tables import score
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text_of_rows
 
@@ -43,16 +41,6 @@ COUNTED: Mapping[str, tuple[Callable[[Result], bool], Callable[[Result], bool]]]
     "wrong name stated above .9": (lambda r: True, is_confidently_wrong),
 }
 """What is counted in each case, by name: which cases, and what of them."""
-
-
-def read_cases(path: Path) -> dict[str, Any]:
-    """Return the results of a campaign's file, packed or not, by key."""
-    if path.suffix != ".xz":
-        return dict(read_campaign(path).results)
-    with tempfile.TemporaryDirectory() as directory:
-        unpacked = Path(directory) / "cases.jsonl"
-        unpacked.write_bytes(lzma.decompress(path.read_bytes()))
-        return dict(read_campaign(unpacked).results)
 
 
 def changed_counts(earlier: list[Result], later: list[Result]) -> list[dict[str, Any]]:
@@ -76,11 +64,6 @@ def changed_counts(earlier: list[Result], later: list[Result]) -> list[dict[str,
     return rows
 
 
-def as_csv(rows: list[dict[str, Any]]) -> str:
-    """Return rows as CSV."""
-    return csv_text_of_rows(rows[0], (row.values() for row in rows))
-
-
 def main() -> None:
     """Compare two files; print what changed, and write the rows of both tables beside each other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -88,13 +71,14 @@ def main() -> None:
     parser.add_argument("later", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
-    both = read_cases(arguments.earlier), read_cases(arguments.later)
+    both = read_campaign(arguments.earlier).results, read_campaign(arguments.later).results
     keys = [key for key in both[1] if key in both[0] and not any("failed" in results[key] for results in both)]
     earlier, later = ([results[key] for key in keys] for results in both)
     n_verdicts = sum(a["verdict"] == b["verdict"] for a, b in zip(earlier, later, strict=True))
     n_leaders = sum(sorted(a["combination"]) == sorted(b["combination"]) for a, b in zip(earlier, later, strict=True))
     print(f"{len(keys)} cases in both; the same verdict in {n_verdicts}, the same leading hypothesis in {n_leaders}")
-    print(as_csv(changed_counts(earlier, later)), end="")
+    changed = changed_counts(earlier, later)
+    print(csv_text_of_rows(changed[0], (row.values() for row in changed)), end="")
     rows = [
         {
             "what": old.name.strip(),
@@ -104,7 +88,7 @@ def main() -> None:
         }
         for old, new in zip(score(earlier), score(later), strict=True)
     ]
-    write_text_atomically(arguments.out, as_csv(rows))
+    write_text_atomically(arguments.out, csv_text_of_rows(rows[0], (row.values() for row in rows)))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -23,14 +23,13 @@ import numpy as np
 
 from probewise.diagnosis import diagnose, weigh_thoroughly
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import Campaign, Result
 from probewise.proof.challenge import Task
 from probewise.proof.estimates import estimated_share
 from probewise.proof.refits import NullRefit
 from probewise.proof.sensors.cases import draw_case
-from probewise.proof.sensors.plans import PLANS
+from probewise.proof.sensors.sensors import PLANS
 
-Result = Mapping[str, Any]
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
 
 
@@ -40,8 +39,8 @@ def weigh_case(task: Task, *, plan: str) -> dict[str, Any]:
         case = draw_case(task.seed, task.number, norm_after_refit=NullRefit())
     except NotConvergedError as error:  # no such effect can be so large
         return {"left_out": str(error)}
-    if case.truth.plan != plan:
-        return {"left_out": case.truth.plan}
+    if case.plan != plan:
+        return {"left_out": case.plan}
     blind, nested = (
         np.random.default_rng(child) for child in np.random.SeedSequence([task.seed, task.number]).spawn(2)
     )
@@ -84,17 +83,11 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
+    work, settings = partial(weigh_case, plan=options.plan), {"seed": options.seed, "plan": options.plan}
     tasks = [Task(options.seed, number) for number in range(options.numbers)]
-    settings = {"seed": options.seed, "plan": options.plan}
+    campaign = Campaign(work, tasks, settings, lambda result: None, "cases")
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        results = run_campaign(
-            partial(weigh_case, plan=options.plan),
-            {task.key: task for task in tasks},
-            path=options.out,
-            settings=settings,
-            executor=pool,
-        )
-    print(summary(list(results.values())))
+        print(summary([*campaign.run(path=options.out, executor=pool).values()]))
 
 
 if __name__ == "__main__":

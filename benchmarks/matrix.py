@@ -57,12 +57,10 @@ from probewise.proof.concealed_study import CONCEALED
 from probewise.proof.refits import NullRefit, SystemRefit
 from probewise.proof.sensors.cases import Stratum
 from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
-from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
-from probewise.proof.sensors.sizing import EffectSizer
+from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup, EffectSizer
 from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
 from probewise.proof.systems.cases import draw_effect_of_size as conceal_in_system
-from probewise.proof.systems.form import Form
-from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
+from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, Form, family_of, forms_of
 from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
 from probewise.proof.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Plan, paper_plan, two_way_plan, write_recording, write_text_atomically
@@ -206,7 +204,7 @@ def commands(cell: Cell, folder: Path) -> tuple[list[list[str]], float | None]:
     path = str(folder / "recording.csv")
     write_recording(world.simulate(plan, rng=rng), path)
     if verb == "investigate":
-        truth = [f"{e.name}:{','.join(map(repr, vars(e).values()))}" for e in world.concealed] or ["nothing"]
+        truth = [f"{e.name}:{','.join(map(repr, e.parameters.values()))}" for e in world.concealed] or ["nothing"]
         return [[verb, "--plan", path, "--truth", *truth, "--readings", "60", "--rounds", "2"]], size
     first = [verb, path, *(known if what in (*LEVELS, *NEEDS_SENSOR, "a known sensor") else [])]
     return [first, *([["predict", "sensor.json", path]] if verb == "diagnose" else [])], size

@@ -28,8 +28,7 @@ from probewise.scene import Field
 from probewise.sensor import mixture_parameter_names
 
 EFFECTS = ("backlash", "saturation", "nonlinearity", "albedo_gradient", "ambient_gradient", "edge_blur", "halo")
-CLEAR = 1
-MOST_READINGS = 100
+CLEAR, MOST_READINGS = 1, 100
 
 
 def calibrated() -> FittedSensor:
@@ -64,7 +63,7 @@ def run(sensor: FittedSensor, trial: ConcealedTrial) -> tuple[FittedSensor, dict
     figures = {
         "known": has_reached_target(last, experiment),
         "readings": last.number,
-        **accuracy_measures(last, experiment, trial.truth),
+        **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
         "credible": list(found.credible_set),
     }
     return repaired_sensor(sensor, last, rng=np.random.default_rng(trial.seed)), figures

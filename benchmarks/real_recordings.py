@@ -61,8 +61,8 @@ def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, free
         rows = np.flatnonzero(np.isfinite(miss))
         gained = (scores[names] - scores[()])[rows]
         by_scan = np.array([gained[plan.scan[rows] == k].mean() for k in np.unique(plan.scan[rows])])
-        error = float(by_scan.std(ddof=1) / np.sqrt(len(by_scan)))
-        out_gains.append(Gain(names, float(np.sqrt(np.mean(miss[rows] ** 2))), float(gained.mean()), error))
+        rms, error = np.sqrt(np.mean(miss[rows] ** 2)), by_scan.std(ddof=1) / np.sqrt(len(by_scan))
+        out_gains.append(Gain(names, float(rms), float(gained.mean()), float(error)))
     return out_gains
 
 
@@ -86,8 +86,7 @@ def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
 
 
 def _best(model, recording, starts, law):
-    tried = [fit(model, recording, start, law, max_steps=40) for start in starts]
-    return min(tried, key=lambda f: f.objective)
+    return min((fit(model, recording, start, law, max_steps=40) for start in starts), key=lambda f: f.objective)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ HERE = Path(__file__).resolve().parent.parent
 DATA = HERE / "src/probewise/data"
 PENDULUM = HERE / "examples/simulators/pendulum.py"
 NOISE = 0.1
+CLOSED_ROWS, LAW_ROWS = (120, 500, 20_000, 200_000, 1_000_000), (500, 5000)
 LONG_S = 20  # a row that takes as long before is run once each
 CLOSED = """import numpy as np
 reading, unit, time, run, vectorized = "y", "V", "t_s", "run", True
@@ -91,45 +92,46 @@ def recording(to: Path, *every: int) -> Path:
     return to
 
 
-def rows(at: Path, before: Path) -> Iterator[tuple[str, float, list[str]]]:
-    """Make the inputs; yield the name of each row, its goal, and its command after `python`, cheap ones first."""
-    (at / "closed.py").write_text(CLOSED)
-    (at / "slow.py").write_text(SLOW)
-    run, out = ["-m", "probewise"], ["--quiet", "--out", str(at / "out")]
-    read, swing = [*run, "diagnose"], ["--simulator", str(PENDULUM), *out]
-
-    def closed(n: int, simulator: str = "closed.py") -> list[str]:
-        (at / f"{n}.csv").write_text(table(n))
-        return [*read, str(at / f"{n}.csv"), "--simulator", str(at / simulator), *out]
-
-    def law(n: int) -> list[str]:
+def rows(at: Path, before: Path) -> dict[str, tuple[float, list[str]]]:
+    """Make the inputs; return by name of each row its goal, and its command after `python`, cheap ones first."""
+    for name, text in (("closed.py", CLOSED), ("slow.py", SLOW), *((f"{n}.csv", table(n)) for n in CLOSED_ROWS)):
+        (at / name).write_text(text)
+    for n in LAW_ROWS:
         (at / f"law{n}.csv").write_text(swings(n))
-        return [*read, str(at / f"law{n}.csv"), *swing]
-
-    yield "diagnose --help", 0.3, [*read, "--help"]
-    yield "import probewise", 1.0, ["-c", "import probewise"]
-    yield "diagnose: a slow simulator, 120 rows", 0.25, closed(120, "slow.py")
-    yield "Inquiry: 12 readings", 0.1, ["-c", INQUIRY]
+    run, out = ["-m", "probewise"], ["--quiet", "--out", str(at / "out")]
     calibrated = [before, *run, "calibrate", DATA / "paper.csv", "--orders", "1", "--quiet", "--out", at / "sensor"]
     subprocess.run(calibrated, check=True, env=environment(before))
-    look = [*run, "explore", "--sensor", str(at / "sensor/sensor.json"), "--seed", "3", "--max-readings", "8", *out]
-    yield "explore: 8 readings, trusting", 0.5, [*look, "--trust", "1"]
     subprocess.run([sys.executable, HERE / "examples/plot_pendulum.py", "--out", at / "swings.csv"], check=True)
-    yield "diagnose: the README's pendulum", 0.35, [*read, str(at / "swings.csv"), *swing]
-    yield "diagnose: a closed form, 500 rows", 0.35, closed(500)
-    yield "diagnose: a recording of 408", 0.35, [*read, str(DATA / "paper.csv"), *out]
-    four = [*out, "--orders", "1", "2", "3", "4"]
-    yield "calibrate: 408 readings", 0.4, [*run, "calibrate", str(DATA / "paper.csv"), *four]
-    yield "diagnose: a closed form, 20,000 rows", 0.2, closed(20_000)
-    yield "explore: 8 readings, in doubt", 0.25, look
-    yield "diagnose: a law of two states, 500 rows", 0.4, law(500)
-    yield "diagnose: a recording of 24", 0.35, [*read, str(recording(at / "24.csv", 41)), *out]
-    yield "calibrate: 961 readings", 0.3, [*run, "calibrate", str(DATA / "concealed.csv"), *four]
-    yield "calibrate: 1,804 readings", 0.5, [*run, "calibrate", str(recording(at / "1804.csv", 1, 8, 2, 4)), *four]
-    yield "demo", 0.3, [*run, "demo", *out]
-    yield "diagnose: a law of two states, 5,000 rows", 0.4, law(5000)
-    yield "diagnose: a closed form, 200,000 rows", 0.2, closed(200_000)
-    yield "diagnose: a closed form, 1,000,000 rows", 0.2, closed(1_000_000)
+    look = [*run, "explore", "--sensor", str(at / "sensor/sensor.json"), "--seed", "3", "--max-readings", "8", *out]
+
+    def read(file: Path, simulator: Path | None = None) -> list[str]:
+        return [*run, "diagnose", str(file), *([] if simulator is None else ["--simulator", str(simulator)]), *out]
+
+    def fitted(file: Path) -> list[str]:
+        return [*run, "calibrate", str(file), *out, "--orders", "1", "2", "3", "4"]
+
+    closed = at / "closed.py"
+    return {
+        "diagnose --help": (0.3, [*run, "diagnose", "--help"]),
+        "import probewise": (1.0, ["-c", "import probewise"]),
+        "diagnose: a slow simulator, 120 rows": (0.25, read(at / "120.csv", at / "slow.py")),
+        "Inquiry: 12 readings": (0.1, ["-c", INQUIRY]),
+        "explore: 8 readings, trusting": (0.5, [*look, "--trust", "1"]),
+        "diagnose: the README's pendulum": (0.35, read(at / "swings.csv", PENDULUM)),
+        "diagnose: a closed form, 500 rows": (0.35, read(at / "500.csv", closed)),
+        "diagnose: a recording of 408": (0.35, read(DATA / "paper.csv")),
+        "calibrate: 408 readings": (0.4, fitted(DATA / "paper.csv")),
+        "diagnose: a closed form, 20,000 rows": (0.2, read(at / "20000.csv", closed)),
+        "explore: 8 readings, in doubt": (0.25, look),
+        "diagnose: a law of two states, 500 rows": (0.4, read(at / "law500.csv", PENDULUM)),
+        "diagnose: a recording of 24": (0.35, read(recording(at / "24.csv", 41))),
+        "calibrate: 961 readings": (0.3, fitted(DATA / "concealed.csv")),
+        "calibrate: 1,804 readings": (0.5, fitted(recording(at / "1804.csv", 1, 8, 2, 4))),
+        "demo": (0.3, [*run, "demo", *out]),
+        "diagnose: a law of two states, 5,000 rows": (0.4, read(at / "law5000.csv", PENDULUM)),
+        "diagnose: a closed form, 200,000 rows": (0.2, read(at / "200000.csv", closed)),
+        "diagnose: a closed form, 1,000,000 rows": (0.2, read(at / "1000000.csv", closed)),
+    }
 
 
 def environment(python: Path) -> dict[str, str]:
@@ -140,14 +142,10 @@ def environment(python: Path) -> dict[str, str]:
 
 def measured(python: Path, command: list[str], at: Path, limit_s: int | None, cwd: Path) -> dict[str, float]:
     """Run once; return seconds, peak memory and calls of the slow simulator, or only `over_s` beyond the limit."""
-
-    def limited() -> None:
-        if limit_s is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s))
-
+    limited = limit_s and partial(resource.setrlimit, resource.RLIMIT_CPU, (limit_s, limit_s))
     (at / "calls").write_bytes(b"")
     began, how = time.monotonic(), {"cwd": cwd, "env": environment(python) | {"CALLS": str(at / "calls")}}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "preexec_fn": limited}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "preexec_fn": limited or None}
     run = subprocess.Popen([str(python), *command], **how, **quiet)
     _, status, used = os.wait4(run.pid, 0)
     cpu_s = used.ru_utime + used.ru_stime
@@ -183,8 +181,8 @@ def main() -> None:
         subprocess.run([python, "-c", compiled], check=True, env=environment(python))
     with tempfile.TemporaryDirectory() as folder:
         at, trees = Path(folder), {"before": told_to.tests or folder, "now": HERE if told_to.tests else folder}
-        tests = ("the README's tests", 0.4, ["-m", "pytest", "-q", "-n", "logical", "--dist", "loadfile"])
-        for name, goal, command in [tests] if told_to.tests else rows(at, told_to.before):
+        tests = {"the README's tests": (0.4, ["-m", "pytest", "-q", "-n", "logical", "--dist", "loadfile"])}
+        for name, (goal, command) in (tests if told_to.tests else rows(at, told_to.before)).items():
             if (name in found and not told_to.rows) or not any(w in name for w in told_to.rows or [name]):
                 continue
             row = {"goal": goal, "before": [], "now": [], "ratio": None}

@@ -17,13 +17,13 @@ from probewise.recordings import Disc
 from probewise.report import exploration, plots
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.world import Blob, Saturation, World, gaussian_spot
+from probewise.world import Blob, World, gaussian_spot, saturation
 
 seed = 4
 print(f"seed {seed}")
 hidden = Disc((600.0, 260.0), 120.0)
 spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))])
-world = World(spot, black=10.0, white=60.0, noise_sd=0.7, concealed=(Saturation(40.0),))
+world = World(spot, black=10.0, white=60.0, noise_sd=0.7, concealed=(saturation(40.0),))
 
 # %%
 # The model: black reads 10, white 60. The converter of the true sensor stops at 40.

@@ -22,7 +22,7 @@ from probewise.investigation import (
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.sensor import mixture_parameter_names
 from probewise.world import World
-from probewise.world.concealed import Backlash, Lag, Saturation
+from probewise.world.concealed import backlash, lag, saturation
 from probewise.world.shipped import BLOB, true_world
 from probewise.world.spots import gaussian_spot
 
@@ -147,7 +147,7 @@ def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to
         field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
         instrumentation=Instrumentation(unit="LEGO", height_mm=16.0),
     )
-    world = World(gaussian_spot([BLOB]), height_mm=16.0, concealed=(Backlash(1.0),))
+    world = World(gaussian_spot([BLOB]), height_mm=16.0, concealed=(backlash(1.0),))
 
     def record_at_20_mm(number, plan, asked):
         assert plan.instrumentation.height_mm == 20.0
@@ -258,8 +258,8 @@ def test_each_round_has_noise_of_its_own():
 
 def test_what_a_world_conceals_is_read_from_its_name_and_numbers():
     assert parse_concealed("nothing") == ()
-    assert parse_concealed("backlash:0.5+lag:2") == (Backlash(0.5), Lag(2.0))
-    assert parse_concealed("saturation:55,1.5") == (Saturation(55.0, 1.5),)
+    assert parse_concealed("backlash:0.5+lag:2") == (backlash(0.5), lag(2.0))
+    assert parse_concealed("saturation:55,1.5") == (saturation(55.0, 1.5),)
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,12 @@ from probewise.report import exploration, plots
 from probewise.scene import Circle, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
-from probewise.world.concealed import AlbedoGradient
+from probewise.world.concealed import albedo_gradient
 
 seed = 4
 print(f"seed {seed}")
 spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))])
-fading = AlbedoGradient(-0.3 / 1048, 0.0)  # per mm along X; the field is 1048 mm wide
+fading = albedo_gradient(-0.3 / 1048, 0.0)  # per mm along X; the field is 1048 mm wide
 world = World(spot, black=10.0, white=60.0, noise_sd=0.7, concealed=(fading,))
 hidden = Disc((600.0, 260.0), 120.0)
 

@@ -6,11 +6,12 @@ each round records the plan that the previous diagnosis advised, and diagnoses a
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -355,21 +356,25 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
 
 def _parse_one_effect(text: str) -> Concealed:
     name, _, numbers = text.partition(":")
-    every = [kind for module in (concealed, unlisted) for kind in vars(module).values() if hasattr(kind, "stage")]
-    kinds: dict[str, Any] = {k.name: k for k in every if all(field.type == "float" for field in fields(k))}
+    every = {**vars(concealed), **vars(unlisted)}
+    kinds = {own: kind for own, kind in every.items() if hasattr(kind, "__wrapped__") and _is_of_numbers(kind)}
     if name not in kinds:
         meant = did_you_mean(name, kinds)
         raise ParameterError(
             "--truth", name, f"{NOTHING}, or an effect of probewise.world.concealed with its values{meant}"
         )
     kind = kinds[name]
-    wanted = ",".join(field.name for field in fields(kind))
+    wanted = ",".join(inspect.signature(kind).parameters)
     allowed = f"{name}:{wanted}, all of them numbers of magnitude up to {_LARGEST:g}"
     try:
         values = [float(number) for number in numbers.split(",")]
-        effect = kind(*values)
+        effect: Concealed = kind(*values)
     except (TypeError, ValueError) as error:
         raise ParameterError("--truth", text, allowed) from error
     if not all(abs(value) <= _LARGEST for value in values):  # nor NaN
         raise ParameterError("--truth", text, allowed)
-    return effect  # type: ignore[no-any-return]
+    return effect
+
+
+def _is_of_numbers(kind: Callable[..., Concealed]) -> bool:
+    return {parameter.annotation for parameter in inspect.signature(kind).parameters.values()} == {"float"}

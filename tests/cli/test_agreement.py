@@ -12,7 +12,7 @@ from probewise.cli import main
 ARM = """
 import numpy as np
 from probewise.recordings import Disc
-from probewise.world import Blob, Saturation, World, gaussian_spot
+from probewise.world import Blob, saturation, World, gaussian_spot
 
 def connect():
     return Arm()
@@ -22,7 +22,7 @@ class Arm:
 
     def __init__(self):
         spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))])
-        self.world = World(spot, black=10.0, white=60.0, noise_sd=0.6, concealed=(Saturation(40.0),))
+        self.world = World(spot, black=10.0, white=60.0, noise_sd=0.6, concealed=(saturation(40.0),))
 
     def measure(self, pose):
         self.n += 1

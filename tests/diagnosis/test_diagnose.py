@@ -107,7 +107,7 @@ def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value
 @pytest.mark.slow
 def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     """A lamp that fades and a sensor that sinks look the same here: the one in the vocabulary speaks for both."""
-    found = diagnose(recording("two_way", hidden.GainDrift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
+    found = diagnose(recording("two_way", hidden.gain_drift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"  # a battery that tires as the lamp does
     assert found.combination in (("gain_drift",), ("battery_sag",))
     assert found.judged.unknown_probability < 0.05
@@ -115,7 +115,7 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
 
 @pytest.mark.slow
 def test_backlash_is_named_measured_located_and_repaired():
-    found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    found = diagnose(recording("forth_and_back", hidden.backlash(0.7), seed=2), rng=np.random.default_rng(0))
     document = strict(found)
     assert found.verdict == "named"
     assert found.combination == ("backlash",)
@@ -140,7 +140,7 @@ def test_backlash_is_named_measured_located_and_repaired():
 @pytest.mark.slow
 def test_a_recording_far_from_0_is_diagnosed_as_one_at_0():
     """Times in seconds since 1970: the lamp warms up from the first reading on, and its sensor knows since when."""
-    near = recording("paper", hidden.GainDrift(-0.1, 100.0), seed=3)
+    near = recording("paper", hidden.gain_drift(-0.1, 100.0), seed=3)
     near = dataclasses.replace(near, plan=dataclasses.replace(near.plan, time_s=near.plan.time_s - near.plan.time_s[0]))
     far = dataclasses.replace(near, plan=dataclasses.replace(near.plan, time_s=near.plan.time_s + 1.7e9))
     found, there = (diagnose(each, rng=np.random.default_rng(0)) for each in (near, far))
@@ -159,7 +159,7 @@ def test_a_recording_far_from_0_is_diagnosed_as_one_at_0():
 def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     worse = HeldOutGain(-4.0, 0.5, 50, (("edge_0", -4.0),))
     monkeypatch.setattr("probewise.diagnosis.best_repair.held_out_gain", lambda *_, **__: worse)
-    found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    found = diagnose(recording("forth_and_back", hidden.backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
     assert "backlash (play) of the arm fits these readings best" in found.reason
@@ -170,7 +170,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
 @pytest.mark.slow
 def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     """Both shift every edge alike, and so does a tilt; scans that also go back tell them apart."""
-    found = diagnose(recording("paper", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
+    found = diagnose(recording("paper", hidden.backlash(0.7), seed=2), rng=np.random.default_rng(0))
     strict(found)
     assert found.verdict == "cannot_tell"
     assert found.p_value < 1e-6
@@ -256,7 +256,7 @@ def test_an_earlier_sensor_is_taken_as_the_prior():
 @pytest.mark.slow
 def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named():
     """To first order the SSF's width takes a scale up; at a third it does not, though no template shows that."""
-    found = diagnose(recording("paper", hidden.PositionScale(-0.3, 0.0)), rng=np.random.default_rng(0))
+    found = diagnose(recording("paper", hidden.position_scale(-0.3, 0.0)), rng=np.random.default_rng(0))
     strict(found)
     scale = next(effect for effect in found.effects if effect.name == "position_scale")
     assert scale.probability > 0.05
@@ -265,7 +265,7 @@ def test_a_scale_so_far_off_that_the_spot_looks_narrower_is_among_what_is_named(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "name"),
-    [(unlisted.PlaceStep(-0.8, 1.4), "missing_tooth"), (unlisted.StickSlip(0.5, 6.0, 0.3), "stick_slip")],
+    [(unlisted.place_step(-0.8, 1.4), "missing_tooth"), (unlisted.stick_slip(0.5, 6.0, 0.3), "stick_slip")],
 )
 def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
     """A step of the arm at one place is among the bases of places too: by that name or as one of those."""
@@ -279,7 +279,7 @@ def test_a_jump_of_the_arm_is_no_wave_of_it(effect, name):
 def test_a_rare_effect_is_named_and_its_repair_predicts():
     """The paper slips; the model that finds it moves the arm instead."""
     half_way_s = float(np.median(two_way_plan().time_s))
-    pushed = recording("two_way", unlisted.SlippedPaper(1.5, half_way_s))
+    pushed = recording("two_way", unlisted.slipped_paper(1.5, half_way_s))
     found = diagnose(pushed, rng=np.random.default_rng(0))
     document = strict(found)
     assert found.verdict == "named"
@@ -299,7 +299,7 @@ def test_readings_beyond_the_declared_range_do_not_stop_it():
     """A gradient drives the dark end below what the instrument can read: those rows are lost, the rest is diagnosed."""
     plan = paper_plan()
     limited = dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, min=8.0, max=None))
-    full = recording("paper", hidden.AmbientGradient(0.05, 0.0))
+    full = recording("paper", hidden.ambient_gradient(0.05, 0.0))
     found = diagnose(Recording(limited, full.readings), rng=np.random.default_rng(0))
     strict(found)
     assert 24 < found.recording.usable.sum() < len(plan)
@@ -327,7 +327,7 @@ def test_a_sensor_that_is_known_shows_that_it_was_turned():
     """As by a clean diagnosis; the alarm is not silenced by fine structure that the sensor is known not to have."""
     rng = np.random.default_rng(0)
     earlier = clean_diagnosis().repaired.fitted_sensor(recording("paper", seed=2), rng=rng)
-    turned = recording("paper", hidden.OrientationError(12.0), seed=5)
+    turned = recording("paper", hidden.orientation_error(12.0), seed=5)
     found = diagnose(turned, sensor=earlier, rng=rng)
     assert (found.verdict, found.combination) == ("named", ("orientation_error",))
     assert found.p_value < 1e-6
@@ -336,7 +336,7 @@ def test_a_sensor_that_is_known_shows_that_it_was_turned():
 @pytest.mark.slow
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
     monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: 0.2)
-    found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
+    found = diagnose(recording("two_way", hidden.hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("cannot_tell", ())
     assert found.hypotheses[0].effects == ("hysteresis",)
     amp = found.repaired.effect_samples("hysteresis")[:, 0]

@@ -9,11 +9,11 @@ from probewise.diagnosis import model_with
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan
 from probewise.world import Blob, World, gaussian_spot
-from probewise.world.concealed import OffsetDrift
+from probewise.world.concealed import offset_drift
 
 PLAN = paper_plan()
 SPOT = gaussian_spot([Blob(1.0, (1.5, 2.5), (6.0, 8.0), 0.2)])
-RECORDING = World(SPOT, concealed=(OffsetDrift(6.0),)).simulate(PLAN, rng=np.random.default_rng(0))
+RECORDING = World(SPOT, concealed=(offset_drift(6.0),)).simulate(PLAN, rng=np.random.default_rng(0))
 
 
 @pytest.mark.slow

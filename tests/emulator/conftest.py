@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from probewise.emulator import Brick, EmptyPort, LightSensor, VirtualClock
+from probewise.emulator import Brick, LightSensor, VirtualClock, empty_port
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def clock() -> VirtualClock:
 @pytest.fixture
 def brick(clock: VirtualClock) -> Brick:
     """A light sensor at port 2 over something that reads 57.5 %."""
-    sensors = [EmptyPort(), LightSensor(lambda lit: 57.5 if lit else 28.75, clock), EmptyPort(), EmptyPort()]
+    sensors = [empty_port, LightSensor(lambda lit: 57.5 if lit else 28.75, clock), empty_port, empty_port]
     return Brick(clock, sensors=sensors, name="ARM1", programs=("arm.rxe",))
 
 

@@ -118,7 +118,7 @@ def test_joints_without_a_stop_keep_their_counters(clock: VirtualClock) -> None:
 def test_a_stop_that_is_not_there_is_told_of(clock: VirtualClock) -> None:
     bench = lost(clock)
     base = bench.arm.joints[0].motor
-    base.parameters = dataclasses.replace(base.parameters, stops_deg=(-math.inf, math.inf))
+    base.stops_deg = (-math.inf, math.inf)
     with (
         connected(bench, clock, with_stops("base")) as lego,
         pytest.raises(MotorError, match="motor A met no stop within 4420 counts"),

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.emulator import Brick, EmptyPort, LightSensor, VirtualClock
+from probewise.emulator import Brick, LightSensor, VirtualClock, empty_port
 
 
 class Fixed:
     def __init__(self, value: int) -> None:
         self.value = value
 
-    def counts(self, *, lit: bool) -> int:
+    def __call__(self, lit: bool) -> int:
         return self.value
 
 
@@ -27,7 +27,7 @@ def values(ask: Callable[[str], str]) -> tuple[int, int, int, int]:
 
 
 def light_brick(clock: VirtualClock, sensor: object) -> Brick:
-    return Brick(clock, sensors=[EmptyPort(), sensor, EmptyPort(), EmptyPort()])  # type: ignore[list-item]
+    return Brick(clock, sensors=[empty_port, sensor, empty_port, empty_port])  # type: ignore[list-item]
 
 
 def asking(brick: Brick) -> Callable[[str], str]:
@@ -88,7 +88,7 @@ def test_the_converter_takes_a_new_sample_every_three_milliseconds(clock: Virtua
 
     light = LightSensor(seen, clock)
     for _ in range(30):
-        light.counts(lit=True)
+        light(True)
         clock.sleep(0.001)
     assert len(taken) == 10
 
@@ -105,11 +105,11 @@ def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
 
 @given(percent=st.floats(-1e6, 1e6))
 def test_no_light_leaves_the_converter_s_range(percent: float) -> None:
-    assert 0 <= LightSensor(lambda lit: percent, VirtualClock()).counts(lit=True) <= 1023
+    assert 0 <= LightSensor(lambda lit: percent, VirtualClock())(True) <= 1023
 
 
 def test_an_empty_port_reads_the_full_voltage(clock: VirtualClock) -> None:
-    ask = asking(light_brick(clock, EmptyPort()))
+    ask = asking(light_brick(clock, empty_port))
     ask("80 05 01 01 00")
     clock.sleep(0.1)
     assert values(ask) == (1, 1023, 1023, 1023)

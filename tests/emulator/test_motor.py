@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from probewise.emulator import Battery, Brick, Motor, MotorParameters, VirtualClock
+from probewise.emulator import Brick, Motor, VirtualClock
 from probewise.emulator.motors import OutputPort, OutputSetting, RunState
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
@@ -28,9 +28,9 @@ def wait(clock: VirtualClock, brick: Brick, seconds: float) -> OutputPort:
     return brick.outputs.ports[0]
 
 
-def coasted(speed_deg_s: float, parameters: MotorParameters) -> float:
+def coasted(speed_deg_s: float, motor: Motor) -> float:
     """Integrate speed' = -speed/T - f to standstill: T v - f T^2 ln(1 + v / (f T))."""
-    t, f = parameters.coasting_s, parameters.friction_deg_s2
+    t, f = motor.coasting_s, motor.friction_deg_s2
     return t * speed_deg_s - f * t * t * math.log1p(speed_deg_s / (f * t))
 
 
@@ -38,18 +38,15 @@ def test_a_coasting_motor_stops_where_the_integral_says() -> None:
     motor = Motor(speed_deg_s=600.0)
     for _ in range(2000):
         motor.step(1e-3, 0, brake=False, battery_mv=7400)
-    assert motor.angle_deg == pytest.approx(coasted(600.0, motor.parameters), rel=0.01)
+    assert motor.angle_deg == pytest.approx(coasted(600.0, motor), rel=0.01)
     assert motor.speed_deg_s == 0
 
 
 def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock, brick) -> None:
     turn(ask, 50, 0, how="01 00 00 20")
     port = wait(clock, brick, 1.0)
-    parameters = port.motor.parameters
-    expected = (
-        parameters.full_speed_deg_s * 0.5 * 7412 / parameters.rated_mv
-        - parameters.friction_deg_s2 * parameters.driven_s
-    )
+    motor = port.motor
+    expected = motor.full_speed_deg_s * 0.5 * 7412 / motor.rated_mv - motor.friction_deg_s2 * motor.driven_s
     assert port.motor.speed_deg_s == pytest.approx(expected, rel=0.01)
 
 
@@ -63,7 +60,7 @@ def test_a_weak_motor_does_not_start(ask, clock, brick) -> None:
 def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(
     clock: VirtualClock, battery_mv: float
 ) -> None:
-    brick = Brick(clock, battery=Battery(battery_mv))
+    brick = Brick(clock, full_mv=battery_mv)
     brick.answer(bytes.fromhex(f"80 04 00 1E {RUN} 00 00 00 00"))
     begun = wait(clock, brick, 2.0).tacho_count
     assert wait(clock, brick, 4.0).tacho_count - begun == pytest.approx(1200, abs=15)
@@ -71,7 +68,7 @@ def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(
 
 def test_the_regulator_is_the_firmwares_by_hand() -> None:
     """Power is half of 3 e (to 100), the sum of errors (3 s + e) / 4, and the change of e, all in whole numbers."""
-    port = OutputPort(Motor(MotorParameters(stops_deg=(0.0, 0.0))))
+    port = OutputPort(Motor(stops_deg=(0.0, 0.0)))
     port.apply_setting(OutputSetting(20, 7, 1, 0, 0x20))
     powers = []
     for _ in range(3):  # e = 20, 40, 60: s = 5, 13, 24
@@ -179,14 +176,14 @@ def test_braking_is_shorter_than_coasting() -> None:
 
 
 def test_a_motor_stands_still_at_its_stop() -> None:
-    motor = Motor(MotorParameters(stops_deg=(-50.0, 100.0)))
+    motor = Motor(stops_deg=(-50.0, 100.0))
     for _ in range(1000):
         motor.step(1e-3, 80, brake=False, battery_mv=7400)
     assert (motor.angle_deg, motor.speed_deg_s) == (100.0, 0.0)
 
 
 def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up() -> None:
-    motor = Motor(MotorParameters(play_deg=8.0))
+    motor = Motor(play_deg=8.0)
     for side in (1, -1):
         while side * motor.angle_deg < 100:
             motor.step(1e-3, 50 * side, brake=False, battery_mv=7400)
@@ -217,7 +214,7 @@ def test_the_brick_sleeps_unless_it_is_kept_awake(ask, clock, brick) -> None:
 
 
 def test_the_battery_sags_by_the_minute(clock: VirtualClock) -> None:
-    brick = Brick(clock, battery=Battery(7400, sag_mv_min=60))
+    brick = Brick(clock, full_mv=7400, sag_mv_min=60)
     clock.sleep(300.0)
     assert brick.battery_mv == 7100
     assert brick.answer(bytes.fromhex("00 0B")) == bytes.fromhex("02 0B 00 BC 1B")

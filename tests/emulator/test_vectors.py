@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from probewise.emulator import Brick, EmptyPort, VirtualClock
+from probewise.emulator import Brick, VirtualClock, empty_port
 from probewise.emulator.motors import OutputSetting
 from probewise.emulator.protocol import COMMANDS, FrameAssembler, framed
 
@@ -17,7 +17,7 @@ class Fixed:
     def __init__(self, counts: int) -> None:
         self.value = counts
 
-    def counts(self, *, lit: bool) -> int:
+    def __call__(self, lit: bool) -> int:
         return self.value
 
 
@@ -82,7 +82,7 @@ def test_input_values_are_laid_out_as_in_the_vectors(
     clock: VirtualClock, wait_s: float, kind: str, mode: str, counts: int, expected: str
 ) -> None:
     """512 counts: t = (512-200)*100//68 = 458, 1023 - 458 = 565, 55 %; 640 counts: 376, shown while invalid."""
-    brick = Brick(clock, sensors=[EmptyPort(), Fixed(counts), EmptyPort(), EmptyPort()])
+    brick = Brick(clock, sensors=[empty_port, Fixed(counts), empty_port, empty_port])
     brick.answer(bytes.fromhex("80 05 01 05 00"))
     clock.sleep(0.1)
     exchanged(brick, f"05 00 80 05 01 {kind} {mode}")

@@ -50,7 +50,7 @@ from probewise.inquiry import Readout
 from probewise.proof.concealed_study import (
     ConcealedTrial,
     _arm_in_concealed_world,
-    concealed_csv_rows,
+    concealed_rows,
     run_concealed_trial,
 )
 from probewise.proof.configurations import REFERENCE
@@ -487,11 +487,9 @@ def test_rows_of_the_study_are_summed_up():
         }
         for k in range(2)
     }
-    (row,) = concealed_csv_rows(runs)
-    assert row["sure_and_wrong"].startswith("0.50")
-    assert row["intervals_hold"].startswith("0.50")
-    assert row["in_credible_set"].startswith("1.00")
-    assert row["size"] == 6.0
+    (row,) = concealed_rows(runs)
+    assert (row.sure_and_wrong.value, row.intervals_hold.value, row.in_credible_set.value) == (0.5, 0.5, 1.0)
+    assert row.size == 6.0
 
 
 def test_a_memory_of_the_noise_is_heard():

@@ -10,10 +10,11 @@ import pytest
 from probewise.experiment import CLEAN, least_readings
 from probewise.proof import pages as report
 from probewise.proof import plots
-from probewise.proof.concealed_study import ConcealedTrial, concealed_forms, concealed_rows
+from probewise.proof.concealed_study import ConcealedTrial, concealed_rows
 from probewise.proof.configurations import REFERENCE, SearchConfiguration
-from probewise.proof.study import Study
-from probewise.proof.trial import experiment_of
+from probewise.proof.study import summaries
+from probewise.proof.trial import Trial, experiment_of
+from probewise.report.html import draw_or_raise
 
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
 
@@ -40,12 +41,12 @@ def trial(rng, mean):
 @pytest.fixture(scope="module")
 def study():
     rng = np.random.default_rng(0)
-    return Study({row: tuple(trial(rng, 10 * (k + 1)) for _ in range(30)) for k, row in enumerate(ROWS)}, 40)
+    return {Trial(row, n, 40): trial(rng, 10 * (k + 1)) for k, row in enumerate(ROWS) for n in range(30)}
 
 
 def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
-    page = report.study_html(study, command="probewise study")
-    needed = study.table()[REFERENCE].mean.value
+    page = report.study_page(study, command="probewise study").html(draw_or_raise)
+    needed = summaries(study)[REFERENCE].mean.value
     assert f"{needed:.1f}" in page.split("<figure>")[0]
     assert all(row.name in page for row in ROWS)
     assert "http" not in page
@@ -53,9 +54,9 @@ def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
 
 
 def test_the_csv_holds_every_number_and_its_bounds(study):
-    rows = list(csv.DictReader(io.StringIO(report.study_csv(study))))
+    rows = list(csv.DictReader(io.StringIO(report.study_csv(summaries(study)))))
     assert [row["row"] for row in rows] == [row.name for row in ROWS]
-    for row, summary in zip(rows, study.table().values(), strict=True):
+    for row, summary in zip(rows, summaries(study).values(), strict=True):
         assert float(row["mean"]) == pytest.approx(summary.mean.value, rel=1e-5)
         assert float(row["mean_low"]) < float(row["mean"]) < float(row["mean_high"])
         assert "cpu" not in ",".join(row)
@@ -64,7 +65,7 @@ def test_the_csv_holds_every_number_and_its_bounds(study):
 def test_the_bound_stands_beside_what_was_measured(study):
     """Bits over capacity, of the rows whose robot knows its sensor."""
     least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
-    shown = str(report.lower_bound_table(study))
+    shown = str(report.lower_bound_table(summaries(study)))
     assert f"{least.readings_of_search:.1f} = " in shown
     assert f"{least.readings_of_refinement:.1f} = " in shown
     assert ROWS[1].name not in shown
@@ -85,7 +86,7 @@ def test_each_curve_is_the_median_of_its_runs():
 
 
 def test_what_rows_need_is_drawn_with_its_bounds(study):
-    axes = plots.readings_needed({row.name: found for row, found in study.table().items()})
+    axes = plots.readings_needed({row.name: found for row, found in summaries(study).items()})
     assert [text.get_text() for text in axes[0, 0].get_yticklabels()] == [row.name for row in ROWS]
     assert len(axes[0, 0].containers) == 2
     low, high = sorted(axes[0, 0].get_ylim())
@@ -96,11 +97,11 @@ def test_what_rows_need_is_drawn_with_its_bounds(study):
 
 @pytest.mark.slow
 def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
-    one = Study({ROWS[1]: study.trials[ROWS[1]]}, 40)
-    page = report.study_html(one, command="probewise study --model naive")
+    one = {trial: result for trial, result in study.items() if trial.row == ROWS[1]}
+    page = report.study_page(one, command="probewise study --model naive").html(draw_or_raise)
     assert "<tbody></tbody>" not in page
     assert max(head.count("<th ") for head in page.split("<thead>")[1:]) <= 7
-    assert report.lower_bound_table(one) is None
+    assert report.lower_bound_table(summaries(one)) is None
 
 
 def concealed_runs():
@@ -118,11 +119,11 @@ def concealed_runs():
 
 
 def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
-    rows = concealed_rows(concealed_runs())
-    assert report.concealed_sentence(rows).startswith(
+    found = report.concealed_page(concealed_runs(), command="probewise study --concealed")
+    assert found.sentence.startswith(
         "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
     )
-    page = report.concealed_html(rows, command="probewise study --concealed")
+    page = found.html(draw_or_raise)
     assert "backlash (play) of the arm, 6" in page
     assert "0.00 | 1.00" in page
     assert "By form" not in page
@@ -131,7 +132,7 @@ def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
 def test_the_page_sums_up_what_was_concealed_by_form_where_there_are_several():
     runs = concealed_runs()
     runs |= {replace(trial, effect="bent_rail"): run for trial, run in runs.items() if trial.effect}
-    page = report.concealed_html(concealed_rows(runs), concealed_forms(runs), command="probewise study --concealed")
+    page = report.concealed_page(runs, command="probewise study --concealed").html(draw_or_raise)
     assert "By form" in page
     assert ">in the list<" in page
     assert ">in no list<" in page

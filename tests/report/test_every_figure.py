@@ -15,7 +15,7 @@ from probewise.priors import Product, Uniform
 from probewise.proof import plots as plots_of_campaigns
 from probewise.proof.concealed_study import ConcealedRow
 from probewise.proof.estimates import Estimate, estimated_share
-from probewise.proof.scoring import Bin
+from probewise.proof.tables import Bin
 from probewise.recordings import read_recording, shipped
 from probewise.report import plots
 from probewise.sensor import SSFField

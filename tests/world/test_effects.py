@@ -10,36 +10,8 @@ from scipy.special import ndtr
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane
 from probewise.world import Blob, World, gaussian_spot
-from probewise.world.concealed import (
-    AlbedoGradient,
-    AlbedoPatch,
-    AmbientGradient,
-    AmbientStep,
-    Backlash,
-    BatterySag,
-    EdgeBlur,
-    EdgeMisplacement,
-    EdgeShadow,
-    ExtraGaussian,
-    Flicker,
-    GainDrift,
-    Glint,
-    Halo,
-    HeightGradient,
-    HeightOffset,
-    Hysteresis,
-    Lag,
-    Nonlinearity,
-    OffsetDrift,
-    OrientationError,
-    PeriodicPositionError,
-    PositionScale,
-    Quantisation,
-    Saturation,
-    ScanAngleError,
-    ScanMisplacement,
-    SensorTilt,
-)
+from probewise.world import concealed as known
+from probewise.world import unlisted as strange
 
 CENTER, SD, RHO = (0.4, 1.5), (4.0, 2.5), 0.2
 SPOT = gaussian_spot([Blob(1.0, CENTER, SD, RHO)], pixel_mm=0.4)
@@ -85,26 +57,53 @@ def test_the_clean_reading_is_the_normal_integral(plan, clean):
 
 
 FORMULAS = {
-    "ambient_gradient": (AmbientGradient(0.01, -0.02), lambda y, p: y + 0.01 * p.x_mm - 0.02 * p.y_mm),
-    "ambient_step": (AmbientStep(2.0, 40.0), lambda y, p: y + np.where(p.time_s > 40, 2.0, 0.0)),
-    "offset_drift": (OffsetDrift(30.0), lambda y, p: y + 30 * p.time_s / 3600),
-    "gain_drift": (GainDrift(0.1, 50.0), lambda y, p: 10 + (y - 10) * (1 + 0.1 * np.exp(-p.time_s / 50))),
+    "ambient_gradient": (known.ambient_gradient(0.01, -0.02), lambda y, p: y + 0.01 * p.x_mm - 0.02 * p.y_mm),
+    "ambient_step": (known.ambient_step(2.0, 40.0), lambda y, p: y + np.where(p.time_s > 40, 2.0, 0.0)),
+    "offset_drift": (known.offset_drift(30.0), lambda y, p: y + 30 * p.time_s / 3600),
+    "gain_drift": (known.gain_drift(0.1, 50.0), lambda y, p: 10 + (y - 10) * (1 + 0.1 * np.exp(-p.time_s / 50))),
     "battery_sag": (
-        BatterySag(0.4),
+        known.battery_sag(0.4),
         lambda y, p: 10 + (y - 10) * (1 + 0.4 * (p.covariates["battery_mv"] - 8300) / 1000),
     ),
-    "flicker": (Flicker(1.5, 0.07, 0.3), lambda y, p: y + 1.5 * np.sin(2 * np.pi * 0.07 * p.time_s + 0.3)),
-    "saturation": (Saturation(45.0), lambda y, p: np.where(y > 45, 45.0, y)),
-    "nonlinearity": (Nonlinearity(1.3), lambda y, p: 10 + 50 * ((y - 10) / 50) ** 1.3),
+    "flicker": (known.flicker(1.5, 0.07, 0.3), lambda y, p: y + 1.5 * np.sin(2 * np.pi * 0.07 * p.time_s + 0.3)),
+    "saturation": (known.saturation(45.0), lambda y, p: np.where(y > 45, 45.0, y)),
+    "nonlinearity": (known.nonlinearity(1.3), lambda y, p: 10 + 50 * ((y - 10) / 50) ** 1.3),
     "hysteresis": (
-        Hysteresis(0.8),
+        known.hysteresis(0.8),
         lambda y, p: y + 0.8 * np.array([1.0, -1.0, 1.0, 1.0])[p.scan],
     ),
     "glint": (
-        Glint(3.0, 4.0, 1.0, 5.0),
+        known.glint(3.0, 4.0, 1.0, 5.0),
         lambda y, p: y + 3 * np.exp(-((p.x_mm - 4) ** 2 + (p.y_mm - 1) ** 2) / 50),
     ),
 }
+
+
+FORMULAS |= {
+    "thermal_gain": (
+        strange.thermal_gain(0.05, 200.0, (0.1, 1.0, 2.0)),
+        lambda y, p: 10 + (y - 10) * (1 + 0.05 * _waves(p.time_s, 200, (0.1, 1.0, 2.0))),
+    ),
+    "cross_talk": (
+        strange.cross_talk(0.1, 0.3),
+        lambda y, p: 10 + (y - 10) * (1 + 0.1 * np.cos(2 * p.orientation_rad + 0.3)),
+    ),
+    "floor": (strange.floor(0.2), lambda y, p: np.where(y - 10 < 0.2 * 50, 10.0, y)),
+    "peak_memory": (
+        strange.peak_memory(0.1),
+        lambda y, p: y + 0.1 * np.array([(y[: k + 1][p.scan[: k + 1] == p.scan[k]] - 10).max() for k in range(len(y))]),
+    ),
+    "gain_loss": (
+        strange.gain_loss(0.02, 2.0),
+        lambda y, p: 10 + (y - 10) * np.clip(1 - 0.01 * p.time_s, 0, None),
+    ),
+}
+
+
+def _waves(t, longest_s, phases):
+    """Waves with power in proportion to their period."""
+    each = [math.sqrt(1 / k) * np.cos(2 * math.pi * k * t / longest_s + phase) for k, phase in enumerate(phases, 1)]
+    return sum(each) * math.sqrt(2 / sum(1 / k for k in range(1, len(phases) + 1)))
 
 
 @pytest.mark.parametrize("name", FORMULAS)
@@ -115,14 +114,29 @@ def test_an_effect_on_the_reading_follows_its_formula(name, plan, clean):
 
 
 STANDS = {
-    "backlash": (Backlash(2.0), lambda p: places(p) - np.array([[1, 0], [-1, 0], [1, 0], [0, 1]])[p.scan]),
-    "position_scale": (PositionScale(0.1, -0.2), lambda p: places(p) * [1.1, 0.8]),
+    "backlash": (known.backlash(2.0), lambda p: places(p) - np.array([[1, 0], [-1, 0], [1, 0], [0, 1]])[p.scan]),
+    "position_scale": (known.position_scale(0.1, -0.2), lambda p: places(p) * [1.1, 0.8]),
     "periodic_position_error": (
-        PeriodicPositionError(0.5, 7.0, 0.4),
-        lambda p: places(p) + np.stack([0.5 * np.sin(2 * np.pi * p.x_mm / 7 + 0.4), 0 * p.x_mm], axis=-1),
+        known.periodic_position_error(0.5, 7.0, 0.4),
+        lambda p: _moved_along_x(p, 0.5 * np.sin(2 * np.pi * p.x_mm / 7 + 0.4)),
     ),
-    "sensor_tilt": (SensorTilt(0.6, -0.3), lambda p: places(p) + np.array([0.6, -0.3])),
+    "sensor_tilt": (known.sensor_tilt(0.6, -0.3), lambda p: places(p) + np.array([0.6, -0.3])),
+    "bent_rail": (strange.bent_rail(0.5), lambda p: _moved_along_x(p, 0.005 * p.x_mm**2)),
+    "twisted_rail": (strange.twisted_rail(0.5), lambda p: _moved_along_x(p, 0.0005 * p.x_mm**3)),
+    "place_step": (strange.place_step(0.5, 1.0), lambda p: _moved_along_x(p, np.where(p.x_mm > 1, 0.5, 0))),
+    "stick_slip": (
+        strange.stick_slip(0.5, 8.0, 0.25),
+        lambda p: _moved_along_x(p, np.mod(p.x_mm + 2, 8) / 8 - 0.5),
+    ),
+    "play_of_axes": (
+        strange.play_of_axes(2.0, 1.0),
+        lambda p: places(p) - np.array([[1, 0], [-1, 0], [1, 0], [0, 0.5]])[p.scan],
+    ),
 }
+
+
+def _moved_along_x(plan, by_mm):
+    return places(plan) + np.stack([by_mm, 0 * by_mm], axis=-1)
 
 
 @pytest.mark.parametrize("name", STANDS)
@@ -134,14 +148,14 @@ def test_an_effect_on_the_place_reads_what_a_right_arm_reads_there(name, plan):
 
 def test_a_tilt_shifts_what_is_seen_and_not_where_the_sensor_stands(plan, clean):
     """The ambient light is that of the sensor's own place."""
-    light = AmbientGradient(0.05, 0.0)
-    tilt = SensorTilt(0.6, -0.3)
+    light = known.ambient_gradient(0.05, 0.0)
+    tilt = known.sensor_tilt(0.6, -0.3)
     np.testing.assert_allclose(read(plan, tilt, light) - read(plan, tilt), 0.05 * plan.x_mm, atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("effect", "scans"),
-    [(ScanAngleError(25.0, ("back", "white")), (1, 2)), (OrientationError(25.0), (0, 1, 2, 3))],
+    [(known.scan_angle_error(25.0, ("back", "white")), (1, 2)), (known.orientation_error(25.0), (0, 1, 2, 3))],
 )
 def test_an_angle_error_reads_what_a_turned_sensor_reads(effect, scans, plan):
     turned = plan.orientation_rad + math.radians(25) * np.isin(plan.scan, scans)
@@ -156,14 +170,14 @@ def test_a_misplaced_edge_is_a_pattern_that_lies_elsewhere(plan):
         "disc": Disc((1.3 + 0.9, -0.4), 12.0),
     }
     expected = read(replace(plan, patterns=moved))
-    assert np.abs(read(plan, EdgeMisplacement(0.9)) - expected).max() < 1e-9
-    one = read(plan, ScanMisplacement(0.9, "back"))
+    assert np.abs(read(plan, known.edge_misplacement(0.9)) - expected).max() < 1e-9
+    one = read(plan, known.scan_misplacement(0.9, "back"))
     np.testing.assert_allclose(one, np.where(plan.scan == 1, expected, read(plan)), atol=1e-9)
 
 
 def test_lag_is_an_exponential_memory_within_the_scan(plan, clean):
     """Second route: the weights of all earlier readings, written out."""
-    got = read(plan, Lag(2.5))
+    got = read(plan, known.lag(2.5))
     for k in range(len(plan)):
         rows = np.flatnonzero((plan.scan == plan.scan[k]) & (np.arange(len(plan)) <= k))
         forgotten = 1 - np.exp(-np.diff(plan.time_s[rows]) / 2.5)
@@ -173,14 +187,14 @@ def test_lag_is_an_exponential_memory_within_the_scan(plan, clean):
 
 
 def test_a_soft_ceiling_is_approached_and_never_passed(plan, clean):
-    soft = read(plan, Saturation(45.0, softness=1.0))
+    soft = read(plan, known.saturation(45.0, softness=1.0))
     np.testing.assert_allclose(soft, 45 - np.log1p(np.exp(45 - clean)), atol=1e-9)
 
 
 def test_coarse_rounding_is_to_multiples_of_the_step(plan, clean):
-    got = World(SPOT, concealed=(Quantisation(3.0),)).simulate(plan, rng=None).readings
+    got = World(SPOT, concealed=(known.quantisation(3.0),)).simulate(plan, rng=None).readings
     np.testing.assert_allclose(got, 3 * np.round(clean / 3))
-    noisy = World(SPOT, concealed=(Quantisation(3.0),)).simulate(plan, rng=np.random.default_rng(1)).readings
+    noisy = World(SPOT, concealed=(known.quantisation(3.0),)).simulate(plan, rng=np.random.default_rng(1)).readings
     np.testing.assert_array_equal(noisy % 3, 0)
 
 
@@ -188,28 +202,28 @@ def test_a_blurred_edge_adds_its_variance(plan, clean):
     rows = on_boundary(plan)
     for sd_mm in (0.3, 3.0):
         expected = BLACK + SPAN * boundary(plan, more_variance=sd_mm**2)[rows]
-        np.testing.assert_allclose(read(plan, EdgeBlur(sd_mm))[rows], expected, atol=1e-3 * SPAN)
+        np.testing.assert_allclose(read(plan, known.edge_blur(sd_mm))[rows], expected, atol=1e-3 * SPAN)
 
 
 def test_a_halo_is_a_share_of_a_wide_gaussian_about_the_spots_middle(plan):
     rows = on_boundary(plan)
     skirt = boundary(plan, covariance=((225.0, 0.0), (0.0, 225.0)))
     expected = BLACK + SPAN * (0.8 * boundary(plan) + 0.2 * skirt)[rows]
-    np.testing.assert_allclose(read(plan, Halo(0.2, 15.0))[rows], expected, atol=1e-3 * SPAN)
+    np.testing.assert_allclose(read(plan, known.halo(0.2, 15.0))[rows], expected, atol=1e-3 * SPAN)
 
 
 def test_one_gaussian_more_is_a_share_of_it(plan):
     rows = on_boundary(plan)
     more = boundary(plan, center=(-3.0, 4.0), covariance=((4.0, 0.0), (0.0, 4.0)))
     expected = BLACK + SPAN * (0.7 * boundary(plan) + 0.3 * more)[rows]
-    np.testing.assert_allclose(read(plan, ExtraGaussian(0.3, -3.0, 4.0, 2.0))[rows], expected, atol=1e-3 * SPAN)
+    np.testing.assert_allclose(read(plan, known.ssf_order(0.3, -3.0, 4.0, 2.0))[rows], expected, atol=1e-3 * SPAN)
 
 
 @pytest.mark.parametrize(
     ("effect", "height"),
     [
-        (HeightGradient(0.05), lambda p: 14 + 0.05 * p.x_mm),
-        (HeightOffset(-3.0, ("out",)), lambda p: np.where(p.scan == 0, 11.0, 14.0)),
+        (known.height_gradient(0.05), lambda p: 14 + 0.05 * p.x_mm),
+        (known.height_offset(-3.0, ("out",)), lambda p: np.where(p.scan == 0, 11.0, 14.0)),
     ],
 )
 def test_height_scales_the_footprint_and_dims_by_the_inverse_square(effect, height, plan):
@@ -221,7 +235,9 @@ def test_height_scales_the_footprint_and_dims_by_the_inverse_square(effect, heig
     np.testing.assert_allclose(got[white], BLACK + SPAN / scale[white] ** 2, atol=1e-9)
 
 
-@pytest.mark.parametrize("effect", [HeightGradient(0.05), HeightOffset(2.0, ("out",)), SensorTilt(0.7, -0.4)])
+@pytest.mark.parametrize(
+    "effect", [known.height_gradient(0.05), known.height_offset(2.0, ("out",)), known.sensor_tilt(0.7, -0.4)]
+)
 def test_a_plan_that_commands_heights_is_read_as_the_arm_reads_at_them(effect, plan):
     """Row by row through `World.read`; a row without a height, or without a state of the LED, is as usual."""
     rows = np.array([3, 20, 31, 44])
@@ -229,9 +245,9 @@ def test_a_plan_that_commands_heights_is_read_as_the_arm_reads_at_them(effect, p
     heights, led = np.array([9.0, np.nan, 20.0, 25.0]), np.array([1.0, 1.0, np.nan, 0.5])
     commanded = replace(plan, covariates={"height_mm": heights, "led": led})
     world = World(SPOT, black=BLACK, white=BLACK + SPAN, concealed=(effect,))
-    if isinstance(effect, HeightOffset):
+    if effect.name == "height_offset":
         # A single reading belongs to a scan without a name.
-        world = replace(world, concealed=(HeightOffset(2.0, ("", *plan.scan_names)),))
+        world = replace(world, concealed=(known.height_offset(2.0, ("", *plan.scan_names)),))
     alone = [
         world.read(
             plan.patterns[plan.pattern_names[plan.pattern[k]]],
@@ -253,12 +269,12 @@ def test_a_tilt_moves_the_spot_of_a_raised_sensor_farther(plan):
     """At twice the height by twice as much: as a pattern that is moved back by that."""
     raised = replace(plan, covariates={"height_mm": np.full(len(plan), 28.0)})
     shifted = replace(raised, x_mm=plan.x_mm + 2 * 0.7, y_mm=plan.y_mm - 2 * 0.4)
-    np.testing.assert_allclose(read(raised, SensorTilt(0.7, -0.4)), read(shifted), atol=1e-9)
+    np.testing.assert_allclose(read(raised, known.sensor_tilt(0.7, -0.4)), read(shifted), atol=1e-9)
 
 
 def test_a_sensor_on_the_table_is_refused(plan):
     with pytest.raises(ParameterError, match="height_mm"):
-        read(plan, HeightOffset(-14.0, ("out",)))
+        read(plan, known.height_offset(-14.0, ("out",)))
 
 
 def middle(plan):
@@ -269,7 +285,7 @@ def middle(plan):
 
 def test_a_gradient_of_albedo_shows_its_value_at_the_spots_middle_on_white(plan):
     white = plan.pattern == 1
-    got = read(plan, AlbedoGradient(0.01, 0.02))[white]
+    got = read(plan, known.albedo_gradient(0.01, 0.02))[white]
     np.testing.assert_allclose(got, BLACK + SPAN * (1 + middle(plan)[white] @ [0.01, 0.02]), atol=1e-3 * SPAN)
 
 
@@ -282,13 +298,13 @@ def test_a_gradient_of_albedo_weights_the_seen_half_of_a_boundary(plan):
     sd = np.sqrt(SD[0] ** 2 * c**2 + SD[1] ** 2 * s**2 + 2 * RHO * SD[0] * SD[1] * c * s)
     z = (mean - 0.7) / sd
     beyond = mean * ndtr(z) + sd * np.exp(-(z**2) / 2) / math.sqrt(2 * math.pi)
-    got = read(straight, AlbedoGradient(k, 0.0))
+    got = read(straight, known.albedo_gradient(k, 0.0))
     np.testing.assert_allclose(got[rows], (BLACK + SPAN * (ndtr(z) + k * beyond))[rows], atol=1e-3 * SPAN)
 
 
 def test_a_patch_is_seen_through_the_spot(plan, clean):
     """Two Gaussians convolved: covariances add."""
-    effect = AlbedoPatch(-0.3, 2.0, 1.0, 5.0)
+    effect = known.albedo_patch(-0.3, 2.0, 1.0, 5.0)
     c, s = np.cos(plan.orientation_rad), np.sin(plan.orientation_rad)
     turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     own = np.array([[SD[0] ** 2, RHO * SD[0] * SD[1]], [RHO * SD[0] * SD[1], SD[1] ** 2]])
@@ -304,16 +320,51 @@ def test_an_edge_casts_its_shadow_by_the_distance_of_the_sensor(plan, clean):
     rim = np.hypot(plan.x_mm - 1.3, plan.y_mm + 0.4) - 12
     distance = np.where(plan.pattern == 0, along, np.where(plan.pattern == 1, np.inf, rim))
     expected = clean - SPAN * 0.1 * np.exp(-(distance**2) / (2 * 9))
-    np.testing.assert_allclose(read(plan, EdgeShadow(0.1, 3.0)), expected, atol=1e-9)
+    np.testing.assert_allclose(read(plan, known.edge_shadow(0.1, 3.0)), expected, atol=1e-9)
 
 
 def test_a_shadow_moves_with_the_edge(plan):
     """The edge of the real pattern and the sensor's real place."""
-    both = read(plan, EdgeMisplacement(0.9), EdgeShadow(0.1, 3.0))
+    both = read(plan, known.edge_misplacement(0.9), known.edge_shadow(0.1, 3.0))
     moved = {**plan.patterns, "boundary": HalfPlane(0.1, 1.6), "disc": Disc((2.2, -0.4), 12.0)}
-    np.testing.assert_allclose(both, read(replace(plan, patterns=moved), EdgeShadow(0.1, 3.0)), atol=1e-9)
+    np.testing.assert_allclose(both, read(replace(plan, patterns=moved), known.edge_shadow(0.1, 3.0)), atol=1e-9)
 
 
 def test_a_sagging_battery_needs_its_voltage(plan):
     with pytest.raises(ParameterError, match="battery_mv"):
-        read(replace(plan, covariates={}), BatterySag(0.4))
+        read(replace(plan, covariates={}), known.battery_sag(0.4))
+
+
+def test_slipped_paper_lies_elsewhere_from_then_on(plan, clean):
+    at_s = float(plan.time_s[30])
+    moved = read(replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(0.1, 1.5)}))
+    got = read(plan, strange.slipped_paper(0.8, at_s))
+    boundary = plan.pattern == 0
+    expected = np.where(plan.time_s > at_s, moved, clean)
+    np.testing.assert_allclose(got[boundary], expected[boundary], atol=1e-9)
+
+
+def test_a_ghost_is_a_faint_second_look_from_elsewhere(plan, clean):
+    beside = read(replace(plan, x_mm=plan.x_mm + 6.0, y_mm=plan.y_mm - 2.0))
+    np.testing.assert_allclose(read(plan, strange.ghost(0.1, 6.0, -2.0)), 0.9 * clean + 0.1 * beside, atol=1e-9)
+
+
+def test_each_rise_is_followed_by_a_pulse_that_dies_off(plan, clean):
+    got = read(plan, strange.after_glow(4.0, 6.0, 35.0))
+    expected = clean.copy()
+    for k in range(1, len(plan)):
+        if clean[k - 1] <= 35 < clean[k]:
+            later = np.arange(len(plan)) >= k
+            expected[later] += 4 * np.exp(-(plan.time_s[later] - plan.time_s[k]) / 6)
+    assert np.abs(expected - clean).max() >= 4
+    np.testing.assert_allclose(got, expected)
+
+
+def test_a_chirp_swings_ever_faster(plan, clean):
+    """The phase is the integral of the frequency: summed up in small steps."""
+    effect = strange.chirp(2.0, 0.01, 0.0005, 0.4)
+    fine = np.linspace(0, plan.time_s[-1], 200_001)
+    hz = 0.01 + 0.0005 * fine
+    turns = np.concatenate([[0.0], np.cumsum((hz[1:] + hz[:-1]) / 2 * np.diff(fine))])
+    phase = 2 * math.pi * np.interp(plan.time_s, fine, turns) + 0.4
+    np.testing.assert_allclose(read(plan, effect) - clean, 2 * np.sin(phase), atol=1e-5)

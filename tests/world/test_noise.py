@@ -9,14 +9,7 @@ from scipy.stats import kstest, norm, t
 from probewise.proof.sensors.sensors import OTHER_NOISE, with_noise_model
 from probewise.recordings import Plan, Ramp
 from probewise.world import World, gaussian_spot
-from probewise.world.concealed import (
-    CorrelatedNoise,
-    Dropouts,
-    HeavyTails,
-    Outliers,
-    RisingNoiseSd,
-    SignalDependentNoise,
-)
+from probewise.world import concealed as known
 from probewise.world.spots import Blob
 
 N, N_SCANS = 20_000, 20
@@ -59,7 +52,7 @@ def test_noise_is_white_and_normal(noise):
 
 
 def test_correlated_noise_remembers_within_a_scan_and_keeps_its_sd(noise, ramp):
-    z = noise(CorrelatedNoise(0.5))
+    z = noise(known.correlated_noise(0.5))
     within = ramp.scan[1:] == ramp.scan[:-1]
     assert abs(z.var() - 1) < 4 * math.sqrt(2 / N * 1.25 / 0.75)
     assert abs(np.mean((z[1:] * z[:-1])[within]) - 0.5) < 4 * math.sqrt(3 / N)
@@ -67,13 +60,13 @@ def test_correlated_noise_remembers_within_a_scan_and_keeps_its_sd(noise, ramp):
 
 
 def test_signal_dependent_noise_has_a_variance_in_proportion(noise, ramp):
-    z = noise(SignalDependentNoise(3.0)) / np.sqrt(1 + 3 * 0.01 * ramp.x_mm)
+    z = noise(known.signal_dependent_noise(3.0)) / np.sqrt(1 + 3 * 0.01 * ramp.x_mm)
     for part in np.split(z[np.argsort(ramp.x_mm)], 4):
         assert abs(part.var() - 1) < 4 * math.sqrt(2 / len(part))
 
 
 def test_drifting_noise_grows_to_its_factor_and_stays(noise, ramp):
-    z = noise(RisingNoiseSd(2.0, N / 2))
+    z = noise(known.drifting_noise(2.0, N / 2))
     late = z[ramp.time_s > N / 2]
     assert abs(late.std() / 2 - 1) < 4 / math.sqrt(2 * len(late))
     early = z[:1000] / (1 + ramp.time_s[:1000] / (N / 2))
@@ -81,26 +74,26 @@ def test_drifting_noise_grows_to_its_factor_and_stays(noise, ramp):
 
 
 def test_heavy_tails_are_student_t_of_the_same_sd(noise):
-    z = noise(HeavyTails(4.0))
+    z = noise(known.heavy_tails(4.0))
     assert kstest(z * math.sqrt(2), t(4).cdf).pvalue > 1e-4
 
 
 def test_outliers_come_in_their_share_and_size(noise):
     """Beyond 4 sd there is next to nothing but outliers."""
-    z = noise(Outliers(0.02, 10.0))
+    z = noise(known.outliers(0.02, 10.0))
     expected = 0.02 * 2 * norm.sf(4, scale=math.sqrt(101)) + 0.98 * 2 * norm.sf(4)
     assert abs(np.mean(np.abs(z) > 4) - expected) < 4 * math.sqrt(expected / N)
     assert abs(z.var() - 3) < 4 * math.sqrt((3 * (0.98 + 0.02 * 101**2) - 9) / N)
 
 
 def test_dropouts_are_lost_to_one_value(ramp):
-    world = World(SPOT, concealed=(Dropouts(0.03, -1.0),))
+    world = World(SPOT, concealed=(known.dropouts(0.03, -1.0),))
     lost = world.simulate(ramp, rng=np.random.default_rng(5)).readings == -1
     assert abs(lost.mean() - 0.03) < 4 * math.sqrt(0.03 / N)
 
 
 def test_without_a_generator_there_is_no_noise_and_nothing_is_lost(ramp):
-    world = World(SPOT, concealed=(Dropouts(0.5, -1.0), Outliers(0.5, 10.0)))
+    world = World(SPOT, concealed=(known.dropouts(0.5, -1.0), known.outliers(0.5, 10.0)))
     np.testing.assert_array_equal(world.simulate(ramp, rng=None).readings, world.expected_readings(ramp))
 
 

@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.proof.sensors.effects import CleanSetup
-from probewise.proof.sensors.sizing import EffectSizer, amplitude_of_size, noise_effect_size
+from probewise.proof.sensors.effects import CleanSetup, EffectSizer, amplitude_of_size, noise_effect_size
 from probewise.world import World, gaussian_spot
-from probewise.world.concealed import (
-    AmbientGradient,
-    CorrelatedNoise,
-    Dropouts,
-    GainDrift,
-    HeavyTails,
-    Outliers,
-    Saturation,
-    SignalDependentNoise,
-)
+from probewise.world import concealed as known
 from probewise.world.spots import Blob
 
 SPOT = gaussian_spot([Blob(1.0, (0.4, 1.5), (3.0, 2.0), 0.2)], pixel_mm=0.5)
@@ -75,7 +65,11 @@ def test_an_effect_that_is_too_small_at_its_limit_is_refused():
 
 @pytest.mark.parametrize(
     "of",
-    [lambda a: AmbientGradient(a, 0.3 * a), lambda a: Saturation(60 - 50 * a), lambda a: GainDrift(a, 60.0)],
+    [
+        lambda a: known.ambient_gradient(a, 0.3 * a),
+        lambda a: known.saturation(60 - 50 * a),
+        lambda a: known.gain_drift(a, 60.0),
+    ],
     ids=["ambient_gradient", "saturation", "gain_drift"],
 )
 def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
@@ -87,7 +81,7 @@ def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
 
 
 def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
-    one, other = AmbientGradient(0.1, 0.0), GainDrift(0.1, 60.0)
+    one, other = known.ambient_gradient(0.1, 0.0), known.gain_drift(0.1, 60.0)
     clean = sizer.clean_recording.readings
     design = np.stack([np.ones(len(plan)), clean], axis=-1)
     rests = [
@@ -100,36 +94,38 @@ def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
 
 
 @pytest.mark.parametrize(
-    "effect", [CorrelatedNoise(0.5), SignalDependentNoise(3.0), Outliers(0.04, 8.0)], ids=lambda e: e.name
+    "effect",
+    [known.correlated_noise(0.5), known.signal_dependent_noise(3.0), known.outliers(0.04, 8.0)],
+    ids=lambda e: e.name,
 )
 def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, plan, sizer):
     """Second route: simulate, and take the mean of the log ratio of the two densities."""
     view = World(SPOT).view(plan)
-    rng, n, rows = np.random.default_rng(4), len(plan), view.rows
-    z = np.stack([effect.disturb(rng.standard_normal(n), rows, view.seen, rng) for _ in range(3000)])
+    rng, n, rows, known = np.random.default_rng(4), len(plan), view.rows, effect.parameters
+    z = np.stack([effect.act(rng.standard_normal(n), rows, view.seen, rng) for _ in range(3000)])
 
     def log_normal(z, variance):
         return -0.5 * (np.log(2 * np.pi * variance) + z**2 / variance)
 
     even = log_normal(z, np.mean(z**2))
-    if isinstance(effect, CorrelatedNoise):
+    if effect.name == "correlated_noise":
         before = np.where(rows.scan_start_mask(), 0.0, np.roll(z, 1, axis=1))
-        fresh = np.where(rows.scan_start_mask(), 1.0, 1 - effect.rho**2)
-        true = log_normal(z - effect.rho * before, fresh)
-    elif isinstance(effect, SignalDependentNoise):
-        true = log_normal(z, 1 + effect.ratio * view.seen)
+        fresh = np.where(rows.scan_start_mask(), 1.0, 1 - known["rho"] ** 2)
+        true = log_normal(z - known["rho"] * before, fresh)
+    elif effect.name == "signal_dependent_noise":
+        true = log_normal(z, 1 + known["ratio"] * view.seen)
     else:
-        wide = np.exp(log_normal(z, 1 + effect.size**2))
-        true = np.log((1 - effect.share) * np.exp(log_normal(z, 1.0)) + effect.share * wide)
+        wide = np.exp(log_normal(z, 1 + known["size"] ** 2))
+        true = np.log((1 - known["share"]) * np.exp(log_normal(z, 1.0)) + known["share"] * wide)
     gained = (true - even).sum(axis=1)
     assert abs(sizer.size(effect) ** 2 / 2 - gained.mean()) < 4 * gained.std() / math.sqrt(3000) + 0.02
 
 
 def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
     clean = sizer.clean_recording.readings
-    assert sizer.size(Dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
+    assert sizer.size(known.dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
 
 
 def test_noise_without_a_name_has_no_size(plan):
     with pytest.raises(ParameterError, match="vocabulary"):
-        noise_effect_size(HeavyTails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)
+        noise_effect_size(known.heavy_tails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)

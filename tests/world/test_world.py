@@ -1,26 +1,18 @@
 """Readings, noise, and each concealed effect against its formula in the vocabulary."""
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
 import pytest
 
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Uniform, paper_plan, two_way_plan
 from probewise.world import (
-    AmbientGradient,
-    Backlash,
     Blob,
-    CorrelatedNoise,
-    GainDrift,
-    Nonlinearity,
-    Saturation,
     World,
     gaussian_spot,
     simulate,
 )
-from probewise.world.concealed import AlbedoPatch, EdgeShadow, Halo, HeightGradient, SensorTilt
+from probewise.world import concealed as known
+from probewise.world.stages import acts_at
 
 SPOT = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)], pixel_mm=0.5)
 PLAN = two_way_plan()
@@ -59,15 +51,15 @@ def test_the_shift_of_the_spot_parts_90_from_270_degrees(clean):
 
 def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
     effects = world(
-        Backlash(1.0),
-        AlbedoPatch(-0.2, 3.0, 1.0, 6.0),
-        HeightGradient(0.01),
-        SensorTilt(0.5, 0.2),
-        Halo(0.1, 15.0),
-        EdgeShadow(0.05, 4.0),
-        GainDrift(0.1, 300.0),
-        AmbientGradient(0.01, 0.02),
-        Saturation(50.0),
+        known.backlash(1.0),
+        known.albedo_patch(-0.2, 3.0, 1.0, 6.0),
+        known.height_gradient(0.01),
+        known.sensor_tilt(0.5, 0.2),
+        known.halo(0.1, 15.0),
+        known.edge_shadow(0.05, 4.0),
+        known.gain_drift(0.1, 300.0),
+        known.ambient_gradient(0.01, 0.02),
+        known.saturation(50.0),
     )
     together = effects.expected_readings(PLAN)
     for k in range(0, len(PLAN), 53):
@@ -83,102 +75,38 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
         assert alone == pytest.approx(together[k], abs=1e-9)
 
 
-def test_noise_is_white_with_the_sd_asked_for(clean):
-    noise = simulate(PLAN, world(noise_sd=0.6), rng=np.random.default_rng(2)).readings - clean
-    z = noise / 0.6
-    n = len(z)
-    # 4 sigma: a right program fails less than once in 10 000.
-    assert abs(z.mean()) < 4 / np.sqrt(n)
-    assert abs(z.var() - 1) < 4 * np.sqrt(2 / n)
-    assert abs(np.mean(z[1:] * z[:-1])) < 4 / np.sqrt(n)
-
-
-def test_a_seed_gives_the_same_recording_again():
-    one, two = (simulate(paper_plan(), world(), rng=np.random.default_rng(7)).readings for _ in range(2))
-    np.testing.assert_array_equal(one, two)
-
-
 def test_readings_are_rounded_to_the_step():
     readings = simulate(paper_plan(), world(step=0.5), rng=np.random.default_rng(7)).readings
     np.testing.assert_array_equal(readings * 2, np.round(readings * 2))
 
 
-def test_backlash_shifts_the_ways_out_and_back_apart():
-    """Vocabulary: position - (width/2) direction, so the two ways differ by the width."""
-    expected = world(Backlash(2.0)).expected_readings(PLAN)
-    at = {}
-    for way in ("out", "back"):
-        rows = PLAN.rows_by_scan()[PLAN.scan_names.index(f"edge_0_{way}")]
-        order = np.argsort(expected[rows])
-        at[way] = np.interp(35, expected[rows][order], PLAN.x_mm[rows][order])
-    assert at["out"] - at["back"] == pytest.approx(2.0, abs=0.02)
-
-
-def test_gain_drift_scales_the_signal_and_never_the_dark(clean):
-    got = world(GainDrift(0.1, 300.0)).expected_readings(PLAN)
-    np.testing.assert_allclose(got - 10, (clean - 10) * (1 + 0.1 * np.exp(-PLAN.time_s / 300)), atol=1e-12)
-
-
-def test_an_ambient_gradient_is_a_plane_on_top(clean):
-    got = world(AmbientGradient(0.01, -0.02)).expected_readings(PLAN)
-    np.testing.assert_allclose(got - clean, 0.01 * PLAN.x_mm - 0.02 * PLAN.y_mm, atol=1e-12)
-
-
-def test_saturation_cuts_and_soft_saturation_bends(clean):
-    np.testing.assert_array_equal(world(Saturation(50.0)).expected_readings(PLAN), np.minimum(clean, 50))
-    soft = world(Saturation(50.0, softness=1.0)).expected_readings(PLAN)
-    assert soft.max() < 50
-    np.testing.assert_allclose(soft[clean < 20], clean[clean < 20], atol=1e-6)
-    np.testing.assert_allclose(
-        world(Saturation(50.0, softness=1e-3)).expected_readings(PLAN), np.minimum(clean, 50), atol=1e-3
-    )
-
-
-def test_nonlinearity_is_a_power_of_the_seen_fraction(clean):
-    got = world(Nonlinearity(1.2)).expected_readings(PLAN)
-    np.testing.assert_allclose((got - 10) / 50, ((clean - 10) / 50) ** 1.2, rtol=1e-9, atol=1e-12)
-
-
-def test_correlated_noise_is_ar1_within_a_scan_and_keeps_its_sd(clean):
-    rho, n_runs = 0.5, 2
-    effect = world(CorrelatedNoise(rho), noise_sd=1.0)
-    z = np.stack([effect.simulate(PLAN, rng=np.random.default_rng(s)).readings - clean for s in range(n_runs)])
-    within = PLAN.scan[1:] == PLAN.scan[:-1]
-    products = z[:, 1:] * z[:, :-1]
-    n = n_runs * len(PLAN)
-    assert abs(z.var() - 1) < 4 * np.sqrt(2 / n * (1 + rho**2) / (1 - rho**2))
-    assert abs(products[:, within].mean() - rho) < 4 * np.sqrt(1.5 / n * 3)
-    assert abs(products[:, ~within].mean()) < 4 / np.sqrt(products[:, ~within].size)
-
-
 def test_effects_stack_in_the_order_of_the_chain_whatever_their_order_in_the_list():
-    effects = (Saturation(45.0), AmbientGradient(0.02, 0.0), GainDrift(0.1, 300.0), Nonlinearity(1.1), Backlash(1.0))
+    effects = (
+        known.saturation(45.0),
+        known.ambient_gradient(0.02, 0.0),
+        known.gain_drift(0.1, 300.0),
+        known.nonlinearity(1.1),
+        known.backlash(1.0),
+    )
     np.testing.assert_array_equal(
         world(*effects).expected_readings(PLAN), world(*effects[::-1]).expected_readings(PLAN)
     )
     assert world(*effects).expected_readings(PLAN).max() == 45
 
 
-def test_an_effect_of_ones_own_is_one_short_class(clean):
-    @dataclass(frozen=True)
-    class Step:
-        name: ClassVar[str] = "ambient_step"
-        stage: ClassVar = "offset"
+def test_an_effect_of_ones_own_is_one_short_function(clean):
+    @acts_at("offset")
+    def step(at_s):
+        return lambda values, rows: values + (rows.time_s > at_s)
 
-        def change(self, values, rows):
-            return values + (rows.time_s > 100)
-
-    np.testing.assert_allclose(world(Step()).expected_readings(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
+    assert step(100).name == "step"
+    np.testing.assert_allclose(world(step(100)).expected_readings(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
 
 
 def test_an_effect_at_no_known_stage_is_refused():
-    @dataclass(frozen=True)
-    class Lost:
-        name: ClassVar[str] = "lost"
-        stage: ClassVar = "somewhere"
-
-    with pytest.raises(ParameterError, match=r"lost\.stage"):
-        world(Lost())
+    lost = acts_at("somewhere")(lambda: None)()
+    with pytest.raises(ParameterError, match=r"stage"):
+        world(lost)
 
 
 def test_what_lies_there_can_differ_from_what_the_plan_says():

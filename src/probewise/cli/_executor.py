@@ -9,21 +9,25 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from probewise._signals import reporting_what_is_kept
-from probewise.cli._common import add, count_up_to, message_to_resume
+from probewise._writing import Drawings
+from probewise.cli._common import add, count_up_to, finish, message_to_resume
 from probewise.errors import DoubtfulResultWarning, LinkError
-from probewise.progress import Progress
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
 
+    from probewise.proof.campaign import Campaign, Keyed, Result
+    from probewise.proof.pages import CampaignPage
 
+K = TypeVar("K", bound="Keyed")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -41,33 +45,45 @@ def open_executor(arguments: argparse.Namespace) -> AbstractContextManager[Execu
     return worker_pool(arguments.workers) if arguments.workers > 1 else contextlib.nullcontext()
 
 
-@contextlib.contextmanager
-def executor_and_progress(
-    path: Path, noun: str, arguments: argparse.Namespace
-) -> Iterator[tuple[Executor | None, Progress]]:
-    """Yield a campaign's executor, None for this process, and its progress function.
+def run_and_report(
+    campaign: Campaign[K],
+    page_of: Callable[[dict[K, Result]], CampaignPage],
+    arguments: argparse.Namespace,
+    file: str,
+    table: str = "table.csv",
+    said: str = "",
+) -> int:
+    """Run what a campaign's `file` in --out lacks; write its table and report; return the exit status.
 
-    If the block is interrupted, the message says what the campaign's file, `path`, holds.
+    If it is interrupted, the message says what the file holds. The last line printed begins with `said`.
     """
     from probewise._progress import progress_shown
 
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    kept = partial(_message_to_resume_campaign, out / file, campaign.noun.removesuffix("s"), arguments)
     with (
-        reporting_what_is_kept(lambda: message_to_resume_campaign(path, noun, arguments)),
+        reporting_what_is_kept(kept),
         progress_shown(quiet=arguments.quiet) as progress,
         open_executor(arguments) as executor,
     ):
-        yield executor, progress
+        results = campaign.run(path=out / file, executor=executor, progress=progress)
+    drawings = Drawings(out)
+    with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
+        page = page_of(results)
+        drawings.write_results(
+            lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw), progress=progress
+        )
+    return finish(drawings, page.sentence, f"{said}written to {out}", quiet=arguments.quiet)
 
 
-def message_to_resume_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
+def _message_to_resume_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
     """Return a message: how many finished tasks a campaign's file holds, and the command that resumes it."""
     from probewise.proof.campaign import read_campaign
 
-    return (
-        message_to_resume(path, len(read_campaign(path).results), noun, arguments)
-        if path.exists()
-        else "nothing was written"
-    )
+    if not path.exists():
+        return "nothing was written"
+    return message_to_resume(path, len(read_campaign(path).results), noun, arguments)
 
 
 @contextlib.contextmanager

@@ -6,10 +6,9 @@ import argparse
 import shlex
 from functools import partial
 
-from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import CommandError, add, add_out, add_seed_and_quiet, finish, parse_count
-from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
+from probewise._writing import checked_output_directory
+from probewise.cli._common import CommandError, add, add_out, add_seed_and_quiet, parse_count
+from probewise.cli._executor import add_executor, run_and_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,48 +32,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge; write its table and report; return the exit status."""
-    from probewise._progress import progress_shown
-    from probewise.proof import pages
-    from probewise.proof.challenge import RunCaseInRounds, run_case, run_challenge
-    from probewise.proof.system_challenge import run_system_case
-    from probewise.proof.tables import score, score_rounds, score_systems
+    from probewise.proof import pages, tables
+    from probewise.proof.challenge import challenge, run_case, run_system_case
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")
-    out = checked_output_directory(arguments.out, "cases.jsonl")
-    out.mkdir(parents=True, exist_ok=True)
-    work, scored, of = run_case, score, ""
+    checked_output_directory(arguments.out, "cases.jsonl")
+    work, score, of, options = partial(run_case, rounds=arguments.rounds), tables.score, "", list[str]()
     if arguments.systems:
-        work, scored, of = run_system_case, score_systems, "systems"
+        work, score, of, options = partial(run_system_case), tables.score_systems, "systems", ["--systems"]
     elif arguments.rounds > 1:
-        work, scored, of = RunCaseInRounds(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
-    cases = out / "cases.jsonl"
-    kept = partial(message_to_resume_campaign, cases, "case", arguments)
-    with executor_and_progress(cases, "case", arguments) as (executor, progress):
-        results = run_challenge(
-            range(arguments.cases),
-            seed=arguments.seed,
-            work=work,
-            of=of,
-            path=cases,
-            executor=executor,
-            progress=progress,
-        )
-    rows = scored(results)
-    options = ["--systems"] if arguments.systems else []
-    options += ["--rounds", str(arguments.rounds)] if arguments.rounds > 1 else []
-    command = shlex.join(
-        ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
+        score, of, options = tables.score_rounds, f"{arguments.rounds} rounds", ["--rounds", str(arguments.rounds)]
+    words = ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
+    command = shlex.join(words)
+    return run_and_report(
+        challenge(range(arguments.cases), seed=arguments.seed, work=work, of=of),
+        lambda found: pages.challenge_page([*found.values()], score, command=command, systems=arguments.systems),
+        arguments,
+        "cases.jsonl",
+        said=f"seed {arguments.seed}; ",
     )
-    drawings = Drawings(out)
-    with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
-        drawings.write_results(
-            lambda stage: stage.write("table.csv", pages.challenge_csv(rows)),
-            {},
-            lambda _: pages.challenge_html(
-                results, rows, command=command, systems=arguments.systems, draw=drawings.draw
-            ),
-            progress=progress,
-        )
-    summary = pages.challenge_sentence(rows, len(results))
-    return finish(drawings, summary, f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)

@@ -233,12 +233,12 @@ def search(
     from probewise.experiment import Exploration, HiddenShape, arm_over, experiment_for, explore, run_from_place
     from probewise.report.demo import SATURATION
     from probewise.scene import Field
-    from probewise.world import Saturation
+    from probewise.world import saturation
     from probewise.world.shipped import true_world as world_behind
 
     field, world, circle = Field(), world_behind("paper"), hypothesised_circle()
     if saturating:
-        world = replace(world, concealed=(Saturation(SATURATION),))
+        world = replace(world, concealed=(saturation(SATURATION),))
     experiment = experiment_for(sensor, circle, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
     with arm_over(world, HiddenShape("circle", circle, np.array(truth)).surface, field, seed=seed) as arm:

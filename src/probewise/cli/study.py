@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Iterable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import MOST_BATCH, add, add_out, add_quiet, count_up_to, finish, parse_count, parse_seed
-from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
+from probewise._writing import checked_output_directory
+from probewise.cli._common import MOST_BATCH, add, add_out, add_quiet, count_up_to, parse_count, parse_seed
+from probewise.cli._executor import add_executor, run_and_report
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from probewise.proof.configurations import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 MOST_CIRCLES = 10_000  # as of `probewise.proof.study`, which takes a second to import
+_OF_CONCEALED = ("clean", "seed", "size", "varied")
 _SIZES = ("small", "plain", "gross")
 
 
@@ -63,82 +62,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
-    from probewise._progress import progress_shown
     from probewise.proof import pages
-    from probewise.proof.study import run_study
+    from probewise.proof.concealed_study import concealed_study
+    from probewise.proof.study import study
 
-    out = checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
+    checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
+    command = _command_line(arguments)
     if arguments.concealed:
-        return _run_concealed(arguments, out)
-    for name in ("seed", "size", "clean", "varied"):
-        if getattr(arguments, name) not in (None, False):
-            raise ParameterError(f"--{name}", getattr(arguments, name), "only with --concealed")
-    rows = _configuration_rows(arguments)
-    numbers = dict.fromkeys(rows, arguments.circles)
-    numbers[rows[0]] = arguments.quoted or arguments.circles
-    if max(numbers.values()) < 2:
-        raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
-    out.mkdir(parents=True, exist_ok=True)
-    trials = out / "trials.jsonl"
-    kept = partial(message_to_resume_campaign, trials, "run", arguments)
-    with executor_and_progress(trials, "run", arguments) as (executor, progress):
-        study = run_study(
-            numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
-        )
-    drawings = Drawings(out)
-    with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
-        drawings.write_results(
-            lambda stage: stage.write("table.csv", pages.study_csv(study)),
-            {},
-            lambda _: pages.study_html(study, command=_command_line(arguments), draw=drawings.draw),
-            progress=progress,
-        )
-    return finish(drawings, pages.study_sentence(study), f"written to {out}", quiet=arguments.quiet)
-
-
-def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
-    """Run the remaining tasks of the study of concealed effects; write its table and report; return the exit status."""
-    from probewise.proof import pages
-    from probewise.proof.concealed_study import concealed_csv_rows, concealed_forms, concealed_rows, run_concealed
-    from probewise.recordings.table import csv_text_of_rows
-
-    others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
-    others += ["--beside-paper"] if arguments.beside_paper else []
-    if others:
-        raise ParameterError(others[0], "given", "none with --concealed, which has its own rows")
-    out.mkdir(parents=True, exist_ok=True)
-    trials = out / "concealed.jsonl"
-    with executor_and_progress(trials, "run", arguments) as (executor, progress):
-        found = run_concealed(
+        _require_none(arguments, (*_FACTORS, "quoted", "beside_paper"), "--concealed")
+        hiding = concealed_study(
             arguments.circles,
-            path=trials,
             max_readings=arguments.max_readings,
             sizes=(0, 1, 2) if arguments.size is None else (_SIZES.index(arguments.size),),
             n_clean=arguments.clean,
             varied=arguments.varied,
             **({} if arguments.seed is None else {"seed": arguments.seed}),
-            executor=executor,
-            progress=progress,
         )
-    table = concealed_csv_rows(found)
-    rows, drawings = concealed_rows(found), Drawings(out)
-    command = _concealed_command_line(arguments)
-    drawings.write_results(
-        lambda stage: stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table))),
-        {},
-        lambda _: pages.concealed_html(rows, concealed_forms(found), command=command, draw=drawings.draw),
-    )
-    return finish(drawings, pages.concealed_sentence(rows), f"written to {out}", quiet=arguments.quiet)
+        page_of = partial(pages.concealed_page, command=command)
+        return run_and_report(hiding, page_of, arguments, "concealed.jsonl", "concealed.csv")
+    for name, value in _given(arguments, _OF_CONCEALED).items():
+        raise ParameterError(f"--{name}", value, "only with --concealed")
+    rows = _configuration_rows(arguments)
+    numbers = dict.fromkeys(rows, arguments.circles)
+    numbers[rows[0]] = arguments.quoted or arguments.circles
+    if max(numbers.values()) < 2:
+        raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
+    plain = study(numbers, max_readings=arguments.max_readings)
+    return run_and_report(plain, partial(pages.study_page, command=command), arguments, "trials.jsonl")
+
+
+def _given(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
+    """Return the options among `names` that were given, with their values."""
+    values = {name: getattr(arguments, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None and value is not False}
+
+
+def _require_none(arguments: argparse.Namespace, names: Iterable[str], beside: str) -> None:
+    for name in _given(arguments, names):
+        raise ParameterError(f"--{name.replace('_', '-')}", "given", f"none with {beside}, which has its own rows")
 
 
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:
     from probewise.proof.configurations import SearchConfiguration, paper_comparison_rows, standard_rows
 
-    given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
+    given = _given(arguments, _FACTORS)
     if arguments.beside_paper:
-        others = [f"--{name.replace('_', '-')}" for name in given if name not in ("population", "nested_stop")]
-        if others:
-            raise ParameterError(others[0], "given", "none with --beside-paper, which has its own rows")
+        others = [name for name in given if name not in ("population", "nested_stop")]
+        _require_none(arguments, others, "--beside-paper")
         return paper_comparison_rows(**given)
     if not given:
         return standard_rows()
@@ -150,20 +120,8 @@ def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfigurat
 
 
 def _command_line(arguments: argparse.Namespace) -> str:
-    words = ["probewise", "study", "--circles", str(arguments.circles)]
-    words += [] if arguments.quoted is None else ["--quoted", str(arguments.quoted)]
-    words += ["--beside-paper"] if arguments.beside_paper else []
-    for name in _FACTORS:
-        value = getattr(arguments, name)
-        if value is not None:
-            words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
-    return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
-
-
-def _concealed_command_line(arguments: argparse.Namespace) -> str:
-    words = ["probewise", "study", "--concealed", "--circles", str(arguments.circles)]
-    for name in ("clean", "seed", "size"):
-        value = getattr(arguments, name)
-        words += [] if value is None else [f"--{name}", str(value)]
-    words += ["--varied"] if arguments.varied else []
-    return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
+    words = ["probewise", "study", *(["--concealed"] if arguments.concealed else [])]
+    names = _OF_CONCEALED if arguments.concealed else ("quoted", "beside_paper", *_FACTORS)
+    for name, value in _given(arguments, ("circles", *names, "max_readings")).items():
+        words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
+    return shlex.join(words)

@@ -14,17 +14,15 @@ from probewise.emulator.arm import (
     shipped_geometry_path,
 )
 from probewise.emulator.bench import EmulatedBench, LightModel, Tabletop, parse_scene, set_up_bench
-from probewise.emulator.brick import Battery, Brick
-from probewise.emulator.inputs import EmptyPort, LightSensor, Sensor
-from probewise.emulator.motors import Motor, MotorParameters
+from probewise.emulator.brick import Brick
+from probewise.emulator.inputs import LightSensor, Sensor, empty_port
+from probewise.emulator.motors import Motor
 from probewise.emulator.protocol import Clock, VirtualClock
 from probewise.emulator.radio import Faults, Radio, Trace, VirtualLine
 
 __all__ = [
-    "Battery",
     "Brick",
     "Clock",
-    "EmptyPort",
     "EmulatedArm",
     "EmulatedBench",
     "Faults",
@@ -34,7 +32,6 @@ __all__ = [
     "LightModel",
     "LightSensor",
     "Motor",
-    "MotorParameters",
     "Radio",
     "Sensor",
     "SensorPose",
@@ -42,6 +39,7 @@ __all__ = [
     "Trace",
     "VirtualClock",
     "VirtualLine",
+    "empty_port",
     "parse_scene",
     "read_geometry",
     "set_up_bench",

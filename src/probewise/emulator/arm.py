@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Self
 
-from probewise.emulator.motors import Motor, MotorParameters
+from probewise.emulator.motors import Motor
 from probewise.errors import FileError, shown
 from probewise.recordings import read_text
 
@@ -148,7 +148,7 @@ class Joint:
         play_deg = numbers.play_deg * abs(numbers.gear_ratio)
         # The stops are the joint's: its motor turns half the backlash further.
         stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
-        return cls(numbers, Motor(MotorParameters(stops_deg=stops_deg, play_deg=play_deg)))
+        return cls(numbers, Motor(stops_deg=stops_deg, play_deg=play_deg))
 
     @property
     def angle_rad(self) -> float:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise.emulator.arm import EmulatedArm, Geometry, SensorPose
-from probewise.emulator.brick import Battery, Brick
-from probewise.emulator.inputs import EmptyPort, LightSensor, Sensor
+from probewise.emulator.brick import Brick
+from probewise.emulator.inputs import LightSensor, Sensor, empty_port
 from probewise.emulator.protocol import Clock
 from probewise.emulator.radio import Faults, Radio, Trace, ignore_trace
 from probewise.errors import ParameterError
@@ -192,14 +192,14 @@ def set_up_bench(
     arm = EmulatedArm(geometry)
     table = Tabletop(surface)
     light = LightModel(world, table, arm.sensor_pose, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
-    sensors: list[Sensor] = [EmptyPort() for _ in range(4)]
+    sensors: list[Sensor] = [empty_port] * 4
     sensors[geometry.sensor_port - 1] = LightSensor(light, clock)
     brick = Brick(
         clock,
         motors=arm.motors(),
         sensors=sensors,
         name=name,
-        battery=Battery(sag_mv_min=faults.sag),
+        sag_mv_min=faults.sag,
         sleep_min=sleep_min,
         watch=arm.record_lowest,
     )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
-from probewise.emulator.inputs import EmptyPort, InputPorts, Sensor
+from probewise.emulator.inputs import InputPorts, Sensor, empty_port
 from probewise.emulator.motors import Motor, OutputPorts
 from probewise.emulator.protocol import Clock, RefusedError, Status, build_reply, parse_request
 from probewise.errors import ParameterError
@@ -20,18 +19,6 @@ _VERSIONS = bytes((124, 1, 31, 1))  # protocol 1.124, firmware 1.31, the smaller
 _LONGEST_NAME = 14
 
 
-@dataclass(frozen=True)
-class Battery:
-    """A battery's voltage at the start, and its loss per minute, in mV."""
-
-    full_mv: float = 7412.0
-    sag_mv_min: float = 0.0
-
-    def millivolts_after(self, seconds: float) -> float:
-        """Return the voltage in mV after some seconds, at least 5500."""
-        return max(self.full_mv - self.sag_mv_min * seconds / 60, 5500.0)
-
-
 class Brick:
     """An NXT brick, switched on at construction; ParameterError if the name or `sleep_min` is invalid.
 
@@ -43,8 +30,8 @@ class Brick:
         Motors at ports A, B, C; sensors at ports 1 to 4.
     name, sleep_min
         Up to 14 characters of Latin-1; minutes without KEEPALIVE until the brick switches itself off, 0: never.
-    battery
-        The battery.
+    full_mv, sag_mv_min
+        The battery's voltage at the start, and its loss per minute, in mV.
     programs
         Names of the programs in flash; one that starts or stops resets all ports, and does nothing else.
     watch
@@ -58,7 +45,8 @@ class Brick:
         motors: Sequence[Motor] | None = None,
         sensors: Sequence[Sensor] | None = None,
         name: str = "NXT",
-        battery: Battery | None = None,
+        full_mv: float = 7412.0,
+        sag_mv_min: float = 0.0,
         sleep_min: int = 10,
         programs: Sequence[str] = ("idle.rxe",),
         watch: Callable[[], None] = lambda: None,
@@ -69,12 +57,12 @@ class Brick:
             raise ParameterError("sleep_min", sleep_min, f"one of {', '.join(map(str, SLEEP_MIN))}")
         self._clock, self._sleep_s = clock, 60.0 * sleep_min
         self._began_s = self._awake_s = clock()
-        self._battery = Battery() if battery is None else battery
+        self._full_mv, self._sag_mv_min = full_mv, sag_mv_min
         self._name = name.encode("latin-1")
         self._programs, self._running = programs, b""
         plugged = [Motor() for _ in range(3)] if motors is None else motors
         self.outputs = OutputPorts(plugged, now_s=self._began_s, watch=watch)
-        self.inputs = InputPorts([EmptyPort()] * 4 if sensors is None else sensors, clock)
+        self.inputs = InputPorts([empty_port] * 4 if sensors is None else sensors, clock)
         self._commands: Mapping[int, Callable[..., bytes]] = {
             **self.outputs.commands,
             **self.inputs.commands,
@@ -91,8 +79,8 @@ class Brick:
 
     @property
     def battery_mv(self) -> float:
-        """The battery's voltage now, in mV."""
-        return self._battery.millivolts_after(self._clock() - self._began_s)
+        """The battery's voltage now, in mV, at least 5500."""
+        return max(self._full_mv - self._sag_mv_min * (self._clock() - self._began_s) / 60, 5500.0)
 
     @property
     def is_off(self) -> bool:

@@ -5,28 +5,20 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TypeAlias
 
 from probewise.emulator.protocol import Clock, RefusedError, Status
 
 AD_MAX = 1023
 
 
-class Sensor(Protocol):
-    """What an input port's AD converter reads: a sensor with a voltage output, or an empty port."""
-
-    def counts(self, *, lit: bool) -> int:
-        """Return the output of the AD converter, 0 to 1023 for 0 to 5 V; `lit`: whether the LED is on."""
-        ...
+Sensor: TypeAlias = Callable[[bool], int]
+"""What an input port's AD converter reads, 0 to 1023 for 0 to 5 V: a function of whether the LED is on."""
 
 
-@dataclass(frozen=True)
-class EmptyPort:
-    """An empty port: the pull-up resistor alone."""
-
-    def counts(self, *, lit: bool) -> int:
-        """Return 1023, the full voltage."""
-        return AD_MAX
+def empty_port(lit: bool) -> int:
+    """Return 1023, the full voltage: of an empty port, the pull-up resistor alone."""
+    return AD_MAX
 
 
 @dataclass
@@ -40,8 +32,8 @@ class LightSensor:
     clock: Clock
     _sample: tuple[int, bool, int] = field(default=(-1, False, AD_MAX))
 
-    def counts(self, *, lit: bool) -> int:
-        """Return the AD converter's current sample, 0 to 1023, taken every 3 ms."""
+    def __call__(self, lit: bool) -> int:
+        """Return the AD converter's current sample, 0 to 1023."""
         number = int(self.clock() / 0.003)
         if self._sample[:2] != (number, lit):
             # The inverse of `_normalized_light`: 0 % is 896 counts, 100 % is 200; beyond, linear within 0 to 1023.
@@ -101,7 +93,7 @@ class InputPorts:
         if self.clock() < port.valid_s:
             return False
         if port.kind != _NONE:
-            raw = port.sensor.counts(lit=port.kind == _LIGHT_ON)
+            raw = port.sensor(port.kind == _LIGHT_ON)
             normalized = _normalized_light(raw) if port.kind in (_LIGHT_ON, _LIGHT_OFF) else raw
             scaled = normalized * 100 // AD_MAX if port.mode & 0xE0 == _PERCENT else normalized
             port.shown = (raw, normalized, scaled)

@@ -19,14 +19,17 @@ from enum import IntEnum
 from probewise.emulator.protocol import FieldValue, RefusedError, Status
 
 
-@dataclass(frozen=True)
-class MotorParameters:
-    """Parameters of a motor under its load, as measured on the NXT motor.
+@dataclass
+class Motor:
+    """A motor under its load: angle and speed of the shaft, angle of the load; the rest as measured on the NXT motor.
 
     That runs at 170 revolutions per minute at full power and 9 V without load, in proportion to power and voltage, does
     not start below about 8 % of power, and overshoots by about 60 degrees after an unregulated limited run at power 75.
     """
 
+    angle_deg: float = 0.0
+    speed_deg_s: float = 0.0
+    driven_deg: float = 0.0
     full_speed_deg_s: float = 1020.0  # without load, at power 100 and a battery of `rated_mv`
     rated_mv: float = 9000.0
     driven_s: float = 0.06  # time constant of the approach to the commanded speed, and of the electric brake
@@ -35,36 +38,25 @@ class MotorParameters:
     stops_deg: tuple[float, float] = (-math.inf, math.inf)  # of the shaft
     play_deg: float = 0.0  # backlash: what the shaft turns after a reversal before its load follows
 
-
-@dataclass
-class Motor:
-    """State of a motor: angle and speed of the shaft, and angle of its load."""
-
-    parameters: MotorParameters = field(default_factory=MotorParameters)
-    angle_deg: float = 0.0
-    speed_deg_s: float = 0.0
-    driven_deg: float = 0.0
-
     def step(self, seconds: float, power: float, *, brake: bool, battery_mv: float) -> None:
         """Simulate a time step, much shorter than the time constants, at a power of -100 to 100.
 
         At power 0 the motor brakes (shorted) if `brake`, and coasts without current otherwise.
         """
-        parameters = self.parameters
         if power or brake:
-            asked = parameters.full_speed_deg_s * (power / 100) * (battery_mv / parameters.rated_mv)
-            speed = self.speed_deg_s + (asked - self.speed_deg_s) * seconds / parameters.driven_s
+            asked = self.full_speed_deg_s * (power / 100) * (battery_mv / self.rated_mv)
+            speed = self.speed_deg_s + (asked - self.speed_deg_s) * seconds / self.driven_s
         else:
-            speed = self.speed_deg_s * (1 - seconds / parameters.coasting_s)
+            speed = self.speed_deg_s * (1 - seconds / self.coasting_s)
         # Dry friction reduces the speed towards zero and never reverses it.
-        lost = parameters.friction_deg_s2 * seconds
+        lost = self.friction_deg_s2 * seconds
         self.speed_deg_s = speed - lost if speed > lost else speed + lost if speed < -lost else 0.0
-        low, high = parameters.stops_deg
+        low, high = self.stops_deg
         angle = self.angle_deg + self.speed_deg_s * seconds
         if not low <= angle <= high:
             angle, self.speed_deg_s = min(max(angle, low), high), 0.0
         self.angle_deg = angle
-        slack = parameters.play_deg / 2
+        slack = self.play_deg / 2
         self.driven_deg = min(max(self.driven_deg, angle - slack), angle + slack)
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
-from typing import Literal, Self, TypeAlias
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -28,24 +28,28 @@ from probewise.emulator.protocol import (
 from probewise.errors import LinkError, ParameterError
 
 
+def _usually(rate: float) -> Any:
+    return field(default=0.0, metadata={"usual": rate})
+
+
 @dataclass(frozen=True)
 class Faults:
-    """Rates of faults, 0 to 1; by default a link without faults."""
+    """Rates of faults, 0 to 1; by default a link without faults; beside each, what its name alone stands for."""
 
-    fragment: float = 0.0  # a reply comes in pieces, up to 30 ms apart
-    merge: float = 0.0  # a reply is delayed and delivered together with the next one
-    double: float = 0.0  # a reply comes twice, the second time up to 0.1 s later
-    corrupt: float = 0.0  # one byte of a reply, its length included, is changed
-    late: float = 0.0  # a reply is late
+    fragment: float = _usually(1.0)  # a reply comes in pieces, up to 30 ms apart
+    merge: float = _usually(0.05)  # a reply is delayed and delivered together with the next one
+    double: float = _usually(0.05)  # a reply comes twice, the second time up to 0.1 s later
+    corrupt: float = _usually(0.05)  # one byte of a reply, its length included, is changed
+    late: float = _usually(0.05)  # a reply is late
     late_s: float = 3.0  # by so many seconds
-    drop: float = 0.0  # a byte of a reply is lost, per byte
-    half: float = 0.0  # the end of a telegram is lost, equally likely of a request or of a reply
-    error: float = 0.0  # a request is refused with an error status and not executed
-    silence: float = 0.0  # a request is executed but never answered
-    deaf: float = 0.0  # a request is lost on the way to the brick
-    unasked: float = 0.0  # the brick sends a message of its own before a reply
-    disconnect: float = 0.0  # the link ends when a request arrives; the request is executed and motors run on
-    sag: float = 0.0  # millivolts that the battery loses per minute
+    drop: float = _usually(0.005)  # a byte of a reply is lost, per byte
+    half: float = _usually(0.05)  # the end of a telegram is lost, equally likely of a request or of a reply
+    error: float = _usually(0.05)  # a request is refused with an error status and not executed
+    silence: float = _usually(0.05)  # a request is executed but never answered
+    deaf: float = _usually(0.05)  # a request is lost on the way to the brick
+    unasked: float = _usually(0.05)  # the brick sends a message of its own before a reply
+    disconnect: float = _usually(0.002)  # the link ends at a request, which is executed; motors run on
+    sag: float = _usually(60.0)  # millivolts that the battery loses per minute
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -79,21 +83,7 @@ class Faults:
         return faults
 
 
-_USUAL = {
-    "fragment": 1.0,
-    "merge": 0.05,
-    "double": 0.05,
-    "corrupt": 0.05,
-    "late": 0.05,
-    "drop": 0.005,
-    "half": 0.05,
-    "error": 0.05,
-    "silence": 0.05,
-    "deaf": 0.05,
-    "unasked": 0.05,
-    "disconnect": 0.002,
-    "sag": 60.0,
-}
+_USUAL = {rate.name: rate.metadata["usual"] for rate in fields(Faults) if rate.metadata}
 
 Event: TypeAlias = Literal[">", "<", "!"]
 Trace: TypeAlias = Callable[[float, Event, str], None]

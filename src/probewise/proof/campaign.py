@@ -8,12 +8,13 @@ of the tasks, so that nothing depends on the executor.
 from __future__ import annotations
 
 import json
+import lzma
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeAlias, TypeVar
 
 from probewise._tasks import results_as_tasks_end
 from probewise._writing import write_and_sync
@@ -21,12 +22,44 @@ from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
 
-__all__ = ["FORMAT", "CampaignContents", "read_campaign", "run_campaign"]
+__all__ = ["FORMAT", "Campaign", "CampaignContents", "read_campaign", "run_campaign"]
 
 FORMAT = "campaign/1"
-T = TypeVar("T")
 Result = Mapping[str, Any]
 Misfit: TypeAlias = Callable[[Result], tuple[str, str] | None]
+T = TypeVar("T")
+
+
+class Keyed(Protocol):
+    """A task: everything that determines its result, a value to be hashed and pickled."""
+
+    @property
+    def key(self) -> str:
+        """The task's key in the campaign's file."""
+        ...
+
+
+K = TypeVar("K", bound=Keyed)
+
+
+@dataclass(frozen=True)
+class Campaign(Generic[K]):
+    """What a campaign runs: its work, its tasks, and the rest as `run_campaign` takes it."""
+
+    work: Callable[[K], Result]
+    tasks: Sequence[K]
+    settings: Mapping[str, Any]
+    misfit: Misfit
+    noun: str = "runs"
+
+    def run(
+        self, *, path: str | os.PathLike[str], executor: Executor | None = None, progress: Progress = silent
+    ) -> dict[K, Result]:
+        """Run it, or resume it, as `run_campaign` does; return the results by task."""
+        tasks = {task.key: task for task in self.tasks}
+        more = {"executor": executor, "progress": progress, "noun": self.noun, "misfit": self.misfit}
+        results = run_campaign(self.work, tasks, path=path, settings=self.settings, **more)  # type: ignore[arg-type]
+        return {tasks[key]: result for key, result in results.items()}
 
 
 @dataclass(frozen=True)
@@ -92,7 +125,7 @@ def run_campaign(
 
 
 def read_campaign(path: str | os.PathLike[str], *, misfit: Misfit = lambda result: None) -> CampaignContents:
-    """Read a campaign's file; an incomplete last line is ignored.
+    """Read a campaign's file, packed if its name ends in .xz; an incomplete last line is ignored.
 
     Raises
     ------
@@ -100,8 +133,9 @@ def read_campaign(path: str | os.PathLike[str], *, misfit: Misfit = lambda resul
         If it is missing, not a campaign's, or damaged before its last line, or if `misfit` (see `run_campaign`) finds
         a result that cannot be.
     """
+    content = read_bytes(Path(path), "a campaign's file")
     # After the last line end there is nothing, or an incomplete line.
-    *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
+    *lines, _ = (lzma.decompress(content) if Path(path).suffix == ".xz" else content).split(b"\n")
     rows = [_parsed_line(path, number, line) for number, line in enumerate(lines, start=1)]
     if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
         raise FileError(path, "this is not a campaign file", f'a first line with "format": "{FORMAT}" and its settings')

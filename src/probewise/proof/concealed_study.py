@@ -9,9 +9,7 @@ sensor model is complete (`trust`): `TRUST` and 1.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Self, TypeAlias, cast
@@ -24,8 +22,7 @@ from probewise._version import __version__
 from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
 from probewise.inference import Rounded
-from probewise.progress import Progress, silent
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import Campaign, Result
 from probewise.proof.configurations import FIELD, MOST_CIRCLES, POPULATIONS, REFERENCE
 from probewise.proof.estimates import Estimate, estimated_share
 from probewise.proof.results import CONCEALED_TRIAL, misfit
@@ -43,6 +40,7 @@ from probewise.proof.trial import (
     timed_steps,
 )
 from probewise.recordings import Disc
+from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
 from probewise.world import Blob, Concealed, World
 from probewise.world import concealed as known
@@ -98,67 +96,67 @@ def _at_any_moment(now: Conditions, rng: np.random.Generator) -> float:
 
 
 def _wandering_gain(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
-    return strange.ThermalGain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10)))
+    return strange.thermal_gain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10)))
 
 
 def _gain_and_dark_level(a: float, now: Conditions, rng: np.random.Generator) -> tuple[Concealed, ...]:
-    return known.GainDrift(a / 50, math.inf), known.AmbientStep(a, -math.inf)
+    return known.gain_drift(a / 50, math.inf), known.ambient_step(a, -math.inf)
 
 
 _W, _UNITS, _PLACES, _SHARES = FIELD.width_mm, (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4)
 
 CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
     "in the list": {
-        "backlash": (_of(known.Backlash), _PLACES),
-        "saturation": (_of(known.Saturation), (55.0, 40.0, 25.0)),
-        "nonlinearity": (_of(known.Nonlinearity), (1.1, 1.5, 2.2)),
-        "albedo_gradient": (lambda a, now, rng: known.AlbedoGradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
-        "ambient_gradient": (lambda a, now, rng: known.AmbientGradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
-        "ambient_step": (lambda a, now, rng: known.AmbientStep(a, 6 * now.each_s), (2.0, 8.0, 16.0)),
-        "offset_drift": (lambda a, now, rng: known.OffsetDrift(a * 3600 / (30 * now.each_s)), (2.0, 8.0, 16.0)),
-        "gain_drift": (lambda a, now, rng: known.GainDrift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
-        "edge_blur": (_of(known.EdgeBlur), (3.0, 11.0, 20.0)),
-        "halo": (_of(known.Halo, 25.0), _SHARES),
-        "dropouts": (_of(known.Dropouts, DARK), (0.03, 0.1, 0.2)),
-        "outliers": (_of(known.Outliers, 12.0), (0.03, 0.1, 0.2)),
-        "gain_loss": (lambda a, now, rng: strange.FadingLamp(a, now.each_s), (0.001, 0.005, 0.01)),
-        "hysteresis": (_of(known.Hysteresis), _and_tenfold(1.0)),
-        "lag": (_of(known.Lag), (2.0, 4.0, 8.0)),
-        "flicker": (_of(known.Flicker, 0.37, 1.0), _UNITS),
-        "edge_shadow": (_of(known.EdgeShadow, 8.0), _SHARES),
-        "correlated_noise": (_of(known.CorrelatedNoise), (0.3, 0.6, 0.9)),
-        "signal_dependent_noise": (_of(known.SignalDependentNoise), (1.0, 8.0, 30.0)),
-        "quantisation": (_of(known.Quantisation), (2.0, 5.0, 10.0)),
-        "periodic_position_error": (_of(known.PeriodicPositionError, 60.0, 0.0), _and_tenfold(1.0)),
-        "height_gradient": (lambda a, now, rng: known.HeightGradient(a / _W), (0.5, 2.0, 5.0)),
-        "albedo_patch": (_of(known.AlbedoPatch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
-        "glint": (_of(known.Glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
-        "sensor_tilt": (_of(known.SensorTilt, 0.0), (2.0, 6.0, 12.0)),
-        "position_scale": (lambda a, now, rng: known.PositionScale(a, a), (0.005, 0.02, 0.05)),
-        "dark_level": (_of(known.AmbientStep, -math.inf), _and_tenfold(2.0)),
-        "gain": (_of(known.GainDrift, math.inf), _and_tenfold(0.05)),
-        "noise_sd": (lambda a, now, rng: known.RisingNoiseSd(1 + a, 1e-9), _and_tenfold(0.5)),
-        "play_of_axes": (lambda a, now, rng: strange.PlayOfAxes(a, a / 2), _PLACES),
-        "scale_of_x": (_of(known.PositionScale, 0.0), (0.005, 0.02, 0.05)),
-        "step_at_any_moment": (lambda a, now, rng: known.AmbientStep(a, _at_any_moment(now, rng)), (2.0, 8.0, 16.0)),
+        "backlash": (_of(known.backlash), _PLACES),
+        "saturation": (_of(known.saturation), (55.0, 40.0, 25.0)),
+        "nonlinearity": (_of(known.nonlinearity), (1.1, 1.5, 2.2)),
+        "albedo_gradient": (lambda a, now, rng: known.albedo_gradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
+        "ambient_gradient": (lambda a, now, rng: known.ambient_gradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
+        "ambient_step": (lambda a, now, rng: known.ambient_step(a, 6 * now.each_s), (2.0, 8.0, 16.0)),
+        "offset_drift": (lambda a, now, rng: known.offset_drift(a * 3600 / (30 * now.each_s)), (2.0, 8.0, 16.0)),
+        "gain_drift": (lambda a, now, rng: known.gain_drift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
+        "edge_blur": (_of(known.edge_blur), (3.0, 11.0, 20.0)),
+        "halo": (_of(known.halo, 25.0), _SHARES),
+        "dropouts": (_of(known.dropouts, DARK), (0.03, 0.1, 0.2)),
+        "outliers": (_of(known.outliers, 12.0), (0.03, 0.1, 0.2)),
+        "gain_loss": (lambda a, now, rng: strange.gain_loss(a, now.each_s), (0.001, 0.005, 0.01)),
+        "hysteresis": (_of(known.hysteresis), _and_tenfold(1.0)),
+        "lag": (_of(known.lag), (2.0, 4.0, 8.0)),
+        "flicker": (_of(known.flicker, 0.37, 1.0), _UNITS),
+        "edge_shadow": (_of(known.edge_shadow, 8.0), _SHARES),
+        "correlated_noise": (_of(known.correlated_noise), (0.3, 0.6, 0.9)),
+        "signal_dependent_noise": (_of(known.signal_dependent_noise), (1.0, 8.0, 30.0)),
+        "quantisation": (_of(known.quantisation), (2.0, 5.0, 10.0)),
+        "periodic_position_error": (_of(known.periodic_position_error, 60.0, 0.0), _and_tenfold(1.0)),
+        "height_gradient": (lambda a, now, rng: known.height_gradient(a / _W), (0.5, 2.0, 5.0)),
+        "albedo_patch": (_of(known.albedo_patch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
+        "glint": (_of(known.glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
+        "sensor_tilt": (_of(known.sensor_tilt, 0.0), (2.0, 6.0, 12.0)),
+        "position_scale": (lambda a, now, rng: known.position_scale(a, a), (0.005, 0.02, 0.05)),
+        "dark_level": (_of(known.ambient_step, -math.inf), _and_tenfold(2.0)),
+        "gain": (_of(known.gain_drift, math.inf), _and_tenfold(0.05)),
+        "noise_sd": (lambda a, now, rng: known.drifting_noise(1 + a, 1e-9), _and_tenfold(0.5)),
+        "play_of_axes": (lambda a, now, rng: strange.play_of_axes(a, a / 2), _PLACES),
+        "scale_of_x": (_of(known.position_scale, 0.0), (0.005, 0.02, 0.05)),
+        "step_at_any_moment": (lambda a, now, rng: known.ambient_step(a, _at_any_moment(now, rng)), (2.0, 8.0, 16.0)),
     },
     "another form": {
         "thermal_gain": (_wandering_gain, _and_tenfold(0.02)),
-        "soft_saturation": (_of(known.Saturation, 10.0), (55.0, 40.0, 25.0)),
-        "dead_zone": (_of(strange.DeadZone), _and_tenfold(0.05)),
-        "ghost": (_of(strange.Ghost, 25.0, 0.0), _SHARES),
-        "stick_slip": (_of(strange.StickSlip, 60.0, 0.0), _and_tenfold(1.0)),
-        "chirp": (lambda a, now, rng: strange.Chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0), _UNITS),
+        "soft_saturation": (_of(known.saturation, 10.0), (55.0, 40.0, 25.0)),
+        "dead_zone": (_of(strange.floor), _and_tenfold(0.05)),
+        "ghost": (_of(strange.ghost, 25.0, 0.0), _SHARES),
+        "stick_slip": (_of(strange.stick_slip, 60.0, 0.0), _and_tenfold(1.0)),
+        "chirp": (lambda a, now, rng: strange.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0), _UNITS),
     },
     "in no list": {
-        "bent_rail": (lambda a, now, rng: strange.QuadraticPositionError(a * (10 / _W) ** 2), _and_tenfold(2.0)),
-        "place_step": (_of(strange.PlaceStep, _MIDDLE_MM[0]), _and_tenfold(1.0)),
-        "after_glow": (lambda a, now, rng: strange.AfterGlow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)), _UNITS),
-        "peak_memory": (_of(strange.PeakMemory), _SHARES),
+        "bent_rail": (lambda a, now, rng: strange.bent_rail(a * (10 / _W) ** 2), _and_tenfold(2.0)),
+        "place_step": (_of(strange.place_step, _MIDDLE_MM[0]), _and_tenfold(1.0)),
+        "after_glow": (lambda a, now, rng: strange.after_glow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)), _UNITS),
+        "peak_memory": (_of(strange.peak_memory), _SHARES),
     },
     "two at once": {
         "backlash_and_step": (
-            lambda a, now, rng: (known.Backlash(a), known.AmbientStep(a, _at_any_moment(now, rng))),
+            lambda a, now, rng: (known.backlash(a), known.ambient_step(a, _at_any_moment(now, rng))),
             _PLACES,
         ),
         "gain_and_dark_level": (_gain_and_dark_level, _and_tenfold(2.0)),
@@ -297,25 +295,22 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     return SimulatedArm(light_reading, reach=everywhere, speed=Speed(500.0, now.each_s - _MOVE_S), scale=None)
 
 
-def run_concealed(
+def concealed_study(
     n_circles: int,
     *,
-    path: str | os.PathLike[str],
     max_readings: int = 100,
     effects: Sequence[str] = tuple(CONCEALED),
     sizes: Sequence[int] = (0, 1, 2),
     n_clean: int | None = None,
     seed: int = SEED,
     varied: bool = False,
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> dict[ConcealedTrial, dict[str, Any]]:
-    """Run every row over the first circles, with trust `TRUST` and 1, or resume an interrupted study.
+) -> Campaign[ConcealedTrial]:
+    """Return the campaign of every row over the first circles, with trust `TRUST` and 1.
 
-    `n_circles`: circles per row; `path`: the campaign's file, whose runs are not repeated; `max_readings`: a run that
-    has not reached the target precision after so many is a miss; `effects`, `sizes`: names in CONCEALED and indices of
-    sizes to run besides the clean row, which has `n_clean` circles, by default as many as the others; `seed`: of
-    circles, noise and robot; `varied`: whether each circle has conditions of its own; others as for `run_study`.
+    `n_circles`: circles per row; `max_readings`: a run that has not reached the target precision after so many is a
+    miss; `effects`, `sizes`: names in CONCEALED and indices of sizes to run besides the clean row, which has `n_clean`
+    circles, by default as many as the others; `seed`: of circles, noise and robot; `varied`: whether each circle has
+    conditions of its own.
     """
     for n in (n_circles, n_clean or n_circles):
         checked_whole("n_circles", n, most=MOST_CIRCLES)
@@ -327,18 +322,9 @@ def run_concealed(
         if circle < n
         for trust in (TRUST, 1.0)
     ]
-    results = run_campaign(
-        run_concealed_trial,
-        {trial.key: trial for trial in trials},
-        path=path,
-        settings={"concealed": __version__, "max_readings": max_readings, "seed": seed}
-        | ({"varied": True} if varied else {}),
-        executor=executor,
-        progress=progress,
-        noun="runs",
-        misfit=partial(misfit, schema=CONCEALED_TRIAL),
-    )
-    return {trial: dict(results[trial.key]) for trial in trials}
+    settings = {"concealed": __version__, "max_readings": max_readings, "seed": seed}
+    settings |= {"varied": True} if varied else {}
+    return Campaign(run_concealed_trial, trials, settings, partial(misfit, schema=CONCEALED_TRIAL))
 
 
 @dataclass(frozen=True)
@@ -368,61 +354,59 @@ class ConcealedRow:
     cpu_s_95: float
 
 
-_COLUMNS = tuple(column.name for column in fields(ConcealedRow))
-
-
-def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
+def concealed_rows(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedRow]:
     """Summarise the runs of each row (effect, size and trust), in the order of `results`."""
     return _summaries(
         results, lambda t: (t.effect or "nothing", CONCEALED[t.effect][1][t.size] if t.effect else None, t.trust)
     )
 
 
-def concealed_forms(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
+def concealed_forms(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedRow]:
     """Summarise the runs with effects of each form, at each trust, in the order of `results`."""
     form = {name: form for form, rows in CONCEALED_BY_FORM.items() for name in rows}
     hidden = {trial: result for trial, result in results.items() if trial.effect}
     return _summaries(hidden, lambda t: (form[t.effect], None, t.trust))
 
 
-def concealed_csv_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise each row as a dict for a CSV file: shares with their intervals as text."""
-    return [{name: _csv_value(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
-
-
 def _summaries(
-    results: Mapping[ConcealedTrial, Mapping[str, Any]],
-    row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]],
+    results: Mapping[ConcealedTrial, Result], row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]]
 ) -> list[ConcealedRow]:
-    rows: dict[tuple[str, float | None, float], list[tuple[tuple[str, ...], Mapping[str, Any]]]] = {}
+    rows: dict[tuple[str, float | None, float], list[tuple[tuple[str, ...], Result]]] = {}
     for trial, result in results.items():
         rows.setdefault(row_of(trial), []).append((trial.right_answers, result))
-    return [_summary_row(key, runs) for key, runs in rows.items()]
+    return [_summary_row(*key, runs) for key, runs in rows.items()]
 
 
 def _summary_row(
-    key: tuple[str, float | None, float], runs: list[tuple[tuple[str, ...], Mapping[str, Any]]]
+    concealed: str, size: float | None, trust: float, runs: list[tuple[tuple[str, ...], Result]]
 ) -> ConcealedRow:
     found = [run for _, run in runs]
+    readings, cpu_s = [run["readings"] for run in found], np.array([run["cpu_s"] for run in found])
     return ConcealedRow(
-        *key,
+        concealed,
+        size,
+        trust,
         runs=len(found),
-        readings=float(np.median([run["readings"] for run in found])),
-        mean_readings=round(float(np.mean([run["readings"] for run in found])), 1),
+        readings=float(np.median(readings)),
+        mean_readings=round(float(np.mean(readings)), 1),
         reached=estimated_share([run["known"] for run in found]),
         intervals_hold=estimated_share([hit for run in found for hit in run["held"]]),
         sure_and_wrong=estimated_share([run["known"] and run["error_mm"] > WRONG_MM for run in found]),
         noticed=estimated_share([run["noticed"] for run in found]),
         in_credible_set=estimated_share([not {*names}.isdisjoint(run["credible"]) for names, run in runs if names]),
         names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
-        cpu_s_median=round(float(np.median([run["cpu_s"][0] for run in found])), 2),
-        cpu_s_95=round(float(np.median([run["cpu_s"][1] for run in found])), 2),
+        cpu_s_median=round(float(np.median(cpu_s[:, 0])), 2),
+        cpu_s_95=round(float(np.median(cpu_s[:, 1])), 2),
     )
 
 
-def _csv_value(value: object) -> object:
+def concealed_csv(rows: Sequence[ConcealedRow]) -> str:
+    """Return rows as CSV text: shares with their intervals as text."""
+    names = [column.name for column in fields(ConcealedRow)]
+    return csv_text_of_rows(names, ([_csv_cell(getattr(row, name)) for name in names] for row in rows))
+
+
+def _csv_cell(value: object) -> object:
     if isinstance(value, Estimate):
-        if not value.n:
-            return ""
-        return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})"
+        return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})" if value.n else ""
     return "" if value is None else value

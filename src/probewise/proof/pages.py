@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, TypeAlias, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
 from probewise._words import count_with_noun
 from probewise.experiment import least_readings
-from probewise.proof.concealed_study import ConcealedRow
+from probewise.proof.campaign import Result
+from probewise.proof.concealed_study import (
+    ConcealedRow,
+    ConcealedTrial,
+    concealed_csv,
+    concealed_forms,
+    concealed_rows,
+)
 from probewise.proof.configurations import REFERENCE, SearchConfiguration
 from probewise.proof.estimates import LEAST_FOR_MEDIAN, Estimate
 from probewise.proof.plots import (
@@ -22,17 +30,25 @@ from probewise.proof.plots import (
     readings_needed,
     reliability_diagram,
 )
-from probewise.proof.scoring import NOISE, are_names_right, confusion_counts, leading_hypothesis, reliability_bins
-from probewise.proof.study import Study, Summary
-from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, gains_on_held_out_runs, name_without_target
-from probewise.proof.trial import experiment_of
+from probewise.proof.study import Summary, summaries, trials_by_row
+from probewise.proof.tables import (
+    NOISE,
+    ScoreRow,
+    are_names_right,
+    confusion_counts,
+    detected_and_named_by_effect,
+    gains_on_held_out_runs,
+    leading_hypothesis,
+    name_without_target,
+    reliability_bins,
+)
+from probewise.proof.trial import Trial, experiment_of
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import (
     Draw,
     Markup,
     Section,
     definition_list,
-    draw_or_raise,
     figure,
     fragment,
     page,
@@ -43,6 +59,17 @@ from probewise.report.plots.canvas import png
 from probewise.report.words import number_text, typeset_numbers, value_with_error
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class CampaignPage:
+    """What a campaign's results come to: a table as CSV text, the HTML, given what makes figures, and a sentence."""
+
+    table: str
+    html: Callable[[Draw], str]
+    sentence: str
+
+
 Columns: TypeAlias = Mapping[str, Callable[[T], str]]
 """Columns of a table: header, and the cell as a function of what its row is about."""
 
@@ -52,25 +79,22 @@ def table_of(columns: Columns[T], rows: Iterable[T], *, caption: str = "") -> Ma
     return table(tuple(columns), (tuple(cell(row) for cell in columns.values()) for row in rows), caption=caption)
 
 
-_COLUMNS: tuple[tuple[str, str], ...] = (
-    ("reached", "share that reached the precision, 95 % interval"),
-    ("mean", "mean readings, standard error (a miss counted as the limit)"),
-    ("median", "median readings, 95 % interval"),
-    ("to_white", "mean readings up to the first on white, standard error (none counted as the limit)"),
-    ("after_white", "mean readings after the first on white, standard error"),
-    ("bits_each", "bits per reading, standard error"),
-    ("held", "share of 95 % intervals that hold the truth, standard error"),
-    ("arm_s", "arm time (s), standard error"),
-)
+_COLUMNS = ("reached", "mean", "median", "to_white", "after_white", "bits_each", "held", "arm_s")
 _INTERVALS = (
     "Readings that a run needs. The 95 % interval of the share is Wilson's, for the number of runs beside it; that of "
     f"the median lies between two of the runs, and takes {LEAST_FOR_MEDIAN} of them."
 )
 
 
-def study_sentence(study: Study) -> str:
+def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage:
+    """Return what a study comes to; `command` is the command line that made it."""
+    found = summaries(results)
+    return CampaignPage(study_csv(found), partial(study_html, results, found, command), study_sentence(found))
+
+
+def study_sentence(table: Mapping[SearchConfiguration, Summary]) -> str:
     """Summarise a study's first row: mean and median readings, and the share of runs that reached the precision."""
-    row, found = next(iter(study.table().items()))
+    row, found = next(iter(table.items()))
     share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
     return (
         f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, _half_width(found.mean))} readings "
@@ -110,16 +134,7 @@ _WORTH: Columns[Row] = {
 }
 
 
-def result_tables(study: Study) -> Markup:
-    """Build two tables, a line for each row of the study: readings needed; information, errors, and time spent."""
-    rows = list(study.table().items())
-    return fragment(
-        table_of(_READINGS, rows, caption=_INTERVALS),
-        table_of(_WORTH, rows, caption="Information per reading, errors of the runs, and cost."),
-    )
-
-
-def lower_bound_table(study: Study) -> Markup | None:
+def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | None:
     """Build the table of lower bounds, for any strategy, on mean readings up to the first on white, and after it.
 
     Measured means are beside; None if no row has default options (but for circles and noise) and the correct model.
@@ -129,45 +144,51 @@ def lower_bound_table(study: Study) -> Markup | None:
         return f"{number_text(bits / capacity, 1)} = {number_text(bits, 1)} / {number_text(capacity, 2)}"
 
     lines = []
-    for row, found in study.table().items():
+    for row, own in found.items():
         if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
             least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
-            search = over(least.search_bits, least.search_capacity_bits), _with_error(found.to_white)
+            search = over(least.search_bits, least.search_capacity_bits), _with_error(own.to_white)
             lines.append(
-                (row.name, *search, over(least.refinement_bits, least.capacity_bits), _with_error(found.after_white))
+                (row.name, *search, over(least.refinement_bits, least.capacity_bits), _with_error(own.after_white))
             )
     places = "up to white, at least (bits over bits per reading)", "from there, at least"
     return table(("row", places[0], "measured", places[1], "measured"), lines) if lines else None
 
 
-def study_csv(study: Study) -> str:
+def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
     """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
-    bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
+    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
     rows = []
-    for row, found in study.table().items():
-        estimates = [getattr(found, name) for name, _ in _COLUMNS]
+    for row, found in table.items():
+        estimates = [getattr(found, name) for name in _COLUMNS]
         values = [value for e in estimates for value in (e.value, e.low, e.high)]
         values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
         rows.append([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])
     return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
 
 
-def study_html(study: Study, *, command: str, draw: Draw = draw_or_raise) -> str:
-    """Return the HTML of a study's page; `command` is the command line that made the study, `draw` makes figures."""
-    summaries = study.table()
+def study_html(
+    results: Mapping[Trial, Result], found: Mapping[SearchConfiguration, Summary], command: str, draw: Draw
+) -> str:
+    """Return the HTML of a study's page from the results and their `summaries`."""
+    own, (first, *_) = trials_by_row(results), results
     curves = {
-        row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]
-        for row in summaries
+        row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in own[row]]
+        for row in found
         if (row.utility == REFERENCE.utility or row.method == "paper")
         and row.noise_sd == 1.0
         and row.width == 1.0
         and row.batch == 1
     }
     needed = figure(
-        draw("readings needed", lambda: png(readings_needed({row.name: found for row, found in summaries.items()}))),
-        f"Readings until every length is known to 4 mm, of at most {study.max_readings}; a miss counts as that many.",
+        draw("readings needed", lambda: png(readings_needed({row.name: summary for row, summary in found.items()}))),
+        f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that many.",
     )
-    sections = [Section("The table", (result_tables(study), _study_legend()))]
+    tables = (
+        table_of(_READINGS, found.items(), caption=_INTERVALS),
+        table_of(_WORTH, found.items(), caption="Information per reading, errors of the runs, and cost."),
+    )
+    sections = [Section("The table", (fragment(*tables), _study_legend()))]
     if curves:
         drawn = figure(
             draw("widths", lambda: png(posterior_widths_of_runs(curves))),
@@ -175,7 +196,7 @@ def study_html(study: Study, *, command: str, draw: Draw = draw_or_raise) -> str
             "width.",
         )
         sections.insert(0, Section("How fast", (drawn,)))
-    least = lower_bound_table(study)
+    least = lower_bound_table(found)
     if least is not None:
         bounds = paragraph(
             "Bits needed over the capacity of a reading in bits. Up to the first reading on white, a reading answers "
@@ -184,7 +205,7 @@ def study_html(study: Study, *, command: str, draw: Draw = draw_or_raise) -> str
         )
         sections.append(Section("Lower bound for any strategy", (least, bounds)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
-    return page("How many measurements?", answer=study_sentence(study), key_figure=needed, sections=sections)
+    return page("How many measurements?", answer=study_sentence(found), key_figure=needed, sections=sections)
 
 
 def _study_legend() -> Markup:
@@ -206,6 +227,12 @@ def _half_width(estimate: Estimate) -> float:
     return 0.5 * (estimate.high - estimate.low)
 
 
+def concealed_page(results: Mapping[ConcealedTrial, Result], *, command: str) -> CampaignPage:
+    """Return what a study of concealed effects comes to; `command` is the command line that made it."""
+    rows, forms = concealed_rows(results), concealed_forms(results)
+    return CampaignPage(concealed_csv(rows), partial(concealed_html, rows, forms, command), concealed_sentence(rows))
+
+
 def concealed_sentence(rows: Sequence[ConcealedRow]) -> str:
     """Count in one sentence the runs that ended by the robot's rule but over 12 mm off: at full trust, and at less."""
     wrong = {
@@ -217,13 +244,8 @@ def concealed_sentence(rows: Sequence[ConcealedRow]) -> str:
     )
 
 
-def concealed_html(
-    rows: Sequence[ConcealedRow], forms: Sequence[ConcealedRow] = (), *, command: str, draw: Draw = draw_or_raise
-) -> str:
-    """Return the HTML of the page of a study of concealed effects, also by their `forms` if there are several.
-
-    Other parameters as in `study_html`.
-    """
+def concealed_html(rows: Sequence[ConcealedRow], forms: Sequence[ConcealedRow], command: str, draw: Draw) -> str:
+    """Return the HTML of the page of a study of concealed effects, also by their `forms` if there are several."""
     drawn = figure(
         draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
         "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
@@ -281,9 +303,21 @@ def _concealed_table_legend() -> Markup:
     )
 
 
-Results = Sequence[Mapping[str, Any]]
+Results: TypeAlias = Sequence[Result]
 
 _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
+
+
+def challenge_page(
+    results: Results, score: Callable[[Results], Sequence[ScoreRow]], *, command: str, systems: bool
+) -> CampaignPage:
+    """Return what a challenge comes to, by the `score` of its cases; `command` is the command line that made it.
+
+    `systems`: the cases are simulators, not light sensors.
+    """
+    rows = score(results)
+    page_with = partial(challenge_html, results, rows, command, systems)
+    return CampaignPage(challenge_csv(rows), page_with, challenge_sentence(rows, len(results)))
 
 
 def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
@@ -322,14 +356,8 @@ def challenge_csv(rows: Sequence[ScoreRow]) -> str:
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
-def challenge_html(
-    results: Results, rows: Sequence[ScoreRow], *, command: str, systems: bool = False, draw: Draw = draw_or_raise
-) -> str:
-    """Return the HTML of a challenge's page from the cases' results and the table's `rows`.
-
-    `command` is the command line that made the results; `systems`: the cases are simulators, not light sensors;
-    `draw` makes figures.
-    """
+def challenge_html(results: Results, rows: Sequence[ScoreRow], command: str, systems: bool, draw: Draw) -> str:
+    """Return the HTML of a challenge's page from the cases' results and the table's `rows`."""
     done = [r for r in results if "failed" not in r]
     sections = [Section("The table", (table_of(_TARGETS, rows), _challenge_legend()))]
     if done:
@@ -382,7 +410,7 @@ def _case_table(results: Results) -> Markup:
     )
 
 
-def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
+def _case_cells(number: int, result: Result) -> tuple[str, ...]:
     concealed = " and ".join(h["name"] for h in result.get("hidden", ())) or result.get("noise_model", "")
     begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
     if "failed" in result:

@@ -13,8 +13,8 @@ from probewise._words import count_with_noun
 from probewise.diagnosis.words import effect_has_words, effect_in_words
 from probewise.proof.concealed_study import ConcealedRow
 from probewise.proof.estimates import Estimate
-from probewise.proof.scoring import Bin
 from probewise.proof.study import Summary
+from probewise.proof.tables import Bin
 from probewise.report.plots.canvas import (
     BLACK,
     BLUE,

@@ -21,7 +21,7 @@ from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
 from probewise.effects import AGAIN, VOCABULARY, EffectKind, Extent, NamedEffect
 from probewise.errors import NotConvergedError
 from probewise.proof.systems.cases import DrawnSystem, SystemCase, SystemEffect
-from probewise.proof.systems.kind import SystemKind, SystemTable
+from probewise.proof.systems.kinds import SystemKind, SystemTable
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
 from probewise.systems import Noise, RunTable, System

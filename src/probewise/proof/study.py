@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from scipy.stats import poisson
@@ -16,14 +13,13 @@ from scipy.stats import poisson
 from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.errors import ParameterError
-from probewise.progress import Progress, silent
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import Campaign, Result
 from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
 from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
 from probewise.proof.results import TRIAL, misfit
 from probewise.proof.trial import WRONG_MM, Trial, run_trial
 
-__all__ = ["Study", "Summary", "run_study", "summarise"]
+__all__ = ["Summary", "study", "summaries", "summarise"]
 
 _CHANCE = 0.01
 
@@ -57,7 +53,7 @@ class Summary:
     cpu_s: float
 
 
-def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summary:
+def summarise(trials: Sequence[Result], *, max_readings: int) -> Summary:
     """Summarise the runs of one row, each a result of `run_trial`.
 
     Raises ParameterError if there are fewer than two runs, which have no standard error.
@@ -88,33 +84,31 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
-    """Results (`run_trial`) of each row, in the order of the circles, and the limit of readings."""
-
-    trials: Mapping[SearchConfiguration, tuple[Mapping[str, Any], ...]]
-    max_readings: int
-
-    def table(self) -> dict[SearchConfiguration, Summary]:
-        """Return the summary of every row with two or more runs, by row."""
-        return {row: summarise(t, max_readings=self.max_readings) for row, t in self.trials.items() if len(t) > 1}
+def summaries(results: Mapping[Trial, Result]) -> dict[SearchConfiguration, Summary]:
+    """Return the summary of every row with two or more runs, by row."""
+    most = {trial.row: trial.max_readings for trial in results}
+    return {row: summarise(t, max_readings=most[row]) for row, t in trials_by_row(results).items() if len(t) > 1}
 
 
-def run_study(
+def trials_by_row(results: Mapping[Trial, Result]) -> dict[SearchConfiguration, list[Result]]:
+    """Return the results of each row, in the order of the circles."""
+    own: dict[SearchConfiguration, list[Result]] = {}
+    for trial, result in results.items():
+        own.setdefault(trial.row, []).append(result)
+    return own
+
+
+def study(
     rows: Mapping[SearchConfiguration, int] | Sequence[SearchConfiguration],
     n_circles: int | None = None,
     *,
-    path: str | os.PathLike[str],
     max_readings: int = 100,
-    executor: Executor | None = None,
-    progress: Progress = silent,
-) -> Study:
-    """Run every row over the first circles of its population, or resume an interrupted study; return the results.
+) -> Campaign[Trial]:
+    """Return the campaign of every row over the first circles of its population.
 
-    `rows`: the rows; a mapping gives each its own number of circles, else it is `n_circles`; `path`: the campaign's
-    file, whose runs are not repeated when rows and circles are added later; `max_readings`: a run that has not reached
-    the target precision after so many is a miss; all else is as in `run_campaign`. Raises ParameterError if there is no
-    row, or a row has no circle.
+    `rows`: the rows; a mapping gives each its own number of circles, else it is `n_circles`; rows and circles may be
+    added later to a file. `max_readings`: a run that has not reached the target precision after so many is a miss.
+    Raises ParameterError if there is no row, or a row has no circle.
     """
     wanted = dict(rows) if isinstance(rows, Mapping) else dict.fromkeys(rows, n_circles or 0)
     if not wanted:
@@ -123,15 +117,5 @@ def run_study(
         checked_whole(f"circles of the row {row.name!r}", n, most=MOST_CIRCLES)
     # Circle by circle, so that an interrupted study has equally many runs in each row.
     trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
-    results = run_campaign(
-        run_trial,
-        {trial.key: trial for trial in trials},
-        path=path,
-        settings={"study": __version__, "max_readings": max_readings},
-        executor=executor,
-        progress=progress,
-        noun="runs",
-        misfit=partial(misfit, schema=TRIAL),
-    )
-    own = {row: tuple(results[Trial(row, k).key] for k in range(n)) for row, n in wanted.items()}
-    return Study(own, max_readings)
+    settings = {"study": __version__, "max_readings": max_readings}
+    return Campaign(run_trial, trials, settings, partial(misfit, schema=TRIAL))

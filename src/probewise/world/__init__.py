@@ -4,7 +4,7 @@ It shares only the file formats with the rest of the package: data simulated by 
 the model. The summed integral is the paper's eq. RwithSSF.
 """
 
-from probewise.world.concealed import AmbientGradient, Backlash, CorrelatedNoise, GainDrift, Nonlinearity, Saturation
+from probewise.world.concealed import ambient_gradient, backlash, correlated_noise, gain_drift, nonlinearity, saturation
 from probewise.world.rays import seen_white_fraction
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.stages import Concealed, Rows
@@ -12,26 +12,26 @@ from probewise.world.surfaces import CoveredSurface, Oval, Surface, albedo_at
 from probewise.world.world import View, World, simulate
 
 __all__ = [
-    "AmbientGradient",
-    "Backlash",
     "Blob",
     "Concealed",
-    "CorrelatedNoise",
     "CoveredSurface",
-    "GainDrift",
-    "Nonlinearity",
     "Oval",
     "Rows",
-    "Saturation",
     "Spot",
     "Surface",
     "View",
     "World",
     "albedo_at",
+    "ambient_gradient",
+    "backlash",
+    "correlated_noise",
+    "gain_drift",
     "gaussian_spot",
+    "nonlinearity",
     "raster_spot",
     "ridge_spot",
     "ring_spot",
+    "saturation",
     "seen_white_fraction",
     "simulate",
     "tailed_spot",

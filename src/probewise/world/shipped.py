@@ -18,7 +18,7 @@ from probewise.recordings.files import write_recording
 from probewise.recordings.io import SHIPPED
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_times
-from probewise.world.concealed import AmbientGradient, Backlash, CorrelatedNoise, GainDrift, Nonlinearity, Saturation
+from probewise.world.concealed import ambient_gradient, backlash, correlated_noise, gain_drift, nonlinearity, saturation
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.stages import Concealed
 from probewise.world.world import World
@@ -36,12 +36,12 @@ _DESCRIPTIONS = {
 }
 
 CANDIDATES: tuple[Concealed, ...] = (
-    AmbientGradient(0.02, -0.02),
-    Backlash(0.53),
-    CorrelatedNoise(0.5),
-    GainDrift(0.044, 400.0),
-    Nonlinearity(1.1),
-    Saturation(57.5),
+    ambient_gradient(0.02, -0.02),
+    backlash(0.53),
+    correlated_noise(0.5),
+    gain_drift(0.044, 400.0),
+    nonlinearity(1.1),
+    saturation(57.5),
 )
 """Effects that the recording `concealed` may contain, each at a size lambda of about 20."""
 

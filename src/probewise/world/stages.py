@@ -1,15 +1,16 @@
-"""The stages of the chain from pose to reading: the table that they see, and the interface of an effect at each."""
+"""The stages of the chain from pose to reading: the table that they see, and how an effect acts at each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, TypeAlias, get_args, runtime_checkable
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, ParamSpec, TypeAlias, get_args
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.recordings.plan import Plan
 from probewise.world.spots import Spot
 
 
@@ -35,21 +36,6 @@ class Rows:
     covariates: Mapping[str, FloatArray]
     across: FloatArray
     edge_mm: FloatArray
-
-    @classmethod
-    def from_plan(cls, plan: Plan, across: FloatArray, edge_mm: FloatArray) -> Rows:
-        """Build from a plan's commanded poses, with `across` and `edge_mm` of the surfaces below."""
-        return cls(
-            place_mm=np.stack([plan.x_mm, plan.y_mm], axis=-1),
-            direction=plan.direction_of_motion,
-            orientation_rad=plan.orientation_rad,
-            time_s=plan.time_s,
-            scan=plan.scan,
-            scan_names=plan.scan_names,
-            covariates=plan.covariates,
-            across=across,
-            edge_mm=edge_mm,
-        )
 
     def commanded_column(self, name: str, *, otherwise: float) -> FloatArray:
         """Return the covariate `name`, shape (n_points,), with `otherwise` in place of NaN or of an absent column."""
@@ -100,63 +86,49 @@ class FootprintPart:
     shift_mm: tuple[float, float] = (0.0, 0.0)
 
 
-@runtime_checkable
-class ChangesQuantity(Protocol):
-    """An effect that changes one quantity per reading.
+Act: TypeAlias = Callable[..., Any]
+"""How an effect acts at its stage: a function of what the chain has there, which returns that with the effect.
 
-    The quantity by stage: "place", position of the sensor, (n_points, 2), mm; "turn", its orientation, rad; "pattern",
-    displacement of the pattern from its description, (n_points, 2), mm; "tilt", shift of the footprint in the lab
-    frame, (n_points, 2), mm; "height" above the surface, mm; "seen" and "response", the seen white fraction u; "gain",
-    the signal without I_min; "offset", "lag", "saturation" and "quantisation", the reading. Shape (n_points,) unless
-    given.
-    """
-
-    name: ClassVar[str]
-    stage: ClassVar[Stage]
-
-    def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Return `values` with the effect on them; `rows` hold true poses, but commanded ones at "place" and "turn"."""
-        ...
+- "albedo": of the albedo at points `x_mm`, `y_mm` of the lab frame, and these; all of one shape.
+- "footprint": of the footprint's components, whose shares sum to one.
+- "noise", "loss": of values, (n_points,), the `Rows`, the seen white fraction and a generator. Values are independent
+  standard normal draws, which become the noise in units of its sd; at "loss", the finished readings.
+- All others: of one quantity per reading, (n_points,) unless given, and the `Rows`, whose poses are true, but commanded
+  ones at "place" and "turn". "place": position of the sensor, (n_points, 2), mm; "turn": its orientation, rad;
+  "pattern": displacement of the pattern from its description, (n_points, 2), mm; "tilt": shift of the footprint in the
+  lab frame, (n_points, 2), mm; "height" above the surface, mm; "seen" and "response": the seen white fraction u;
+  "gain": the signal without I_min; "offset", "lag", "saturation" and "quantisation": the reading.
+"""
 
 
-@runtime_checkable
-class Retouches(Protocol):
-    """An effect that changes the surface, at the stage "albedo"."""
+@dataclass(frozen=True)
+class Concealed:
+    """An effect that a world conceals: its name, the stage at which it acts, its parameters by name, how it acts."""
 
-    name: ClassVar[str]
-    stage: ClassVar[Stage]
+    name: str
+    stage: Stage
+    parameters: Mapping[str, Any]
+    act: Act = field(compare=False, repr=False)
 
-    def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Return the changed albedo at points `x_mm`, `y_mm` of the lab frame; all arrays of one shape."""
-        ...
-
-
-@runtime_checkable
-class ChangesFootprint(Protocol):
-    """An effect that changes the footprint, at the stage "footprint"."""
-
-    name: ClassVar[str]
-    stage: ClassVar[Stage]
-
-    def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
-        """Return the components of the changed footprint; their shares sum to one."""
-        ...
+    @property
+    def disturbs(self) -> bool:
+        """Whether it changes the noise or loses readings."""
+        return self.stage in ("noise", "loss")
 
 
-@runtime_checkable
-class Disturbs(Protocol):
-    """An effect that changes the noise or loses readings.
-
-    At the stage "noise", `values` are independent standard normal draws and become the noise in units of its sd; at
-    "loss" they are the finished readings. Shape (n_points,).
-    """
-
-    name: ClassVar[str]
-    stage: ClassVar[Stage]
-
-    def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return `values` with the effect on them; `seen` is the seen white fraction, (n_points,)."""
-        ...
+P = ParamSpec("P")
 
 
-Concealed: TypeAlias = ChangesQuantity | Retouches | ChangesFootprint | Disturbs
+def acts_at(stage: Stage) -> Callable[[Callable[P, Act]], Callable[P, Concealed]]:
+    """Make a kind of effect of a function from parameters to how it acts: called, it returns the effect of its name."""
+
+    def kind_of_effect(act_with: Callable[P, Act]) -> Callable[P, Concealed]:
+        @functools.wraps(act_with)
+        def effect(*values: P.args, **named: P.kwargs) -> Concealed:
+            bound = inspect.signature(act_with).bind(*values, **named)
+            bound.apply_defaults()
+            return Concealed(act_with.__name__, stage, bound.arguments, act_with(*values, **named))
+
+        return effect
+
+    return kind_of_effect

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,17 +15,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.rays import seen_white_fraction
 from probewise.world.spots import Spot
-from probewise.world.stages import (
-    STAGES,
-    ChangesFootprint,
-    ChangesQuantity,
-    Concealed,
-    Disturbs,
-    FootprintPart,
-    Retouches,
-    Rows,
-    Stage,
-)
+from probewise.world.stages import STAGES, Concealed, FootprintPart, Rows, Stage
 from probewise.world.surfaces import Surface, common_edge_normal, distance_to_nearest_edge
 
 _Surfaces = Sequence[tuple[Surface, IntArray]]
@@ -129,15 +120,27 @@ class World:
         for surface, chosen in found:
             across[chosen] = common_edge_normal(surface)
             edge_mm[chosen] = distance_to_nearest_edge(surface, plan.x_mm[chosen], plan.y_mm[chosen])
-        return self._view_of_rows(found, Rows.from_plan(plan, across, edge_mm))
+        sent = Rows(
+            place_mm=np.stack([plan.x_mm, plan.y_mm], axis=-1),
+            direction=plan.direction_of_motion,
+            orientation_rad=plan.orientation_rad,
+            time_s=plan.time_s,
+            scan=plan.scan,
+            scan_names=plan.scan_names,
+            covariates=plan.covariates,
+            across=across,
+            edge_mm=edge_mm,
+        )
+        return self._view_of_rows(found, sent)
 
     def noise_free_readings(self, view: View) -> FloatArray:
         """Turn a view into readings before noise, rounding and losses, shape (n_points,)."""
         rows = view.rows
-        signal = (self.white - self.black) * self._apply_changes("response", view.seen, rows) * view.dimming
-        reading = self.black + self._apply_changes("gain", signal, rows)
-        for stage in ("offset", "lag", "saturation"):
-            reading = self._apply_changes(stage, reading, rows)
+        signal = (self.white - self.black) * self._with_effects("response", view.seen, rows) * view.dimming
+        reading: FloatArray = self.black + self._with_effects("gain", signal, rows)
+        stages: tuple[Stage, ...] = ("offset", "lag", "saturation")
+        for stage in stages:
+            reading = self._with_effects(stage, reading, rows)
         return reading
 
     def expected_readings(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
@@ -165,17 +168,18 @@ class World:
         return Recording(plan, self._recorded_readings(self.view(plan, surfaces) if view is None else view, rng))
 
     def _view_of_rows(self, surfaces: _Surfaces, sent: Rows) -> View:
-        place = self._apply_changes("place", sent.place_mm, sent)
-        there = replace(sent, place_mm=place, orientation_rad=self._apply_changes("turn", sent.orientation_rad, sent))
-        pattern = self._apply_changes("pattern", np.zeros_like(place), there)
+        place = self._with_effects("place", sent.place_mm, sent)
+        there = replace(sent, place_mm=place, orientation_rad=self._with_effects("turn", sent.orientation_rad, sent))
+        pattern = self._with_effects("pattern", np.zeros_like(place), there)
         height_mm = sent.commanded_column("height_mm", otherwise=self.height_mm)
         # A tilt moves the spot in proportion to the height.
         lever = (height_mm / self.height_mm)[:, None]
-        center = place + lever * self._apply_changes("tilt", np.zeros_like(place), there)
-        scale = self._apply_changes("height", height_mm, there) / self.height_mm
+        center = place + lever * self._with_effects("tilt", np.zeros_like(place), there)
+        scale = self._with_effects("height", height_mm, there) / self.height_mm
         if scale.min() <= 0:
             raise ParameterError("height_mm", float(scale.min() * self.height_mm), "greater than 0 at every reading")
-        retouch = self._apply_retouches if any(isinstance(effect, Retouches) for effect in self.concealed) else None
+        retouches = any(effect.stage == "albedo" for effect in self.concealed)
+        parts = self._with_effects("footprint", (FootprintPart(1.0, self.spot),))
         seen, edge_mm = np.zeros(len(place)), np.empty(len(place))
         for surface, chosen in surfaces:
             edge_mm[chosen] = distance_to_nearest_edge(surface, *(place - pattern)[chosen].T)
@@ -185,51 +189,32 @@ class World:
                 orientation_rad=there.orientation_rad[chosen],
                 scale=scale[chosen],
                 pattern_mm=pattern[chosen],
-                retouch=retouch,
+                retouch=partial(self._with_effects, "albedo") if retouches else None,
             )
-            for part in self._footprint_parts():
+            for part in parts:
                 x_mm, y_mm = (center[chosen] + part.shift_mm).T
                 seen[chosen] += part.share * white(part.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
         # Illumination by the LED falls with the inverse square of the distance.
         dimming = sent.commanded_column("led", otherwise=1.0) * scale**-2.0
-        return View(self._apply_changes("seen", seen, there), dimming, there)
+        return View(self._with_effects("seen", seen, there), dimming, there)
 
     def _recorded_readings(self, view: View, rng: np.random.Generator | None) -> FloatArray:
         """Turn a view into readings with noise, rounding and losses; if `rng` is None, with rounding only."""
         readings = self.noise_free_readings(view)
         if rng is not None:
-            noise = self._apply_disturbances("noise", rng.standard_normal(len(readings)), view, rng)
+            noise = self._with_effects("noise", rng.standard_normal(len(readings)), view.rows, view.seen, rng)
             readings = readings + self.noise_sd * noise
-        readings = self._apply_changes("quantisation", readings, view.rows)
+        readings = self._with_effects("quantisation", readings, view.rows)
         if self.step is not None:
             readings = np.round(readings / self.step) * self.step
-        return readings if rng is None else self._apply_disturbances("loss", readings, view, rng)
+        return np.asarray(readings if rng is None else self._with_effects("loss", readings, view.rows, view.seen, rng))
 
-    def _apply_changes(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
-        """Return a stage's values with the effects of that stage on them."""
+    def _with_effects(self, stage: Stage, values: Any, *more: Any) -> Any:
+        """Return what the chain has at a stage with the effects of that stage (`stages.Act`)."""
         for effect in self.concealed:
-            if effect.stage == stage and isinstance(effect, ChangesQuantity):
-                values = effect.change(values, rows)
-        return values
-
-    def _apply_retouches(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        for effect in self.concealed:
-            if isinstance(effect, Retouches):
-                albedo = effect.retouch(albedo, x_mm, y_mm)
-        return albedo
-
-    def _footprint_parts(self) -> tuple[FootprintPart, ...]:
-        parts: tuple[FootprintPart, ...] = (FootprintPart(1.0, self.spot),)
-        for effect in self.concealed:
-            if isinstance(effect, ChangesFootprint):
-                parts = effect.change_footprint(parts)
-        return parts
-
-    def _apply_disturbances(self, stage: Stage, values: FloatArray, view: View, rng: np.random.Generator) -> FloatArray:
-        for effect in self.concealed:
-            if effect.stage == stage and isinstance(effect, Disturbs):
-                values = effect.disturb(values, view.rows, view.seen, rng)
+            if effect.stage == stage:
+                values = effect.act(values, *more)
         return values
 
     def _surfaces_with_rows(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> _Surfaces:

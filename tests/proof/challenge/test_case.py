@@ -5,7 +5,7 @@ import json
 import pytest
 
 from probewise.errors import FileError
-from probewise.proof.challenge import Task, run_case, run_challenge
+from probewise.proof.challenge import Task, challenge, run_case
 from probewise.proof.sensors.cases import stratum_of
 from probewise.proof.tables import score
 
@@ -29,12 +29,12 @@ def file_of(tmp_path, make):
 
 def test_what_a_file_holds_is_not_done_again(file_of, make):
     results = [make.case(), make.single()]
-    assert list(run_challenge(range(2), seed=3, path=file_of(results))) == results
+    assert list(challenge(range(2), seed=3).run(path=file_of(results)).values()) == results
 
 
 def test_another_version_s_cases_are_not_mixed_in(file_of, make):
     with pytest.raises(FileError, match="other settings"):
-        run_challenge([0], seed=3, path=file_of([make.case()], version="0.0"))
+        challenge([0], seed=3).run(path=file_of([make.case()], version="0.0"))
 
 
 def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.proof.scoring import (
+from probewise.proof.tables import (
     oracle_covariate_rate,
     oracle_credible_set_size,
     oracle_name_rate,

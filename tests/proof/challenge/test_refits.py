@@ -10,7 +10,7 @@ from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_
 from probewise.proof.tables import score
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
-from probewise.world.concealed import AlbedoPatch, AmbientStep, Halo, Hysteresis, Saturation
+from probewise.world.concealed import albedo_patch, ambient_step, halo, hysteresis, saturation
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -47,11 +47,6 @@ def test_a_sensor_of_one_gaussian_is_taken_for_one(refit, clean):
     assert np.abs(null.residuals).max() < 0.05
 
 
-def test_levels_take_up_an_offset_and_a_gain(refit, clean):
-    assert refit(clean, changed(clean, 0.0)) < 0.05
-    assert refit(clean, changed(clean, 1.0 + 0.1 * clean.readings)) < 0.05
-
-
 def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
     """Two routes: the refit, and least squares on slopes by differences."""
     null = refit.null_fit(clean)
@@ -61,13 +56,9 @@ def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
     assert refit(clean, changed(clean, wave)) == pytest.approx(np.linalg.norm(left), rel=0.01)
 
 
-def test_the_null_is_fitted_once_for_each_clean_recording(refit, clean):
-    assert refit.null_fit(clean) is refit.null_fit(clean)
-
-
 def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
     at_s = float(np.quantile(plan.time_s, 0.4))
-    step = replace(world, concealed=(AmbientStep(1.0, at_s),)).simulate(plan, rng=None)
+    step = replace(world, concealed=(ambient_step(1.0, at_s),)).simulate(plan, rng=None)
     few = {name: VOCABULARY[name] for name in ("ambient_step", "offset_drift", "backlash", "correlated_noise")}
     found = cosines_with_vocabulary(refit, clean, step, vocabulary=few)
     assert found["ambient_step"] == pytest.approx(1.0, abs=1e-3)
@@ -79,15 +70,15 @@ def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
 @pytest.mark.slow
 def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, clean):
     """And a change of the light is not: it is not even asked."""
-    skirt = replace(world, concealed=(Halo(0.08, 12.0),)).simulate(plan, rng=None)
+    skirt = replace(world, concealed=(halo(0.08, 12.0),)).simulate(plan, rng=None)
     assert cosines_with_vocabulary(refit, clean, skirt)["ssf_order"] > 0.99
-    step = replace(world, concealed=(AmbientStep(0.4, 300.0),)).simulate(plan, rng=None)
+    step = replace(world, concealed=(ambient_step(0.4, 300.0),)).simulate(plan, rng=None)
     assert "ssf_order" not in cosines_with_vocabulary(refit, clean, step)
 
 
 def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan, clean):
     """Two routes: one effect fitted to both, and the null fitted to the other alone."""
-    hidden = AmbientStep(0.8, float(np.quantile(plan.time_s, 0.4))), Hysteresis(0.5)
+    hidden = ambient_step(0.8, float(np.quantile(plan.time_s, 0.4))), hysteresis(0.5)
     both = replace(world, concealed=hidden).simulate(plan, rng=None)
     alone = replace(world, concealed=hidden[1:]).simulate(plan, rng=None)
     left = residual_norms_with_one_named(refit, clean, both, ["ambient_step"])
@@ -95,9 +86,9 @@ def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan,
 
 
 def test_a_ceiling_hides_what_is_above_it(refit, world, plan, clean):
-    patch = AlbedoPatch(0.05, 10.0, 0.0, 4.0)
+    patch = albedo_patch(0.05, 10.0, 0.0, 4.0)
     alone = replace(world, concealed=(patch,)).simulate(plan, rng=None)
-    both = replace(world, concealed=(patch, Saturation(45.0))).simulate(plan, rng=None)
+    both = replace(world, concealed=(patch, saturation(45.0))).simulate(plan, rng=None)
     assert residual_norms_with_one_named(refit, clean, both, ["saturation"])["saturation"] < 0.3 * refit(clean, alone)
 
 

@@ -10,8 +10,8 @@ from probewise.cli import main
 from probewise.proof import pages as report
 from probewise.proof import plots
 from probewise.proof.challenge import Task
-from probewise.proof.scoring import confusion_counts, reliability_bins
-from probewise.proof.tables import score
+from probewise.proof.tables import confusion_counts, reliability_bins, score
+from probewise.report.html import draw_or_raise
 
 
 @pytest.fixture
@@ -38,23 +38,15 @@ def test_the_csv_leaves_out_what_is_not_there(results):
 
 
 def test_the_page_stands_alone_and_tells_of_failures(results):
-    page = report.challenge_html(results, score(results), command="probewise challenge")
+    page = report.challenge_page(results, score, command="probewise challenge", systems=False).html(draw_or_raise)
     assert "no &lt;plan&gt;" in page
     assert page.count("data:image/png;base64,") == 2
     assert "http://" not in page
 
 
 def test_nothing_but_failures_still_makes_a_page(results):
-    assert "Cases that failed" in report.challenge_html(
-        results[-1:], score(results[-1:]), command="probewise challenge"
-    )
-
-
-def test_the_matrix_writes_every_count(results):
-    truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
-    ax = plots.confusion_matrix(truths, said, counts)
-    assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
-    assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)
+    page = report.challenge_page(results[-1:], score, command="probewise challenge", systems=False)
+    assert "Cases that failed" in page.html(draw_or_raise)
 
 
 @pytest.mark.slow
@@ -75,3 +67,10 @@ def test_the_verb_scores_what_its_file_holds(results, tmp_path, capsys):
     assert "6 cases" in capsys.readouterr().out
     assert (out / "table.csv").read_text().startswith("what,found")
     assert "probewise challenge --cases 6 --seed 5" in (out / "report.html").read_text()
+
+
+def test_the_matrix_writes_every_count(results):
+    truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
+    ax = plots.confusion_matrix(truths, said, counts)
+    assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
+    assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from probewise.proof.scoring import (
+from probewise.proof.tables import (
     count_extra_names,
     is_distinguishable_from_ssf,
     is_leading_name_right,

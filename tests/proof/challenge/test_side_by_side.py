@@ -5,7 +5,7 @@ import lzma
 import challenges_side_by_side as side_by_side
 import pytest
 
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import read_campaign, run_campaign
 
 
 def _case(kind, p_value, verdict="clean", combination=(), **more):
@@ -49,8 +49,5 @@ def test_a_packed_campaign_is_read_as_an_unpacked_one(tmp_path):
     run_campaign(_square, {f"seed / {k}": k for k in range(3)}, path=cases, settings={"seed": 1})
     packed = tmp_path / "cases.jsonl.xz"
     packed.write_bytes(lzma.compress(cases.read_bytes()))
-    assert (
-        side_by_side.read_cases(packed)
-        == side_by_side.read_cases(cases)
-        == {f"seed / {k}": {"square": k**2} for k in range(3)}
-    )
+    assert read_campaign(packed) == read_campaign(cases)
+    assert len(read_campaign(packed).results) == 3

@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 
 from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic
-from probewise.proof.scoring import calibration_error, confusion_counts, is_confidently_wrong, reliability_bins
-from probewise.proof.tables import ScoreRow, detected_and_named_by_effect, score
+from probewise.proof.tables import (
+    ScoreRow,
+    calibration_error,
+    confusion_counts,
+    detected_and_named_by_effect,
+    is_confidently_wrong,
+    reliability_bins,
+    score,
+)
 
 
 def row(results, name):
     (found,) = (r for r in score(results) if r.name == name)
     return found
-
-
-def test_wilson_s_interval():
-    """(k + z^2/2 -+ z sqrt(k (n - k)/n + z^2/4)) / (n + z^2): 8 of 10."""
-    z = 1.959963984540054
-    centre, half = (8 + z * z / 2) / (10 + z * z), z * math.sqrt(8 * 2 / 10 + z * z / 4) / (10 + z * z)
-    found = estimated_share([True] * 8 + [False] * 2)
-    assert (found.value, found.n) == (0.8, 10)
-    assert (found.low, found.high) == pytest.approx((centre - half, centre + half))
 
 
 def test_a_mean_has_student_s_interval():
@@ -42,11 +40,6 @@ def test_a_bootstrap_of_the_mean_agrees_with_its_standard_error():
 )
 def test_a_row_is_decided_only_by_its_whole_interval(low, high, decision):
     assert ScoreRow("x", Estimate(0.9, low, high, 10), least=0.9).decision == decision
-
-
-def test_no_case_decides_nothing():
-    assert ScoreRow("x", estimated_share([]), least=0.9).decision == "open"
-    assert ScoreRow("x", estimated_share([])).decision is None
 
 
 def test_false_alarms_are_counted_at_both_levels(make):
@@ -239,3 +232,8 @@ def test_an_alias_is_no_confusion(make):
     assert truths == ("clean", "lag", "outside")
     assert said == ("clean", "lag", "halo", "several")
     assert counts.tolist() == [[1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 1, 0]]
+
+
+def test_no_case_decides_nothing():
+    assert ScoreRow("x", estimated_share([]), least=0.9).decision == "open"
+    assert ScoreRow("x", estimated_share([])).decision is None

@@ -7,7 +7,8 @@ import pytest
 
 from probewise.errors import FileError, ParameterError
 from probewise.proof.configurations import REFERENCE, SearchConfiguration, paper_comparison_rows
-from probewise.proof.study import run_study
+from probewise.proof.study import study as campaign_of
+from probewise.proof.study import summaries, trials_by_row
 from probewise.proof.trial import Trial, experiment_of_trial, run_trial
 
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
@@ -17,14 +18,11 @@ BRIEF = {"n_circles": 2, "max_readings": 3}
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     path = tmp_path_factory.mktemp("study") / "trials.jsonl"
-    return run_study(ROWS, path=path, **BRIEF), path
+    return campaign_of(ROWS, **BRIEF).run(path=path), path
 
 
-def timeless(study):
-    return {
-        row: [{key: value for key, value in t.items() if key != "cpu_s"} for t in trials]
-        for row, trials in study.trials.items()
-    }
+def timeless(results):
+    return {trial: {key: value for key, value in t.items() if key != "cpu_s"} for trial, t in results.items()}
 
 
 @pytest.mark.slow
@@ -40,10 +38,10 @@ def test_the_robot_knows_the_circle_when_it_stops():
 
 @pytest.mark.slow
 def test_a_run_that_may_not_go_on_is_a_miss(study):
-    table = study[0].table()
+    table, trials = summaries(study[0]), trials_by_row(study[0])
     for row in ROWS:
-        assert [t["reached"] for t in study[0].trials[row]] == [False, False]
-        assert [t["readings"] for t in study[0].trials[row]] == [3, 3]
+        assert [t["reached"] for t in trials[row]] == [False, False]
+        assert [t["readings"] for t in trials[row]] == [3, 3]
         assert table[row].mean.value == 3
         assert table[row].reached.value == 0
 
@@ -99,23 +97,27 @@ def test_rows_that_differ_have_names_that_differ():
 @pytest.mark.slow
 def test_other_processes_come_to_the_same(study, tmp_path):
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        other = run_study(ROWS, path=tmp_path / "trials.jsonl", executor=pool, **BRIEF)
+        other = campaign_of(ROWS, **BRIEF).run(path=tmp_path / "trials.jsonl", executor=pool)
     assert timeless(other) == timeless(study[0])
 
 
 def test_what_a_file_holds_is_not_done_again(study):
     told = []
-    again = run_study({REFERENCE: 1}, path=study[1], max_readings=3, progress=lambda *words: told.append(words))
+    one = campaign_of({REFERENCE: 1}, max_readings=3)
+    again = one.run(path=study[1], progress=lambda *words: told.append(words))
     assert told == [("runs", 1, 1)]
-    assert again.trials[REFERENCE] == study[0].trials[REFERENCE][:1]
-    assert list(again.table()) == []
+    (trial,) = one.tasks
+    assert again == {trial: study[0][trial]}
+    assert summaries(again) == {}
 
 
-def test_wrong_files_and_numbers_are_refused(study, tmp_path):
+def test_wrong_files_and_numbers_are_refused(study):
     with pytest.raises(FileError, match="other settings"):
-        run_study([REFERENCE], 1, path=study[1])
+        campaign_of([REFERENCE], 1).run(path=study[1])
     with pytest.raises(ParameterError, match="1 or more"):
-        run_study([REFERENCE], path=tmp_path / "none.jsonl")
+        campaign_of([REFERENCE])
+    with pytest.raises(ParameterError, match="one row or more"):
+        campaign_of([], 2)
 
 
 @pytest.mark.slow
@@ -136,12 +138,7 @@ def test_a_cluster_that_loses_a_worker_loses_and_counts_twice_nothing(study, tmp
                 victim._process.kill()
                 killed.append(note)
 
-        found = run_study(ROWS, path=path, executor=client.get_executor(pure=False), progress=kill, **BRIEF)
+        found = campaign_of(ROWS, **BRIEF).run(path=path, executor=client.get_executor(pure=False), progress=kill)
     assert killed
     assert timeless(found) == timeless(study[0])
     assert len(path.read_text().splitlines()) == 1 + 4
-
-
-def test_a_study_without_rows_is_refused(tmp_path):
-    with pytest.raises(ParameterError, match="one row or more"):
-        run_study([], 2, path=tmp_path / "trials.jsonl")

@@ -92,14 +92,14 @@ def test_circles_and_noise_are_always_the_same():
     assert not np.allclose(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(6, 10))
 
 
-def test_every_standard_row_has_a_name_of_its_own():
-    names = [row.name for row in standard_rows()]
-    assert len(set(names)) == len(names)
-
-
 @pytest.mark.parametrize(
     "wrong", [{"population": "outside"}, {"model": "best"}, {"utility": "luck"}, {"noise_sd": 0.0}, {"width": -1.0}]
 )
 def test_rows_that_mean_nothing_are_refused(wrong):
     with pytest.raises(ParameterError, match=next(iter(wrong))):
         SearchConfiguration(**wrong)
+
+
+def test_every_standard_row_has_a_name_of_its_own():
+    names = [row.name for row in standard_rows()]
+    assert len(set(names)) == len(names)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from probewise.proof.systems.form import TrueSystem
 from probewise.proof.systems.forms import forms_of
-from probewise.proof.systems.kind import SystemKind, SystemTable
+from probewise.proof.systems.kinds import SystemKind, SystemTable
 from probewise.proof.systems.simulate import simulate_noise_free
 
 T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
@@ -45,8 +44,7 @@ def with_form(name, numbers, **options):
     """Simulate the small system with a form, (n_points,); also return its rows and the readings without."""
     kind, rows, parameters = small(**options)
     bare = simulate_noise_free(kind, rows, parameters)
-    true = TrueSystem(kind, rows, parameters, bare.readings, bare.states)
-    form = next(form for form in forms_of(true) if form.name == name)
+    form = next(form for form in forms_of(bare) if form.name == name)
     return simulate_noise_free(kind, rows, parameters, [(form, numbers)]).readings, rows, bare.readings
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.proof.systems.forms import behind_gear_play, delayed_values, direction_of_change
-from probewise.proof.systems.kind import SystemTable
+from probewise.proof.systems.kinds import SystemTable
 
 
 def _rows(t, run=None, **columns):

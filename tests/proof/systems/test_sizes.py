@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+from probewise.proof.challenge import _right_predictions
 from probewise.proof.refits import SystemRefit, nats_of_alternative, rivals_with_nats
-from probewise.proof.system_challenge import _right_predictions
 from probewise.proof.systems import cases
 from probewise.proof.systems.cases import (
     KINDS,

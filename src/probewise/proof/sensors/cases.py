@@ -9,18 +9,33 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.effects import INSIDE, NO_PHYSICS, OUTSIDE, PAIRABLE, SINGLES, CleanSetup
-from probewise.proof.sensors.plans import PLANS, draw_plan_with_displaced_patterns, held_out_plans
-from probewise.proof.sensors.sensors import NOISE_LEVELS, NOISE_NAMES, OTHER_NOISE, SSFS, draw_sensor, with_noise_model
-from probewise.proof.sensors.sizing import (
+from probewise.proof.sensors.effects import (
+    INSIDE,
+    NO_PHYSICS,
+    OUTSIDE,
+    PAIRABLE,
+    SAMPLERS,
+    SINGLES,
+    CleanSetup,
     CovariateRegion,
     EffectSizer,
     NormAfterRefit,
     amplitude_of_size,
     region_of_effect,
 )
+from probewise.proof.sensors.sensors import (
+    NOISE_LEVELS,
+    NOISE_NAMES,
+    OTHER_NOISE,
+    PLANS,
+    SSFS,
+    draw_plan_with_displaced_patterns,
+    draw_sensor,
+    held_out_plans,
+    with_noise_model,
+)
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.stages import Concealed, Disturbs
+from probewise.world.stages import Concealed
 from probewise.world.world import World
 
 CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]
@@ -99,12 +114,12 @@ class HiddenEffect:
     @property
     def residual_covariates(self) -> tuple[str, ...]:
         """Names of the covariates along which the effect's residual is visible."""
-        return (INSIDE.get(self.name) or OUTSIDE[self.name]).residual_covariates
+        return SAMPLERS[self.name].residual_covariates
 
     @property
-    def parameters(self) -> dict[str, object]:
+    def parameters(self) -> Mapping[str, object]:
         """Parameters of the effect, name to value."""
-        return dict(vars(self.effect))
+        return self.effect.parameters
 
 
 ALIASES: tuple[tuple[str, str], ...] = (
@@ -189,7 +204,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
             failure = error
     else:
         raise failure
-    if any(isinstance(each.effect, Disturbs) for each in hidden):
+    if any(each.effect.disturbs for each in hidden):
         model = "white"  # only one noise fault at a time
     step = 1.0 if model == "quantised" else None
     told = replace(setup.plan.instrumentation, step=step, description="Simulated readings of a challenge")
@@ -257,7 +272,7 @@ def _draw_effects(
 
 def draw_effect_of_size(name: str, wanted: float, sizer: EffectSizer, rng: np.random.Generator) -> HiddenEffect:
     """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
-    sampler = INSIDE.get(name) or OUTSIDE[name]
+    sampler = SAMPLERS[name]
     of_amplitude = sampler.draw(sizer.setup, rng)
     amplitude = sampler.first
     if sampler.scalable:

@@ -15,14 +15,22 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.proof.sensors.cases import Stratum, stratum_in_wheel
-from probewise.proof.sensors.sizing import amplitude_of_size
-from probewise.proof.systems.form import Form, FormWithParameters, Numbers, TrueSystem
-from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, family_of, forms_of
-from probewise.proof.systems.kind import SystemKind, SystemTable, design_runs, draw_values
-from probewise.proof.systems.kinds import FORMULAS, LAWS
+from probewise.proof.sensors.effects import amplitude_of_size
+from probewise.proof.systems.forms import (
+    ADDED_FAMILIES,
+    FAMILIES,
+    OUT_OF_VOCABULARY,
+    Form,
+    FormWithParameters,
+    Numbers,
+    SimulatedSystem,
+    family_of,
+    forms_of,
+    forms_out_of_vocabulary,
+)
+from probewise.proof.systems.kinds import FORMULAS, LAWS, SystemKind, SystemTable, design_runs, draw_values
 from probewise.proof.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
 from probewise.proof.systems.simulate import simulate_noise_free
-from probewise.proof.systems.unlisted import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text
 
@@ -85,11 +93,9 @@ class DrawnSystem:
         return self.table.select_rows(self.diagnosed_row_numbers)
 
     @cached_property
-    def true_system(self) -> TrueSystem:
+    def true_system(self) -> SimulatedSystem:
         """The system at its true parameters with readings and states, over the rows that are not held out."""
-        parameters = self._parameters(self.diagnosed_table)
-        found = simulate_noise_free(self.kind, self.diagnosed_table, parameters)
-        return TrueSystem(self.kind, self.diagnosed_table, parameters, found.readings, found.states)
+        return simulate_noise_free(self.kind, self.diagnosed_table, self._parameters(self.diagnosed_table))
 
     def _parameters(self, table: SystemTable) -> dict[str, Any]:
         per_run = {name: values[table.run] for name, values in self.by_run.items()}
@@ -308,7 +314,7 @@ _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts 
 _PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def _residual_covariates(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
+def _residual_covariates(form: Form, residuals: FloatArray, true: SimulatedSystem) -> tuple[str, ...]:
     """Return names that a diagnosis may rank first: the form's covariates, then others that explain about as much.
 
     `residuals`: those of the effect after the refit, (n_points,).

@@ -1,30 +1,216 @@
-"""Every effect of the vocabulary, built for one system: on readings, inputs, clock, parameters and rates."""
+"""Effects on a system: their formulas bound to targets, in the vocabulary and outside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
 
-from probewise._arrays import FloatArray
-from probewise.proof.systems.form import (
-    Form,
-    Instants,
-    Numbers,
-    Side,
-    TrueSystem,
-    draw_log_uniform,
-    linear_drift,
-    modulated,
-    proportional_to_column,
-    settling,
-    sinusoid_in_time,
-    step_at_change_point,
-    value_per_run,
-)
-from probewise.proof.systems.kind import SystemTable
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import NotConvergedError
+from probewise.proof.systems.kinds import SystemKind, SystemTable
+
+Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
+
+Numbers: TypeAlias = Mapping[str, float]
+"""A form's parameters by name."""
+
+OfAmplitude: TypeAlias = Callable[[float, dict[str, float]], dict[str, float]]
+Draw: TypeAlias = Callable[[np.random.Generator], dict[str, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Instants:
+    """Instants of runs, at rows or between them; arrays broadcast.
+
+    `t` is the recorded time, `since` the time since the start of the run, `u` the columns by name, `run` the number of
+    the run, `row` the index of the row.
+    """
+
+    t: FloatArray
+    since: FloatArray
+    u: Mapping[str, Any]
+    run: IntArray
+    row: FloatArray
+
+    @classmethod
+    def at_rows(cls, rows: SystemTable) -> Self:
+        """Return the instants of all rows of a table."""
+        return cls(rows.t, rows.time_since_start, rows.columns, rows.run, np.arange(float(len(rows))))
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """The formula of an effect, in the vocabulary or outside, bound to a target.
+
+    It is called `name` or `name:target`, and changes a `side`: `act`, of an input, is a function of columns, rows and
+    parameters that returns columns; of a parameter, of now and parameters, that returns a term to add; of the rate of a
+    state, of states, now and parameters, that returns a term to add; of the reading, of readings, rows and parameters,
+    that returns readings. `first` and `limit` are the first amplitude tried and the largest, `covariates` those along
+    which its residual is visible. `draw` draws all parameters except the amplitude and its sign (negative ones too if
+    `signed`), and `of_amplitude` returns all by name. `target` is the parameter or state on which it acts; forms of
+    readings act in ascending `order`; `uses` are the columns that it uses; `breaks` is a function of the parameters
+    that returns the time of a discontinuity; `late` is the column that it delays. `sticks` and `stops`: it is dry
+    friction, or an upper bound, of the target; `outside`: of the vocabulary of a diagnosis.
+    """
+
+    name: str
+    side: Side
+    act: Callable[..., Any]
+    first: float
+    limit: float
+    covariates: tuple[str, ...]
+    of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
+    draw: Draw = lambda rng: {}
+    signed: bool = True
+    target: str = ""
+    order: int = 0
+    uses: tuple[str, ...] = ()
+    breaks: Callable[[Numbers], float] | None = None
+    late: str = ""
+    sticks: bool = False
+    stops: bool = False
+    outside: bool = False
+
+    @property
+    def vocabulary_name(self) -> str:
+        """Name in the vocabulary: that of "saturation (floor)" is "saturation"."""
+        return self.name.removesuffix(" (floor)")
+
+
+FormWithParameters: TypeAlias = tuple[Form, Numbers]
+"""A form with its parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSystem:
+    """A system simulated without noise over the rows of a table, at parameters that are numbers or (n_points,).
+
+    `readings`, (n_points,), and `states` by name of the same shape ({} for a static system). Effects are made for one
+    at its true parameters, without effects, over the rows that are not held out.
+    """
+
+    kind: SystemKind
+    table: SystemTable
+    parameters: Mapping[str, Any]
+    readings: FloatArray
+    states: Mapping[str, FloatArray]
+
+    @property
+    def varying_columns(self) -> tuple[str, ...]:
+        """Names of the columns that vary, except time."""
+        return tuple(name for name, v in self.table.columns.items() if name != self.table.time and np.ptp(v) > 0)
+
+    @property
+    def names_runs(self) -> bool:
+        """Whether the table names its runs, of which there are several."""
+        return self.kind.run is not None and len(self.table.rows_by_run) > 1
+
+    def deviation(self, column: str) -> tuple[float, float]:
+        """Return mean and sd of a column over the rows that are not held out."""
+        values = self.table.columns[column]
+        return float(values.mean()), float(values.std())
+
+    def rms_rate(self, state: str) -> float:
+        """Return the root-mean-square rate of a state, from differences between successive rows of a run."""
+        found = []
+        for own in self.table.rows_by_run:
+            gaps = np.diff(self.table.t[own])
+            found.append(np.diff(self.states[state][own])[gaps > 0] / gaps[gaps > 0])
+        return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+    def random_time(self, rng: np.random.Generator) -> float:
+        """Draw a time (or a row plus 0.5, if there is no time) from the middle 60 % of the rows."""
+        at = float(np.quantile(self.table.t, rng.uniform(0.2, 0.8)))
+        return math.floor(at) + 0.5 if self.table.time is None else at
+
+
+def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number between `low` and `high` whose logarithm is uniform; NotConvergedError if the range is empty."""
+    if not 0 < low < high:
+        raise NotConvergedError(f"nothing lies between {low:g} and {high:g}: too few rows")
+    return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+
+def modulation(value_at: Callable[[Instants, Numbers], Any], *covariates: str, reach: float = 1.0, **more: Any) -> Form:
+    """Return a variation in proportion to an amplitude, of which forms are made by `modulated`.
+
+    `value_at` is a function of instants and parameters, `reach` its typical magnitude at amplitude 1; `more` as of
+    `Form`.
+    """
+    return Form("", "parameter", value_at, 1 / reach, math.inf, covariates, **more)
+
+
+def modulated(how: Form, name: str, side: Side, size: float, *, limit: float, **more: Any) -> Form:
+    """Return the form that varies so, by default a term added; `size` of its first amplitude, `limit` in that."""
+    first = size * how.first
+    return replace(how, name=name, side=side, first=first, limit=limit * first, **more)
+
+
+def linear_drift(true: SimulatedSystem) -> Form:
+    """Return the modulation a t, t the recorded time."""
+    names = dict.fromkeys(("time", true.table.time or "time"))
+    return modulation(lambda now, v: v["a"] * now.t, *names, reach=float(np.abs(true.table.t).max()))
+
+
+def proportional_to_column(true: SimulatedSystem, column: str) -> Form:
+    """Return the modulation a (column - its mean over the recording)."""
+    middle, sd = true.deviation(column)
+    return modulation(lambda now, v: v["a"] * (now.u[column] - middle), column, reach=sd, uses=(column,))
+
+
+def step_at_change_point(true: SimulatedSystem) -> Form:
+    """Return the modulation 0, then a after a time "at_s", or after a row "at_row" if the table has no time."""
+    timed = true.table.time is not None
+    at = "at_s" if timed else "at_row"
+    return modulation(
+        lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at]),
+        *(("time", str(true.table.time)) if timed else ("row",)),
+        draw=lambda rng: {at: true.random_time(rng)},
+        breaks=(lambda v: v[at]) if timed else None,
+    )
+
+
+def value_per_run(true: SimulatedSystem) -> Form:
+    """Return a modulation with one normal random value per run, held-out runs included, times the amplitude."""
+    names = [f"values[{k}]" for k in range(true.table.n_runs)]
+    return modulation(
+        lambda now, v: np.array([v[name] for name in names])[now.run],
+        "run",
+        of_amplitude=lambda a, drawn: {name: a * drawn[name] for name in names},
+        draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
+    )
+
+
+def sinusoid_in_time(true: SimulatedSystem) -> Form:
+    """Return a sinusoid in time, its period from four rows to two thirds of the recording."""
+    rows = true.table
+    return modulation(
+        lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
+        "time",
+        str(rows.time),
+        draw=lambda rng: {
+            "hz": draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap),
+            "phase": float(rng.uniform(0, 2 * np.pi)),
+        },
+        signed=False,
+    )
+
+
+def settling(true: SimulatedSystem) -> Form:
+    """Return the modulation a exp(-t / tau_s), t the time since the start of the run."""
+    longest = float(true.table.time_since_start.max())
+    return modulation(
+        lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"]),
+        *("time", "run", str(true.table.time)),
+        draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
+    )
+
 
 GAIN, OFFSET, _HYSTERESIS, _BEND, _LAG, _CEILING = range(6)
 _MANY = 1e4  # largest amplitude of a term, in noise sds
@@ -48,7 +234,7 @@ def family_of(form: Form) -> str:
     return ADDED_FAMILIES[1] if of_column else form.vocabulary_name.split(":")[0]
 
 
-def forms_of(true: TrueSystem) -> list[Form]:
+def forms_of(true: SimulatedSystem) -> list[Form]:
     """Return every form of the vocabulary, once for each of its possible targets in this system."""
     out = [*_modulated_forms(true), *_forms_of_levels(true), *_lag_and_delay_forms(true)]
     for column in true.kind.drives:
@@ -56,8 +242,7 @@ def forms_of(true: TrueSystem) -> list[Form]:
     time = true.table.time
     # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (true.kind.law is not None or true.kind.restarts_time):
-        scaled = _act_on_column(time, lambda c, rows, v: c * (1 + v["a"]))
-        out.append(Form("clock_drift", "input", scaled, 1e-3, 0.5, ("time", time)))
+        out.append(_input_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, "time", time))
     out += _varying_parameter_forms(true)
     if true.kind.defines_states:
         for state in true.states:
@@ -65,7 +250,17 @@ def forms_of(true: TrueSystem) -> list[Form]:
     return out
 
 
-def modulated_reading_form(true: TrueSystem, name: str, how: Form, *, gain: bool = False) -> Form:
+def _is(number: str) -> dict[str, Any]:
+    """Return the fields of a form of one parameter, the `number`, which is the amplitude."""
+    return {"of_amplitude": lambda a, drawn: {number: a}, "signed": False}
+
+
+def _bounded_by(end: float, inwards: float) -> dict[str, Any]:
+    """Return the fields of a form with a "level", which the amplitude moves inwards from an end of the range."""
+    return {"of_amplitude": lambda a, drawn: {"level": end + inwards * a}, "signed": False}
+
+
+def _modulated_reading_form(true: SimulatedSystem, name: str, how: Form, *, gain: bool = False) -> Form:
     """Return the form that adds a modulation to the reading or, with `gain`, multiplies by 1 + modulation."""
 
     def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
@@ -74,25 +269,23 @@ def modulated_reading_form(true: TrueSystem, name: str, how: Form, *, gain: bool
 
     typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
     order = GAIN if gain else OFFSET
-    return modulated(how, name, "reading", true.noise_sd / typical, limit=_MANY, act=act, order=order)
+    return modulated(how, name, "reading", true.kind.sd / typical, limit=_MANY, act=act, order=order)
 
 
-def added_form(
-    true: TrueSystem, name: str, addition: Callable[..., Any], covariates: tuple[str, ...], **more: Any
+def _added_form(
+    true: SimulatedSystem, name: str, addition: Callable[..., Any], *covariates: str, order: int = OFFSET, **more: Any
 ) -> Form:
     """Return the form that adds `a` times `addition` (readings, rows, parameters) to the reading."""
-    return Form(
-        name,
-        "reading",
-        lambda y, rows, v: y + v["a"] * addition(y, rows, v),
-        true.noise_sd,
-        _MANY * true.noise_sd,
-        covariates,
-        **{"order": OFFSET, **more},
-    )
+    sd = true.kind.sd
+    act = partial(_with_addition, addition)
+    return Form(name, "reading", act, sd, _MANY * sd, covariates, order=order, **more)
 
 
-def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
+def _with_addition(addition: Callable[..., Any], y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+    return np.asarray(y + v["a"] * addition(y, rows, v))
+
+
+def _modulated_forms(true: SimulatedSystem) -> Iterator[Form]:
     timed = true.table.time is not None
     both = {"step": step_at_change_point(true)}
     if timed:
@@ -100,20 +293,20 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
     if true.names_runs:
         both["per_run"] = value_per_run(true)
     for kind, how in both.items():
-        yield modulated_reading_form(true, f"offset_{kind}", how)
-        yield modulated_reading_form(true, f"gain_{kind}", how, gain=True)
+        yield _modulated_reading_form(true, f"offset_{kind}", how)
+        yield _modulated_reading_form(true, f"gain_{kind}", how, gain=True)
     for column in true.varying_columns:
-        yield modulated_reading_form(true, f"sensitivity:{column}", proportional_to_column(true, column))
+        yield _modulated_reading_form(true, f"sensitivity:{column}", proportional_to_column(true, column))
         yield from _curve_and_friction_forms(true, column)
     if timed:
-        yield modulated_reading_form(true, "interference", sinusoid_in_time(true))
+        yield _modulated_reading_form(true, "interference", sinusoid_in_time(true))
         if true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
-            yield modulated_reading_form(true, "settling", settling(true))
+            yield _modulated_reading_form(true, "settling", settling(true))
 
 
-def _curve_and_friction_forms(true: TrueSystem, column: str) -> Iterator[Form]:
+def _curve_and_friction_forms(true: SimulatedSystem, column: str) -> Iterator[Form]:
     """Yield a polynomial of an order of two to five in a column, and its friction if it moves both ways."""
-    values = true.table.columns[column]
+    values, sd = true.table.columns[column], true.kind.sd
     middle, half = 0.5 * float(values.max() + values.min()), 0.5 * float(np.ptp(values))
     orders = range(1, 6)
 
@@ -121,33 +314,28 @@ def _curve_and_friction_forms(true: TrueSystem, column: str) -> Iterator[Form]:
         z = (rows.columns[column] - middle) / half
         return np.asarray(y + np.polyval([*(v[f"a{k}"] for k in reversed(orders)), 0.0], z))
 
-    def draw_coefficients(rng: np.random.Generator) -> dict[str, float]:
+    def coefficients(rng: np.random.Generator) -> dict[str, float]:
         order = int(rng.integers(2, 6))
         size = np.append(rng.uniform(-1, 1, order - 1), 1.0)  # the highest is the largest
         return {f"a{k}": float(size[k - 1]) if k <= order else 0.0 for k in orders}
 
+    def scaled(a: float, drawn: dict[str, float]) -> dict[str, float]:
+        return {name: a * size for name, size in drawn.items()}
+
     if len(np.unique(values)) > len(orders):
-        yield Form(
-            f"curve:{column}",
-            "reading",
-            curve,
-            true.noise_sd,
-            _MANY * true.noise_sd,
-            (column,),
-            of_amplitude=lambda a, drawn: {name: a * size for name, size in drawn.items()},
-            draw=draw_coefficients,
-            order=OFFSET,
-        )
+        name, limit = f"curve:{column}", _MANY * sd
+        yield Form(name, "reading", curve, sd, limit, (column,), scaled, coefficients, order=OFFSET)
     speeds = np.sort(np.abs(values[values != 0]))
     if min(len(np.unique(side)) for side in (values[values < 0], values[values > 0])) >= 3:
         low, high = float(speeds[len(speeds) // 20]), 0.3 * float(speeds[-1])
-        yield added_form(
-            true,
-            f"friction:{column}",
-            lambda y, rows, v: np.tanh(rows.columns[column] / max(v["width"], 1e-12 * half)),
-            (column,),
-            draw=lambda rng: {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, low, high)},
-        )
+
+        def pull(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+            return np.tanh(rows.columns[column] / max(v["width"], 1e-12 * half))
+
+        def width(rng: np.random.Generator) -> dict[str, float]:
+            return {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, low, high)}
+
+        yield _added_form(true, f"friction:{column}", pull, column, draw=width)
 
 
 def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
@@ -162,13 +350,12 @@ def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
     return out
 
 
-def _forms_of_levels(true: TrueSystem) -> Iterator[Form]:
+def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
     """Yield what depends on the reading itself: hysteresis, a bend, a ceiling and a floor."""
-    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.noise_sd
-    span = high - low
-    yield added_form(
-        true, "hysteresis", lambda y, rows, v: direction_of_change(y, rows), ("previous",), order=_HYSTERESIS
-    )
+    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.kind.sd
+    span, level = high - low, ("level",)
+    turns = partial(_added_form, true, "hysteresis", lambda y, rows, v: direction_of_change(y, rows))
+    yield turns("previous", order=_HYSTERESIS)
     if not span > 0:
         return
 
@@ -176,38 +363,14 @@ def _forms_of_levels(true: TrueSystem) -> Iterator[Form]:
         z = (y - low) / span
         return np.asarray(y + v["a"] * span * (np.sign(z) * np.abs(z) ** v["power"] - z))
 
-    def drawn_power(rng: np.random.Generator) -> dict[str, float]:
+    def power(rng: np.random.Generator) -> dict[str, float]:
         return {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}
 
-    yield Form("nonlinearity", "reading", bend, sd / span, 0.5, ("level",), draw=drawn_power, order=_BEND)
-    common: dict[str, Any] = {"signed": False, "order": _CEILING}
-    for name, bound, end in (("saturation", np.minimum, high), ("saturation (floor)", np.maximum, low)):
-        inwards = -1.0 if end == high else 1.0
-
-        def bounded(y: FloatArray, rows: SystemTable, v: Any, bound: Any = bound) -> FloatArray:
-            return np.asarray(bound(y, v["level"]))
-
-        def level_at(a: float, drawn: Any, end: float = end, inwards: float = inwards) -> dict[str, float]:
-            return {"level": end + inwards * a}
-
-        yield Form(
-            name,
-            "reading",
-            bounded,
-            2 * sd,
-            0.5 * span,
-            ("level",),
-            of_amplitude=level_at,
-            **common,
-        )
-
-
-def _form_of_number(
-    name: str, side: Side, number: str, act: Callable[..., Any], first: float, limit: float, *more: Any, **others: Any
-) -> Form:
-    """Return a form of one parameter, the `number`, which is the amplitude."""
-    others |= {"of_amplitude": lambda a, drawn: {number: a}, "signed": False}
-    return Form(name, side, act, first, limit, *more, **others)
+    yield Form("nonlinearity", "reading", bend, sd / span, 0.5, level, draw=power, order=_BEND)
+    bounds = (("saturation", np.minimum, high, -1.0), ("saturation (floor)", np.maximum, low, 1.0))
+    for name, bound, *end in bounds:
+        act = partial(lambda bound, y, rows, v: bound(y, v["level"]), bound)
+        yield Form(name, "reading", act, 2 * sd, 0.5 * span, level, **_bounded_by(*end), order=_CEILING)
 
 
 def delayed_values(values: FloatArray, rows: SystemTable, tau: float) -> FloatArray:
@@ -219,6 +382,10 @@ def delayed_values(values: FloatArray, rows: SystemTable, tau: float) -> FloatAr
     return out
 
 
+def _late(values: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+    return delayed_values(values, rows, v["tau_s"])
+
+
 def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
     out = y.copy()
     for own in rows.rows_by_run:
@@ -228,75 +395,61 @@ def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
     return out
 
 
-def _lag_and_delay_forms(true: TrueSystem) -> Iterator[Form]:
+def _lag_and_delay_forms(true: SimulatedSystem) -> Iterator[Form]:
     if true.table.time is not None:
-        gap, acts = (
-            true.table.median_gap,
-            {"lag": _lagged, "delay": lambda y, rows, v: delayed_values(y, rows, v["tau_s"])},
-        )
-        for name, act in acts.items():
-            yield _form_of_number(name, "reading", "tau_s", act, 0.5 * gap, 15 * gap, ("previous",), order=_LAG)
+        gap = true.table.median_gap
+        for name, act in (("lag", _lagged), ("delay", _late)):
+            yield Form(name, "reading", act, 0.5 * gap, 15 * gap, ("previous",), **_is("tau_s"), order=_LAG)
 
 
-def _act_on_column(column: str, change: Callable[[FloatArray, SystemTable, Numbers], Any]) -> Callable[..., Any]:
-    """Return a `Form.act` that replaces one column by `change(column, rows, parameters)`."""
-    return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
+def _input_form(
+    name: str, column: str, change: Callable[..., Any], first: float, limit: float, *covariates: str, **more: Any
+) -> Form:
+    """Return the form that replaces a column of the law or formula by `change(column, rows, parameters)`."""
+
+    def act(columns: Mapping[str, FloatArray], rows: SystemTable, v: Numbers) -> dict[str, FloatArray]:
+        return {**columns, column: np.asarray(change(columns[column], rows, v))}
+
+    return Form(name, "input", act, first, limit, covariates, **more)
 
 
 def _narrowed(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
     return np.asarray(np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0))
 
 
-def _forms_of_input(true: TrueSystem, column: str) -> Iterator[Form]:
+def _with_runout(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+    return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
+
+
+def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
     """Yield the forms on a column that the law or formula uses."""
     values, (_, spread) = true.table.columns[column], true.deviation(column)
     low, high = float(values.min()), float(values.max())
     span, own, n_values = high - low, (column, "level"), len(np.unique(values))
     if not span > 0:
         return
-    begin = 0.01 * spread
-    offset = _act_on_column(column, lambda c, rows, v: c + v["a"])
-    yield Form(f"input_offset:{column}", "input", offset, begin, 5 * span, own)
-    scaled = _act_on_column(column, lambda c, rows, v: c * (1 + v["a"]))
-    yield Form(f"input_gain:{column}", "input", scaled, 0.01, 0.9, own)
-    yield Form(
-        f"input_saturation:{column}",
-        "input",
-        _act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
-        0.05 * span,
-        0.6 * span,
-        own,
-        lambda a, drawn: {"level": high - a},
-        signed=False,
-    )
 
-    def of_width(name: str, change: Callable[..., Any], seen: tuple[str, ...]) -> Form:
-        act = _act_on_column(column, change)
-        return _form_of_number(f"{name}:{column}", "input", "width", act, 0.01 * span, 0.3 * span, seen)
+    def form(name: str, change: Callable[..., Any], first: float, limit: float, *seen: str, **more: Any) -> Form:
+        return _input_form(f"{name}:{column}", column, change, first, limit, *(seen or own), **more)
 
+    def wave(rng: np.random.Generator) -> dict[str, float]:
+        period = span / draw_log_uniform(rng, 1.5, min(n_values / 6, 25))
+        return {"period": period, "phase": float(rng.uniform(0, 2 * np.pi))}
+
+    yield form("input_offset", lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span)
+    yield form("input_gain", lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9)
+    ceiling = _bounded_by(high, -1.0)
+    yield form("input_saturation", lambda c, rows, v: np.minimum(c, v["level"]), 0.05 * span, 0.6 * span, **ceiling)
     if low <= 0.1 * span:
-        yield of_width("dead_zone", _narrowed, own)
+        yield form("dead_zone", _narrowed, 0.01 * span, 0.3 * span, **_is("width"))
     moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
-        yield of_width("backlash", behind_gear_play, ("previous", column))
+        yield form("backlash", behind_gear_play, 0.01 * span, 0.3 * span, "previous", column, **_is("width"))
     if n_values > 20:
-        yield Form(
-            f"periodic_error:{column}",
-            "input",
-            _act_on_column(column, lambda c, rows, v: c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"])),
-            begin,
-            0.2 * span,
-            own,
-            draw=lambda rng: {
-                "period": span / draw_log_uniform(rng, 1.5, min(n_values / 6, 25)),
-                "phase": float(rng.uniform(0, 2 * np.pi)),
-            },
-            signed=False,
-        )
+        yield form("periodic_error", _with_runout, 0.01 * spread, 0.2 * span, draw=wave, signed=False)
     if true.table.time is not None:
-        gap, act = true.table.median_gap, _act_on_column(column, lambda c, rows, v: delayed_values(c, rows, v["tau_s"]))
-        seen = ("previous", column)
-        yield _form_of_number(f"input_delay:{column}", "input", "tau_s", act, 0.5 * gap, 6 * gap, seen, late=column)
+        gap = true.table.median_gap
+        yield form("input_delay", _late, 0.5 * gap, 6 * gap, "previous", column, **_is("tau_s"), late=column)
 
 
 def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
@@ -314,7 +467,7 @@ def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray
     return out
 
 
-def _varying_parameter_forms(true: TrueSystem) -> Iterator[Form]:
+def _varying_parameter_forms(true: SimulatedSystem) -> Iterator[Form]:
     """Yield the forms by which each parameter may vary: in a step, a drift, from run to run, with a column."""
     common = {"steps": step_at_change_point(true)}
     if true.table.time is not None:
@@ -327,50 +480,120 @@ def _varying_parameter_forms(true: TrueSystem) -> Iterator[Form]:
         if not of_run and true.names_runs:
             own[f"differs:{name}"] = value_per_run(true)
         own |= {f"depends:{name}:{column}": proportional_to_column(true, column) for column in true.varying_columns}
-        for called, how in own.items():
-            size = 0.003 * float(np.abs(values).mean())
-            yield modulated(how, called, "parameter", size, limit=200, target=name)
+        size = 0.003 * float(np.abs(values).mean())
+        yield from (modulated(how, called, "parameter", size, limit=200, target=name) for called, how in own.items())
 
 
-def rate_term_form(
-    true: TrueSystem, name: str, state: str, push: Callable[[Any, Any, Any], Any], size: float, **more: Any
-) -> Form:
+def _rate_form(
+    true: SimulatedSystem, name: str, state: str, push: Callable[[Any, Any, Any], Any], size: float, *seen: str,
+    **more: Any,
+) -> Form:  # fmt: skip
     """Return the form of a term a push(states, now, parameters) in the rate of a state; `size`: push's magnitude."""
     first = 0.01 * true.rms_rate(state) / size
-    return Form(name, "rate", lambda s, now, v: v["a"] * push(s, now, v), first, 300 * first, target=state, **more)
+    return Form(
+        name, "rate", lambda s, now, v: v["a"] * push(s, now, v), first, 300 * first, seen, target=state, **more
+    )
 
 
-def _forms_of_rate(true: TrueSystem, state: str) -> Iterator[Form]:
+def _forms_of_rate(true: SimulatedSystem, state: str) -> Iterator[Form]:
     """Yield the terms that may be missing from the rate of a state, dry friction and an upper bound included."""
-    speed, values = true.rms_rate(state), true.states[state]
+    speed, values, waves = true.rms_rate(state), true.states[state], sinusoid_in_time(true)
 
-    def term(name: str, of: str, change: Callable[[Any], Any], size: float, seen: tuple[str, ...], **more: Any) -> Form:
+    def term(name: str, of: str, change: Callable[[Any], Any], size: float, *seen: str, **more: Any) -> Form:
         """Return a term that is a function `change` of the state `of`."""
-        return rate_term_form(true, name, state, lambda s, now, v: change(s[of]), size, covariates=seen, **more)
+        return _rate_form(true, name, state, lambda s, now, v: change(s[of]), size, *seen, **more)
 
     size, own = float(np.abs(values).max()), (f"state:{state}", "time")
-    yield term(f"damping:{state}", state, lambda r: -r, size, own, signed=False)
-    yield term(f"drag:{state}", state, lambda r: -np.abs(r) * r, size**2, own, signed=False)
-    yield term(f"forcing:{state}", state, lambda r: 1.0 + 0.0 * r, 1.0, ("time", *own))
+    yield term(f"damping:{state}", state, lambda r: -r, size, *own, signed=False)
+    yield term(f"drag:{state}", state, lambda r: -np.abs(r) * r, size**2, *own, signed=False)
+    yield term(f"forcing:{state}", state, lambda r: 1.0 + 0.0 * r, 1.0, "time", *own)
     for other, there in true.states.items():
         most, seen = float(np.abs(there).max()), (f"state:{other}", "time")
-        yield term(f"cubic:{state}:{other}", other, lambda r: -(r**3), most**3, seen)
-        yield term(f"quadratic:{state}:{other}", other, lambda r: -(r**2), most**2, seen)
+        yield term(f"cubic:{state}:{other}", other, lambda r: -(r**3), most**3, *seen)
+        yield term(f"quadratic:{state}:{other}", other, lambda r: -(r**2), most**2, *seen)
         if other != state:
-            yield term(f"coupling:{state}:{other}", other, lambda r: -r, most, seen)
-    waves = sinusoid_in_time(true)
-    act, name = (lambda s, now, v: waves.act(now, v)), f"periodic_forcing:{state}"
-    yield modulated(waves, name, "rate", 0.02 * speed, limit=100, act=act, target=state)
-    held: dict[str, Any] = {"covariates": (f"state:{state}", "level"), "signed": False, "target": state}
-    yield Form(f"friction:{state}", "rate", lambda s, now, v: 0.0, 0.02 * speed, 2 * speed, sticks=True, **held)
+            yield term(f"coupling:{state}:{other}", other, lambda r: -r, most, *seen)
+    act = partial(lambda waves, s, now, v: waves.act(now, v), waves)
+    yield modulated(waves, f"periodic_forcing:{state}", "rate", 0.02 * speed, limit=100, act=act, target=state)
+    held = partial(Form, side="rate", act=lambda s, now, v: 0.0, covariates=(f"state:{state}", "level"), target=state)
+    yield held(f"friction:{state}", first=0.02 * speed, limit=2 * speed, sticks=True, signed=False)
     high, span = float(values.max()), float(np.ptp(values))
-    yield Form(
-        f"limit:{state}",
-        "rate",
-        lambda s, now, v: 0.0,
-        0.05 * span,
-        0.6 * span,
-        of_amplitude=lambda a, drawn: {"level": high - a},
-        stops=True,
-        **held,
-    )
+    yield held(f"limit:{state}", first=0.05 * span, limit=0.6 * span, stops=True, **_bounded_by(high, -1.0))
+
+
+OUT_OF_VOCABULARY = (
+    *("product", "square_wave", "switch", "one_sided_spring", "leak", "memory", "two_settlings", "column_times_state"),
+    *("chirp", "fading_bend"),
+)
+"""Names of effects outside the vocabulary, without targets."""
+
+
+def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> Iterator[Form]:
+    """Yield the effects outside the vocabulary that this system can have, on randomly drawn columns and states."""
+    one, other = (str(name) for name in rng.permutation(true.varying_columns)[:2])
+    (middle, spread), (middle_of_other, spread_of_other) = true.deviation(one), true.deviation(other)
+    low, high = float(true.readings.min()), float(true.readings.max())
+    at = float(np.quantile(true.table.columns[one], rng.uniform(0.55, 0.8)))
+
+    def adds(name: str, addition: Callable[..., Any], *covariates: str, **more: Any) -> Form:
+        return _added_form(true, f"strange_{name}", addition, *covariates, outside=True, **more)
+
+    def memory(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        """Saturate with the sum of the column's absolute deviations since the start of the run."""
+        out = np.empty(len(rows))
+        for own in rows.rows_by_run:
+            out[own] = np.tanh(np.cumsum(np.abs(rows.columns[one][own] - middle)) / spread / 12)
+        return out
+
+    def fading_bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        z = np.clip((y - low) / (high - low), 0, 1)
+        return np.asarray(4 * z * (1 - z) * (rows.columns[one] - middle) / spread)
+
+    def product(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        factors = rows.columns[one] - middle, rows.columns[other] - middle_of_other
+        return factors[0] * factors[1] / (spread * spread_of_other)
+
+    yield adds(f"product:{one}:{other}", product, one, other, "time", "run")
+    yield adds(f"switch:{one}", lambda y, rows, v: 1.0 * (rows.columns[one] > at), one, "time", "run")
+    yield adds(f"memory:{one}", memory, "time", "run", one)
+    yield adds(f"fading_bend:{one}", fading_bend, one, "level")
+    if true.table.time is not None:
+        timed, duration = ("time", str(true.table.time)), true.table.duration
+        hz = draw_log_uniform(rng, 4 / duration, 0.06 / true.table.median_gap)
+        begin, longest = float(true.table.t.min()), float(true.table.time_since_start.max())
+
+        def chirp(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+            z = (rows.t - begin) / duration
+            return np.sin(2 * np.pi * (3 * z + 8 * z**2))
+
+        def two_settlings(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+            z = rows.time_since_start / longest
+            return np.exp(-z / 0.05) - 1.5 * np.exp(-z / 0.35)
+
+        square = partial(adds, "square_wave", lambda y, rows, v: 1.0 * ((hz * rows.t) % 1.0 < 0.3))
+        yield square(*timed, draw=lambda rng: {"hz": hz})
+        yield adds("chirp", chirp, *timed)
+        if true.kind.run is not None:
+            yield adds("two_settlings", two_settlings, "time", "run", timed[1])
+    if true.states:
+        state = str(rng.choice(list(true.states)))
+        values, own = true.states[state], (f"state:{state}", "level", "time")
+        most, sprung = float(np.abs(values).max()), float(np.quantile(values, 0.6))
+
+        def pushes(name: str, push: Callable[..., Any], size: float, *seen: str, **more: Any) -> Form:
+            return _rate_form(true, f"strange_{name}:{state}", state, push, size, *seen, outside=True, **more)
+
+        def spring(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
+            return -np.maximum(s[state] - sprung, 0.0)
+
+        def leak(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
+            return -np.expm1(np.clip(s[state] / (0.3 * most), -30, 12))
+
+        def pull(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
+            return np.asarray(-(now.u[one] - middle) / spread * s[state] ** 2 / most**2)
+
+        yield pushes("one_sided_spring", spring, float(np.ptp(values)), *own)
+        yield pushes("leak", leak, 20.0, *own)
+        seen = (one, f"state:{state}", "time", "run", "level")
+        column = pushes("column_times_state", pull, 1.0, *seen, uses=(one,))
+        yield replace(column, name=f"{column.name}:{one}")

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from probewise._arrays import FloatArray
-from probewise.proof.systems.kind import SystemTable
+from probewise.proof.systems.kinds import SystemTable
 
 OTHER_NOISE = (
     "correlated_noise",

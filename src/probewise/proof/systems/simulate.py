@@ -17,8 +17,8 @@ from scipy.integrate import solve_ivp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.proof.systems.form import Form, FormWithParameters, Instants
-from probewise.proof.systems.kind import Law, SystemKind, SystemTable
+from probewise.proof.systems.forms import Form, FormWithParameters, Instants, SimulatedSystem
+from probewise.proof.systems.kinds import Law, SystemKind, SystemTable
 
 _RTOL, _ATOL = 1e-8, 1e-10
 _REST = 1e-9  # share of a state's scale below which it is at rest
@@ -28,17 +28,9 @@ _CLOSE = 1e-7  # share of a gap: closer events are merged
 _HAIR = 1e-8  # share of a gap by which an interval keeps away from discontinuities at its ends
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseFreeResult:
-    """Noise-free readings, (n_points,), and states by name of the same shape ({} for a static system)."""
-
-    readings: FloatArray
-    states: Mapping[str, FloatArray]
-
-
 def simulate_noise_free(
     kind: SystemKind, rows: SystemTable, parameters: Mapping[str, Any], effects: Sequence[FormWithParameters] = ()
-) -> NoiseFreeResult:
+) -> SimulatedSystem:
     """Simulate a system without noise.
 
     `rows`: the table of the rows to simulate; `parameters`: by name, a number or (n_points,) each; `effects`: forms,
@@ -62,7 +54,7 @@ def simulate_noise_free(
     readings = np.array(np.broadcast_to(readings, len(rows)), dtype=np.float64)
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)
-    return NoiseFreeResult(readings, states)
+    return SimulatedSystem(kind, rows, parameters, readings, states)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from scipy.stats import norm, t
 
 from probewise.diagnosis import ModelSamples
 from probewise.priors import Normal, Uniform
-from probewise.proof.system_challenge import predict_runs
+from probewise.proof.challenge import predict_runs
 from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 

@@ -2,8 +2,9 @@
 
 import pytest
 
-from probewise.proof.pages import _case_cells, challenge_html
+from probewise.proof.pages import _case_cells, challenge_page
 from probewise.proof.tables import gains_on_held_out_runs, name_without_target, score_systems
+from probewise.report.html import draw_or_raise
 
 
 def _hidden(name, size=12.0, *, rivals=None, on_the_list=True, shows_in=("time",)):
@@ -197,6 +198,6 @@ def test_the_page_tells_every_case():
     failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
     strange = _case("outside", 20.0, truth=["unknown"], hides=[_hidden("strange_switch:u", 20.0, on_the_list=False)])
     results = [_case(), _single("drifts:k"), strange, failed]
-    text = challenge_html(results, score_systems(results), command="probewise challenge", systems=True)
+    text = challenge_page(results, score_systems, command="probewise challenge", systems=True).html(draw_or_raise)
     for expected in ("drifts:k", "strange_switch:u", "ParameterError: no", "right covariate first, lambda 12"):
         assert expected in text

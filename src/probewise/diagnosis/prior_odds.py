@@ -25,8 +25,7 @@ class PriorOdds:
     `complexity_penalty` (nats) is the penalty of an effect per Gaussian of the SSF that it makes superfluous, since
     physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is that of an unknown effect.
     `named_needs_half`: effects on the mean are `named` only with half the probability, whatever noise is beside, or
-    if nearly all hypotheses share them, whatever is open beside them; an unknown effect is the verdict only if it has
-    more evidence than each named one alone. Otherwise the leading combination is named.
+    if nearly all hypotheses share them, whatever is open beside them. Otherwise the leading combination is named.
     `unlikely` are effects in places where hardly anything can be missing: each has `unlikely_weight` times the prior
     probability of another one.
     `twofold` are the effects that may occur twice; `twice` is the probability that one does, given that it occurs;

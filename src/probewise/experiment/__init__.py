@@ -53,7 +53,7 @@ from probewise.experiment.simulated import (
     with_cards,
     world_like,
 )
-from probewise.experiment.stopping import probability_of_length_off
+from probewise.experiment.stopping import least_readings, probability_of_length_off
 
 __all__ = [
     "CLEAN",
@@ -92,6 +92,7 @@ __all__ = [
     "find_shape",
     "found_shape",
     "geometry_entry",
+    "least_readings",
     "left_out_after_step",
     "naive_levels_from_recording",
     "naive_levels_from_world",

@@ -14,11 +14,12 @@ from scipy.stats import rankdata
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
 from probewise.experiment.arm_error import ArmError, arm_error_in_posterior
+from probewise.experiment.journal import PATTERN
 from probewise.experiment.kinds import Posterior
 from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
-from probewise.inquiry import UtilityMap
+from probewise.inquiry import Bound, UtilityMap, capacity_bits, fewest_readings, prior_entropy, target_entropy
 from probewise.nested import Weighted
 from probewise.scene.shapes import AnyOf, mean_angles, with_angles_near
 
@@ -31,6 +32,7 @@ MOST_MISSING = 8
 _TREND_P = 1e-3  # p-value of the residuals' strongest trend, every look counted, below which no kind is believed
 _FEWEST_FOR_TREND = 12  # readings
 _WHOLE = 1.0 - 1e-12  # a correlation beyond which rounding rules
+_ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on the shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,3 +307,33 @@ def stop_reason(
     if max_readings is not None and n_readings >= max_readings:
         return f"all {max_readings} readings that it may take are taken; {widest_known}"
     return None
+
+
+def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
+    """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
+
+    The search ends with the first reading on the shape. Any reading before is on the shape with probability p at most,
+    that of the best first place, and so carries at most the information of a yes or no with probability p; a yes leaves
+    a share p of all hypotheses. From there to the target sd, a reading carries at most the sensor's capacity. The
+    experiment has one shape and a known sensor; `n_samples` are drawn from the prior.
+    """
+    prior = experiment.prior
+    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
+    weight = np.full(n_samples, 1.0 / n_samples)
+    designs = experiment.designs
+    plan = replace(designs.plan(PATTERN), instrumentation=experiment.instrumentation)
+    predictive = experiment.forecast.predictive(
+        theta, weight, designs, plan, np.arange(experiment.grid.n_places), experiment.noise_sd
+    )
+    _, mass = next(predictive.level_weights(weight))
+    levels = predictive.levels
+    beside = levels[int(mass.sum(axis=0).argmax())]
+    covered = float(mass[:, np.abs(levels - beside) > _ON_SHAPE * experiment.noise_sd].sum(axis=1).max())
+    prior_bits = prior_entropy(prior, rng=rng)
+    return fewest_readings(
+        prior_bits,
+        prior_bits + math.log2(covered),
+        target_entropy(len(prior.names), experiment.stop_sd_mm),
+        most_covered=covered,
+        capacity=capacity_bits(float(levels[0]), float(levels[-1]), experiment.readout),
+    )

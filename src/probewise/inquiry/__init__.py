@@ -15,10 +15,14 @@ from probewise.inquiry.forecast import CardedForecast, DirectForecast, Forecast,
 from probewise.inquiry.grid import Design, Designs, Grid
 from probewise.inquiry.predictive import ReadingNoise
 from probewise.inquiry.readout import (
+    Bound,
     Readout,
     bits_gained,
+    capacity_bits,
     entropy_bits,
+    fewest_readings,
     prior_entropy,
+    target_entropy,
 )
 from probewise.inquiry.utilities import (
     UTILITY_NAMES,
@@ -40,6 +44,7 @@ from probewise.inquiry.utilities import (
 
 __all__ = [
     "UTILITY_NAMES",
+    "Bound",
     "CardedForecast",
     "Design",
     "Designs",
@@ -67,15 +72,18 @@ __all__ = [
     "WhichShape",
     "best_places_mask",
     "bits_gained",
+    "capacity_bits",
     "cards_of",
     "choose",
     "choose_several",
     "entropy_bits",
     "entropy_map",
+    "fewest_readings",
     "forecast_of",
     "label_entropy",
     "prior_entropy",
     "reachable_rows",
+    "target_entropy",
     "utility_map",
     "utility_named",
 ]

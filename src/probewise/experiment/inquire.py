@@ -55,6 +55,8 @@ FAR_SIDE = "expected information (bits) on the side of the shape that no reading
 INFORMATION = "expected information about the shape and what the sensor leaves out (bits)"
 ENDS = "probability that a reading there ends the run, plus bits about what the sensor leaves out"
 
+_COMPLETE = 0.05  # probability that the sensor model is complete, from which on that is open
+_MUCH_BITS = 0.25  # about the name, for which a reading is taken where that is not open
 _MISSING_REACH = 0.1  # of the field's diagonal: from there on, a missing reading hardly counts
 _SAME_MM = 1.0  # closer than this, two places count as one
 _NODES = 12  # of the reading expected under a name
@@ -104,10 +106,14 @@ def inquire(
     return given, utilities_near_end(experiment, raised, given, utilities, readings, rng=rng, known=judged.may_stop)
 
 
-def must_continue(utilities: UtilityMap) -> bool:
-    """Return whether a run goes on for a check, though it knows the shape: of its far side, or of the sensor."""
-    is_worth_it = utilities.label == NAMES and utilities.highest_utility >= ENOUGH_BITS
-    return is_worth_it or utilities.label == FAR_SIDE
+def must_continue(utilities: UtilityMap, kinds: Posterior) -> bool:
+    """Return whether a run goes on for a check, though it knows the shape: of its far side, or of the sensor.
+
+    Once the sensor model is surely not complete, the shape is known under every effect that may be left out: which of
+    them it is need not be told, and only a reading that tells much of it is taken.
+    """
+    least = ENOUGH_BITS if kinds.left_out.get("", 0.0) >= _COMPLETE else _MUCH_BITS
+    return utilities.label == FAR_SIDE or (utilities.label == NAMES and utilities.highest_utility >= least)
 
 
 @dataclass(frozen=True, eq=False)

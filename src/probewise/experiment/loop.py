@@ -123,7 +123,7 @@ def step(
     given, utilities = inquire(experiment, kinds, posterior, drawn, judged, state.field, readings, rng=rng)
     all_missing = max_missing is not None and n_missing >= max_missing
     all_taken = max_readings is not None and n_readings >= max_readings
-    checks = must_continue(utilities) and not all_taken
+    checks = must_continue(utilities, kinds) and not all_taken
     if judged.arm_error is None and (utilities.is_flat or all_missing or all_taken):
         judged = with_arm_error(judged, experiment, kinds, posterior, readings, rng=rng)
     reason = stop_reason(

@@ -100,6 +100,7 @@ def test_an_effect_of_ones_own_is_one_short_function(clean):
         return lambda values, rows: values + (rows.time_s > at_s)
 
     assert step(100).name == "step"
+    assert {step(100), step(at_s=100)} == {step(100)} != {step(99)}
     np.testing.assert_allclose(world(step(100)).expected_readings(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
 
 

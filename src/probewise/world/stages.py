@@ -107,7 +107,7 @@ class Concealed:
 
     name: str
     stage: Stage
-    parameters: Mapping[str, Any]
+    parameters: Mapping[str, Any] = field(hash=False)
     act: Act = field(compare=False, repr=False)
 
     @property

@@ -1,5 +1,7 @@
 """Readings, noise, and each concealed effect against its formula in the vocabulary."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -100,6 +102,8 @@ def test_an_effect_of_ones_own_is_one_short_function(clean):
         return lambda values, rows: values + (rows.time_s > at_s)
 
     assert step(100).name == "step"
+    assert {step(100), step(at_s=100)} == {step(100)} != {step(99)}
+    assert pickle.loads(pickle.dumps(known.saturation(45.0))) == known.saturation(45.0, softness=0.0)
     np.testing.assert_allclose(world(step(100)).expected_readings(PLAN) - clean, PLAN.time_s > 100, atol=1e-12)
 
 

@@ -103,12 +103,16 @@ Act: TypeAlias = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Concealed:
-    """An effect that a world conceals: its name, the stage at which it acts, its parameters by name, how it acts."""
+    """An effect that a world conceals: name, stage, parameters by name, how it acts, and the kind that makes it."""
 
     name: str
     stage: Stage
-    parameters: Mapping[str, Any]
+    parameters: Mapping[str, Any] = field(hash=False)
     act: Act = field(compare=False, repr=False)
+    kind: Callable[..., Concealed] = field(compare=False, repr=False)
+
+    def __reduce__(self) -> tuple[Callable[..., Concealed], tuple[Any, ...]]:
+        return self.kind, tuple(self.parameters.values())
 
     @property
     def disturbs(self) -> bool:
@@ -127,7 +131,7 @@ def acts_at(stage: Stage) -> Callable[[Callable[P, Act]], Callable[P, Concealed]
         def effect(*values: P.args, **named: P.kwargs) -> Concealed:
             bound = inspect.signature(act_with).bind(*values, **named)
             bound.apply_defaults()
-            return Concealed(act_with.__name__, stage, bound.arguments, act_with(*values, **named))
+            return Concealed(act_with.__name__, stage, bound.arguments, act_with(*values, **named), effect)
 
         return effect
 

@@ -359,19 +359,19 @@ def noise_effect_size(effect: Concealed, view: View, readings: FloatArray, noise
     (`World.view`), and the noise-free readings, shape (n_points,); `noise_sd`: sd of the noise's Gaussian core, reading
     units. Raises ParameterError if the effect is any other.
     """
-    n_points, known = len(view.seen), effect.parameters
+    n_points, own = len(view.seen), effect.parameters
     match effect.name:
         case "correlated_noise":
             n_correlated = n_points - int(view.rows.scan_start_mask().sum())
-            return math.sqrt(-n_correlated * math.log(1 - known["rho"] ** 2))
+            return math.sqrt(-n_correlated * math.log(1 - own["rho"] ** 2))
         case "signal_dependent_noise":
-            variance = 1 + known["ratio"] * view.seen
+            variance = 1 + own["ratio"] * view.seen
             return math.sqrt(n_points * (math.log(variance.mean()) - float(np.log(variance).mean())))
         case "outliers":
-            return math.sqrt(2 * n_points * _outlier_divergence(**known))
+            return math.sqrt(2 * n_points * _outlier_divergence(**own))
         case "dropouts":
             # As for the mean: a lost reading deviates by its distance from the right value.
-            return math.sqrt(known["share"] * float(((known["value"] - readings) ** 2).sum())) / noise_sd
+            return math.sqrt(own["share"] * float(((own["value"] - readings) ** 2).sum())) / noise_sd
         case _:
             raise ParameterError("effect", effect.name, "a noise effect of the vocabulary")
 
@@ -404,18 +404,18 @@ def region_of_effect(effect: Concealed, sizer: EffectSizer) -> CovariateRegion |
     largest reading. Edge shadow: distances at which it is at least half its maximum. Stain, glint, step in X: the range
     of X in which it changes readings of scans along X by at least half its maximum.
     """
-    plan, clean, known = sizer.clean_recording.plan, sizer.clean_recording.readings, effect.parameters
+    plan, clean, own = sizer.clean_recording.plan, sizer.clean_recording.readings, effect.parameters
     match effect.name:
         case "scan_misplacement":
-            return CovariateRegion("scan", scans=(known["scan"],))
+            return CovariateRegion("scan", scans=(own["scan"],))
         case "scan_angle_error" | "height_offset":
-            return CovariateRegion("scan", scans=known["scans"])
+            return CovariateRegion("scan", scans=own["scans"])
         case "ambient_step":
-            return CovariateRegion("time", known["at_s"], float(plan.time_s[-1]))
+            return CovariateRegion("time", own["at_s"], float(plan.time_s[-1]))
         case "saturation":
-            return CovariateRegion("level", known["level"], float(clean.max()))
+            return CovariateRegion("level", own["level"], float(clean.max()))
         case "edge_shadow":
-            return CovariateRegion("edge_distance", 0.0, known["w"] * math.sqrt(2 * math.log(2)))
+            return CovariateRegion("edge_distance", 0.0, own["w"] * math.sqrt(2 * math.log(2)))
         case "albedo_patch" | "glint" | "place_step":
             along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
             strength = np.where(along_x, np.abs(sizer.recording_with_effects(effect).readings - clean), 0.0)

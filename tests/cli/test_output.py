@@ -76,15 +76,14 @@ def test_results_of_two_verbs_do_not_mix_in_one_folder(held, words, tmp_path, ca
 
 def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
     said, stages = [], []
-    for _ in range(2):
-        said.append(
-            Drawings(tmp_path).write_results(
-                lambda stage: stage.write("a.json", "{}"),
-                {},
-                lambda drawn: "",
-                progress=lambda *told: stages.append(told),
-            )
-        )
+    for other in ("b.json", "c.json"):
+
+        def write(stage, other=other):
+            stage.write("a.json", "{}")
+            stage.write(other, "{}")
+
+        tell = lambda *told: stages.append(told)  # noqa: E731
+        said.append(Drawings(tmp_path).write_results(write, {}, lambda drawn: "", progress=tell))
     assert said == [[], ["note: the results of an earlier run there were replaced"]]
     assert stages[0] == ("writing the results",)
 

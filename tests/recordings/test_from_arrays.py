@@ -264,7 +264,7 @@ def test_the_led_of_a_table_may_be_true_or_false():
 
 def test_a_scan_with_a_name_that_no_file_can_hold_is_refused_where_it_is_made():
     """Else a calibration of hours ends in an error, when its recording's fingerprint is taken."""
-    with pytest.raises(ParameterError, match=r"scan is 'b.*printable"):
+    with pytest.raises(ParameterError, match=r"scan\[2\] is 'b.*printable"):
         made(scan=["a", "a", "b\n\0c"])
     assert made(scan=[" a", "a", "b\n"]).plan.scan_names == ("a", "b")
 

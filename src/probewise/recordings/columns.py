@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, array_or_none, floats
+from probewise._arrays import FloatArray, IntArray, array_or_none, floats
 from probewise._kinds import require_kind, require_mapping
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.cells import MISSING, count_numbers
@@ -191,26 +191,22 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
     cells = _names_per_reading("scan", names, n_points)
     if "" in cells and any(cells):
         raise ParameterError(f"scan[{cells.index('')}]", "", A_SCAN)
-    return codes_and_names_of_runs(cells)
-
-
-def codes_and_names_of_runs(cells: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
-    """Return the number of each cell's run of equal cells, from 0, (n_cells,), and what is in each run."""
     begins = np.fromiter((k == 0 or cells[k] != cells[k - 1] for k in range(len(cells))), dtype=np.bool_)
     return np.cumsum(begins) - 1, tuple(cells[k] for k in np.flatnonzero(begins).tolist())
 
 
 def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:
-    """Return the session of each scan, by scan number, given that of each reading, (n_points,); () if all are one."""
-    first = session[np.unique(scan, return_index=True)[1]]
-    return tuple(int(number) for number in first) if len(set(first.tolist())) > 1 else ()
+    """Return the session of each scan, by scan number, given that of each reading, (n_points,); () if all are one.
 
-
-def no_session_mask(session: FloatArray, scan: IntArray) -> BoolArray:
-    """Mark readings, (n_points,), whose session is no whole number from 0, or not that of their scan's first."""
-    _, first, which = np.unique(scan, return_index=True, return_inverse=True)
+    Raises ParameterError where a reading's session is no whole number from 0, or not that of its scan's first.
+    """
+    _, rows, which = np.unique(scan, return_index=True, return_inverse=True)
+    first = session[rows]
     whole = np.isfinite(session) & (session >= 0) & (session == np.floor(session))
-    return np.asarray(~(whole & (session == session[first][which.reshape(-1)])))
+    wrong = np.flatnonzero(~(whole & (session == first[which.reshape(-1)])))
+    if wrong.size:
+        raise ParameterError(f"session[{wrong[0]}]", float(session[wrong[0]]), A_SESSION)
+    return tuple(int(number) for number in first) if len(set(first.tolist())) > 1 else ()
 
 
 def require_patterns(patterns: Mapping[str, Pattern]) -> None:
@@ -236,10 +232,11 @@ def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, P
         return np.zeros(n_points, dtype=np.int64)
     cells = [names] * n_points if isinstance(names, str) else _names_per_reading("pattern", names, n_points)
     code = {name: k for k, name in enumerate(known)}
-    for cell in cells:
-        if cell not in code:
-            raise ParameterError("pattern", cell, how_to_describe_pattern(cell, known))
-    return np.array([code[cell] for cell in cells], dtype=np.int64)
+    if unknown := set(cells).difference(code):
+        k = next(k for k, cell in enumerate(cells) if cell in unknown)
+        name = "pattern" if isinstance(names, str) else f"pattern[{k}]"
+        raise ParameterError(name, cells[k], how_to_describe_pattern(cells[k], known))
+    return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
 
 def how_to_describe_pattern(name: str, known: Sequence[str]) -> str:
@@ -258,7 +255,11 @@ def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> li
     for k, cell in enumerate(cells):
         if _is_missing(cell):
             raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
-    return [_checked_name(name, text_of_name(cell)) for cell in cells]
+    texts, own = list(map(text_of_name, cells)), dict[str, str]()
+    for k, text in enumerate(texts):
+        if text not in own:
+            own[text] = _checked_name(f"{name}[{k}]", text)
+    return [own[text] for text in texts]
 
 
 def text_of_name(value: object) -> str:

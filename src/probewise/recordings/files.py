@@ -11,28 +11,27 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
 from probewise._writing import is_device_or_pipe, write_bytes_atomically, write_text_atomically
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
-    A_SCAN,
     A_SESSION,
     SESSION,
     a_command,
-    codes_and_names_of_runs,
     is_commanded,
     led_cell,
-    no_session_mask,
+    pattern_codes,
+    scan_codes_and_names,
     sessions_of_scans,
 )
-from probewise.recordings.description import Description, description_text, read_description, shortest_degrees
+from probewise.recordings.description import description_text, read_description, shortest_degrees
 from probewise.recordings.images import image_bytes, is_file_name_without_path
 from probewise.recordings.patterns import Image, Pattern
 from probewise.recordings.plan import Plan, Recording, range_in_words, require_plan, require_recording
-from probewise.recordings.table import LARGEST, CSVTable, csv_text, number_text, read_table
+from probewise.recordings.table import LARGEST, CSVTable, cell_in_words, csv_text, number_text, read_table
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
@@ -190,12 +189,7 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))
     notes = [*table.notes, *description.notes]
-    scan, scan_names = _scan_codes_and_names_in_file(table)
     time_s = table.column_of_numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
-    for k, name in enumerate(scan_names):
-        if not name.isprintable():
-            row = table.rows[int(np.argmax(scan == k))]
-            raise FileError(path, shown(name), _A_NAME, row=row, column="scan")
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
         notes.append(f"time_s runs backwards at row {table.rows[int(back[0]) + 1]}")
@@ -204,10 +198,12 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
     turned = "orientation_deg" in table.columns
     orientation_deg = table.column_of_numbers("orientation_deg") if turned else np.zeros(len(table))
     covariates = _covariate_columns(table, description.instrumentation.controls, notes)
-    session = covariates.pop(SESSION, np.zeros(len(table)))
-    if (wrong := no_session_mask(session, scan)).any():
-        k = int(np.argmax(wrong))
-        raise FileError(path, shown(table.columns[SESSION][k]), A_SESSION, row=table.rows[k], column=SESSION)
+    try:
+        scan, scan_names = scan_codes_and_names(table.columns.get("scan"), len(table))
+        sessions = sessions_of_scans(covariates.pop(SESSION, np.zeros(len(table))), scan)
+        pattern = pattern_codes(table.columns.get("pattern"), description.patterns, len(table))
+    except ParameterError as error:
+        raise _error_in_table(table, error, list(description.patterns)) from error
     plan = Plan(
         x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
         y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
@@ -215,12 +211,12 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         time_s=time_s,
         scan=scan,
         scan_names=scan_names,
-        pattern=_pattern_codes_in_file(table, description),
+        pattern=pattern,
         pattern_names=tuple(description.patterns),
         patterns=description.patterns,
         covariates=covariates,
         instrumentation=description.instrumentation,
-        sessions=sessions_of_scans(session, scan),
+        sessions=sessions,
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
     if "reading" not in table.columns:
@@ -241,37 +237,16 @@ def _notes_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> li
     ]
 
 
-def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
-    """Return each row's scan number and the scans' names; every change of name begins a new scan.
-
-    FileError if the name is missing in some rows.
-    """
-    if "scan" not in table.columns:
-        return np.zeros(len(table), dtype=np.int64), ("scan",)
-    cells = table.columns["scan"]
-    if "" in cells and any(cells):
-        raise FileError(table.path, "the cell is empty", A_SCAN, row=table.rows[cells.index("")], column="scan")
-    return codes_and_names_of_runs(cells)
-
-
-def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArray:
-    names = list(description.patterns)
-    known = ", ".join(repr(name) for name in names)
-    json_name = table.path.with_suffix(".json").name
-    if "pattern" not in table.columns:
-        if len(names) > 1:
-            found = f"no such column, and {json_name} has {len(names)} patterns"
-            raise FileError(
-                table.path, found, f"a column that names one of {known} in each row", row=1, column="pattern"
-            )
-        return np.zeros(len(table), dtype=np.int64)
-    code = {name: k for k, name in enumerate(names)}
-    cells = table.columns["pattern"]
-    if unknown := set(cells).difference(code):
-        k = next(k for k, cell in enumerate(cells) if cell in unknown)
-        found = f"the pattern {shown(cells[k])} is not in {json_name}"
-        raise FileError(table.path, found, f"one of {known}", row=table.rows[k], column="pattern")
-    return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
+def _error_in_table(table: CSVTable, error: ParameterError, described: Sequence[str]) -> FileError:
+    """Return the error of a reading's scan, session or pattern, called scan[3], with its row in the file."""
+    column, _, index = error.name.removesuffix("]").partition("[")
+    found, allowed = cell_in_words(error.value), error.allowed
+    if column == "pattern":
+        json_name = table.path.with_suffix(".json").name
+        allowed = f"one of {', '.join(map(repr, described))}, as {json_name} describes them"
+        found = found if index else f"no such column, and {json_name} has {len(described)} patterns"
+    row = table.rows[int(index)] if index else table.header_row
+    return FileError(table.path, found, allowed, row=row, column=column)
 
 
 def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str]) -> dict[str, FloatArray]:

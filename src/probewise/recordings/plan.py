@@ -26,13 +26,11 @@ from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     A_PATTERN,
-    A_SESSION,
     SESSION,
     TableLike,
     checked_covariates,
     columns_by_name,
     how_to_describe_pattern,
-    no_session_mask,
     numbers_per_reading,
     numeric_covariates_and_notes,
     pattern_codes,
@@ -217,8 +215,6 @@ class Plan:
         require_patterns(described)
         code, scan_names = scan_codes_and_names(scan, n_points)
         number = numbers_per_reading("session", 0.0 if session is None else session, n_points)
-        if (wrong := no_session_mask(number, code)).any():
-            raise ParameterError(f"session[{np.argmax(wrong)}]", float(number[wrong][0]), A_SESSION)
         return cls(
             x_mm=x,
             y_mm=numbers_per_reading("y_mm", y_mm, n_points),

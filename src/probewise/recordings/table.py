@@ -100,14 +100,15 @@ class CSVTable:
             allowed = allowed or number + (", or empty, nan or n/a where it is missing" if missing else "")
             k = first_cell_without_number(cells, missing=missing, largest=most)
             assert k is not None
-            raise FileError(self.path, _cell_in_words(cells[k]), allowed, row=self.rows[k], column=name)
+            raise FileError(self.path, cell_in_words(cells[k]), allowed, row=self.rows[k], column=name)
         out = np.full(len(cells), math.nan)
         out[there] = values
         return out
 
 
-def _cell_in_words(cell: str) -> str:
-    return shown(cell) if cell else "the cell is empty"
+def cell_in_words(cell: object) -> str:
+    """Return what a cell holds, for an error message."""
+    return "the cell is empty" if cell == "" else shown(cell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,7 +365,7 @@ def _with_plain_numbers(
         usual = [name for name in columns if name not in odd and name not in names and name != time]
         rewritten, said = plain_cells(odd, lambda: {name: columns[name] for name in usual})
     except UnclearCellError as error:
-        cell, row = _cell_in_words(table.columns[error.name][error.index]), table.rows[error.index]
+        cell, row = cell_in_words(table.columns[error.name][error.index]), table.rows[error.index]
         raise FileError(table.path, cell, error.allowed, row=row, column=error.name) from error
     notes += said
     said_how = (f"{table.path.name}: {'; '.join(notes)}",) if notes else ()

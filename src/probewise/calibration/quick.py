@@ -33,7 +33,7 @@ from probewise.priors import Uniform
 _LEAST_READINGS = 80
 _LOWER = 12.0  # ln L below the highest peak, up to which draws are made about peaks
 _LEAST_EFFECTIVE, _GAINED = 200, 3.0  # draws about peaks, and nats over the orders below, from which they suffice
-_N_LIVE, _N_SAMPLES = 200, 1000  # live points from near the posterior, and samples that say where that is
+_N_LIVE, _N_SAMPLES = 150, 1000  # live points from near the posterior, and samples that say where that is
 # The evidence has clearly fallen by so many errors and nats, unless the next order's peak is higher by much.
 _N_ERRORS, _FALLEN, _MUCH_HIGHER = 3.0, 2.0, 10.0
 # The search of the prior: live points; it disagrees beyond so many errors, one false alarm in 30,000, or where many of

@@ -1,4 +1,4 @@
-"""Sampling coordinates: moments instead of A, B and C, Gaussians sorted by mass; or without labels."""
+"""Sampling coordinates: moments instead of A, B and C, Gaussians sorted by mass; or the whole's, or without labels."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import pytest
 
 from probewise.calibration import SSFPrior
 from probewise.calibration.about_peaks import LightContrasts
+from probewise.calibration.coordinates import WholeFootprintCoordinates
+from probewise.calibration.priors import MomentCoordinates
 from probewise.priors import LogUniform, Uniform
 
 
@@ -26,10 +28,18 @@ def prior(n_gaussians: int, *, by_mass: bool) -> SSFPrior:
 CASES = pytest.mark.parametrize(("n_gaussians", "by_mass"), [(1, False), (1, True), (2, False), (3, True)])
 
 
+def coordinates(belief: SSFPrior, *, whole: bool) -> MomentCoordinates | WholeFootprintCoordinates:
+    return WholeFootprintCoordinates(belief, (1.0, 0.5), 20.0) if whole else belief.coordinates
+
+
+WHOLE = pytest.mark.parametrize("whole", [False, True])
+
+
 @CASES
-def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int, by_mass: bool) -> None:
+@WHOLE
+def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int, by_mass: bool, whole: bool) -> None:
     belief = prior(n_gaussians, by_mass=by_mass)
-    space = belief.coordinates
+    space = coordinates(belief, whole=whole)
     theta = belief.from_unit_cube(np.random.default_rng(2).random((50, len(belief.names))))
     x = space.enter(theta)
     back, log_density = space.leave(x)
@@ -44,10 +54,13 @@ def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int,
 
 
 @CASES
-def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_gaussians: int, by_mass: bool) -> None:
+@WHOLE
+def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(
+    n_gaussians: int, by_mass: bool, whole: bool
+) -> None:
     """The Jacobian by central differences; N! for the labellings that became one."""
     belief = prior(n_gaussians, by_mass=by_mass)
-    space = belief.coordinates
+    space = coordinates(belief, whole=whole)
     for row in space.enter(belief.from_unit_cube(np.random.default_rng(3).random((5, len(belief.names))))):
         step = 1e-6 * np.maximum(1.0, np.abs(row))
         ahead, behind = (space.leave(row + sign * np.diag(step))[0] for sign in (1, -1))
@@ -57,15 +70,33 @@ def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_g
         assert log_density[0] == pytest.approx(expected, abs=1e-6)
 
 
-def test_what_is_not_sorted_by_mass_is_outside_the_prior() -> None:
+@WHOLE
+def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole: bool) -> None:
     belief = prior(3, by_mass=True)
-    space = belief.coordinates
+    space = coordinates(belief, whole=whole)
     x = space.enter(belief.from_unit_cube(np.random.default_rng(7).random((20, 20))))
     heavier, swapped = x.copy(), x.copy()
     heavier[:, 6] = 0.1
     swapped[:, [6, 12]] = swapped[:, [12, 6]]
     assert (space.leave(heavier)[1] == -np.inf).all()
     assert (space.leave(swapped)[1] == -np.inf).all()
+
+
+def test_the_whole_of_gaussians_nearby_has_their_mean_and_covariance() -> None:
+    """Far less is tapered there than a hundredth; the moments of a mixture by another route."""
+    theta = np.array([[0.05, 1.0, 0.5, 0.05, 0.06, 0.01, 0.01, 2.0, 0.0, 0.08, 0.05, 0.0, 10.0, 60.0]])
+    g = theta[0, :-2].reshape(2, 6)
+    light = g[:, 0] / np.sqrt(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
+    share = light / light.sum()
+    mean = share @ g[:, 1:3]
+    whole = np.zeros((2, 2))
+    for s, (_, u, v, a, b, c) in zip(share, g, strict=True):
+        off = np.array([u, v]) - mean
+        whole += s * (0.5 * np.linalg.inv([[a, c], [c, b]]) + np.outer(off, off))
+    x = coordinates(prior(2, by_mass=True), whole=True).enter(theta)[0]
+    np.testing.assert_allclose(x[1:3], mean, atol=0.01)
+    np.testing.assert_allclose(x[3:5], np.log(np.diag(whole)), atol=0.01)
+    assert x[5] == pytest.approx(np.arctanh(whole[0, 1] / np.sqrt(whole[0, 0] * whole[1, 1])), abs=0.01)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

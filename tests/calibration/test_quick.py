@@ -11,9 +11,17 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, OrderPosterior, calibrate, default_prior, quick
-from probewise.calibration.about_peaks import LightContrasts, _MixtureAboutPeaks, _StudentTDensity
+from probewise.calibration.about_peaks import (
+    LightContrasts,
+    _MixtureAboutPeaks,
+    _StudentTDensity,
+)
+from probewise.calibration.coordinates import WholeFootprintCoordinates
 from probewise.calibration.peaks import _split, climb, starts_of_climbs
-from probewise.calibration.quick import fit_orders_quickly
+from probewise.calibration.quick import (
+    _NearPosterior,
+    fit_orders_quickly,
+)
 from probewise.calibration.search import ProblemsByOrder, search_prior_of_order
 from probewise.nested import Weighted
 from probewise.recordings import Recording, paper_plan
@@ -78,6 +86,26 @@ def test_the_prior_integrates_to_one_by_draws_about_a_peak(recording: Recording,
     assert abs(weight.sum() / 40_000 - 1.0) < 5 * error < 0.3
 
 
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_prior_integrates_to_one_by_draws_near_a_posterior(recording: Recording, n: int) -> None:
+    """Place, size and levels are as wide as the prior's. Five errors.
+
+    Of two Gaussians, draws count where the second has less than a twentieth of the light, a known share of the prior:
+    brighter ones move the whole so far that few draws weigh.
+    """
+    prior, rng = default_prior(recording, n), np.random.default_rng(3)
+    space = WholeFootprintCoordinates(prior, (0.0, 0.0), 80.0)
+    whole = space.enter(prior.from_unit_cube(rng.random((4000, 6 * n + 2))))[:, quick._WHOLE]
+    near = _NearPosterior(prior, space, whole.mean(axis=0)[None], np.linalg.cholesky(np.cov(whole, rowvar=False)))
+    x = near.draw(100_000, rng=rng)
+    log_prior = space.leave(x)[1]
+    counted = np.isfinite(log_prior) & (x[:, 6:-2:6] < np.log(0.05)).all(axis=1)
+    weight = np.exp(log_prior[counted] - near.log_density(x[counted]))
+    error = weight.std() * np.sqrt(len(weight)) / 100_000
+    share = 0.05 ** (n - 1)
+    assert abs(weight.sum() / 100_000 - share) < 5 * error < 0.5 * share
+
+
 @pytest.fixture
 def with_evidences(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float]], None]:
     """Return a function that gives each order its evidence, by draws and by nested sampling."""
@@ -99,8 +127,7 @@ def with_evidences(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float
             return made, lambda theta: np.zeros(len(theta))
 
         monkeypatch.setattr(quick, "weigh_draws_about_peaks", drawn)
-        monkeypatch.setattr(quick, "_sample_near", drawn)
-        monkeypatch.setattr(quick, "_search_with_few_live_points", lambda *_: None)
+        monkeypatch.setattr(quick, "_sample", lambda nearby, *_: drawn(nearby.problem)[0])
 
     return give
 

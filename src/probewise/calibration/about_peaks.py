@@ -21,6 +21,7 @@ from probewise.inference import SensorProblem, StudentT
 from probewise.nested import Weighted
 from probewise.nested.importance import weighted_draws
 from probewise.nested.weights import n_effective, student_t_draws, student_t_log_norm, tempering_power
+from probewise.priors import Coordinates
 
 MOST_RELABELLED = 5
 """Number of Gaussians up to which labels are permuted: 120 labellings."""
@@ -156,18 +157,33 @@ class _MixtureAboutPeaks:
         return y[inside], theta[inside], self.log_density(y[inside]) - log_prior[inside]
 
 
+def distinct_peaks(problem: SensorProblem, peaks: FloatArray) -> FloatArray:
+    """Leave out peaks near an earlier one under any labels, (n_peaks, 6 N + 2), and all but the first six distinct."""
+    assert isinstance(problem.prior, SSFPrior)
+    space = LightContrasts(problem.prior)
+    kept: list[FloatArray] = []
+    densities: list[_StudentTDensity] = []
+    for peak in peaks:
+        labelled = space.relabelled(space.enter(peak[None]))
+        distance = min((density.square_distance(labelled).min() for density in densities), default=math.inf)
+        if len(kept) < _MOST_PEAKS and distance > _SAME * labelled.shape[-1]:
+            densities.append(_laplace(problem, space, peak))
+            kept.append(peak)
+    return np.array(kept)
+
+
 def weigh_draws_about_peaks(
     problem: SensorProblem, peaks: FloatArray, *, rng: np.random.Generator
 ) -> tuple[Weighted, Callable[[FloatArray], FloatArray]]:
-    """Estimate evidence and posterior from draws about peaks, (n_peaks, 6 N + 2), highest first.
+    """Estimate evidence and posterior from draws about distinct peaks, (n_peaks, 6 N + 2).
 
     `problem`: with an `SSFPrior` of uniform light. Also return the log weight as a function of parameters: of prior
     times likelihood over the density of the draws.
     """
     assert isinstance(problem.prior, SSFPrior)
     space, densities, log_z, n_calls = LightContrasts(problem.prior), [], [], 0
-    for start in _distinct_densities(problem, space, peaks):
-        density, own = start, -math.inf
+    for peak in peaks:
+        density, own = _laplace(problem, space, peak), -math.inf
         for _ in range(_N_ROUNDS):
             y, theta, log_density = _MixtureAboutPeaks(space, [density], np.ones(1)).draw(_N_PILOTS, rng)
             if len(y) < 2 * y.shape[1]:
@@ -180,7 +196,7 @@ def weigh_draws_about_peaks(
         densities.append(density)
         log_z.append(own)
     by_evidence = np.exp(np.array(log_z) - logsumexp(log_z)) if max(log_z) > -math.inf else np.ones(1)
-    share = _BY_EVIDENCE * by_evidence + (1.0 - _BY_EVIDENCE) / len(densities)
+    share = _BY_EVIDENCE * by_evidence + (1.0 - _BY_EVIDENCE) / len(peaks)
     mixture = _MixtureAboutPeaks(space, densities, share / share.sum())
     _, theta, log_density = mixture.draw(_N_DRAWS, rng)
     log_likelihood = problem.log_likelihood(theta)
@@ -195,19 +211,15 @@ def weigh_draws_about_peaks(
     return replace(found, log_z_error=error, n_calls=n_calls + len(theta)), log_weight_at
 
 
-def _distinct_densities(problem: SensorProblem, space: LightContrasts, peaks: FloatArray) -> list[_StudentTDensity]:
-    """Return densities about peaks, but for those near an earlier one under any labels; at most six."""
-    found = list[_StudentTDensity]()
-    for peak in peaks:
-        labelled = space.relabelled(space.enter(peak[None]))
-        distance = min((density.square_distance(labelled).min() for density in found), default=math.inf)
-        if len(found) < _MOST_PEAKS and distance > _SAME * labelled.shape[-1]:
-            found.append(_laplace(problem, space, peak))
-    return found
-
-
 def _laplace(problem: SensorProblem, space: LightContrasts, peak: FloatArray) -> _StudentTDensity:
-    """Return a density about a peak, (6 N + 2,), by the curvature there.
+    at, covariance = laplace(problem, space, peak)
+    return _StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance)))
+
+
+def laplace(
+    problem: SensorProblem, space: Coordinates | LightContrasts, peak: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return a peak, (6 N + 2,), in the coordinates, (d,), and the covariance by the curvature there, (d, d).
 
     Along coordinates of little information it has the prior's width.
     """
@@ -219,5 +231,4 @@ def _laplace(problem: SensorProblem, space: LightContrasts, peak: FloatArray) ->
     predicted = problem.model.predict(theta, recording.plan)[:, recording.usable]
     slope = (predicted[1:] - predicted[0]) / _DIFFERENCE
     weight = likelihood.inverse_noise_variance(recording.readings[recording.usable] - predicted[:1])[0]
-    covariance = np.linalg.inv((slope * weight) @ slope.T + np.diag(1.0 / wide))
-    return _StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance)))
+    return at, np.linalg.inv((slope * weight) @ slope.T + np.diag(1.0 / wide))

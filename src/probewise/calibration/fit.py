@@ -15,8 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import checked_finite_number, checked_whole, require_flag, require_like, require_rng
-from probewise._posterior_samples import MIN_SAMPLES
+from probewise._kinds import checked_whole, require_flag, require_like, require_rng
 from probewise.calibration.fields import (
     choose_pixel_mm,
     gaussians_sorted_by_mass,
@@ -115,8 +114,6 @@ def calibrate(
     stop: StopRule | None = None,
     refined: bool = True,
     data_sets: IntArray | None = None,
-    pixel_mm: float | None = None,
-    n_samples: int = _N_SAMPLES,
     executor: Executor | None = None,
 ) -> Calibration:
     """Fit SSFs of several orders to a recording and compare their evidences (paper, section on MoG estimation).
@@ -146,10 +143,6 @@ def calibrate(
         Whether to refine each evidence by importance sampling; the paper's is of nested sampling alone.
     data_sets
         Data set of each row, each with its own noise sd, (n_points,) from 0; default: its scan.
-    pixel_mm
-        Pixel size of the mean fields; default by `choose_pixel_mm`, 1 mm or finer.
-    n_samples
-        Number of equally weighted posterior samples to keep, 500 or more.
     executor
         Runs the orders in parallel; by default they run here, one by one. The result does not depend on it.
 
@@ -178,9 +171,6 @@ def calibrate(
     wanted = _checked_orders(orders)
     checked_whole("n_live", n_live, least=least_live(6 * max(wanted) + 2))
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
-    checked_whole("n_samples", n_samples, least=MIN_SAMPLES)
-    if pixel_mm is not None and not checked_finite_number("pixel_mm", pixel_mm, "greater than 0, or None") > 0:
-        raise ParameterError("pixel_mm", pixel_mm, "greater than 0, or None")
     if executor is not None:
         require_like("executor", executor, ("submit",), "an Executor of concurrent.futures, or None")
     require_flag("quick", quick)
@@ -188,7 +178,6 @@ def calibrate(
         raise ParameterError("refined", refined, "True with quick=True, or leave quick out")
     problems = ProblemsByOrder(recording, prior, data_sets)
     search = partial(search_prior_of_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
-    one = partial(_fit_order, problems, search, pixel_mm=pixel_mm, n_samples=n_samples)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
     quickly: dict[int, OrderPosterior] = {}
     note = ""
@@ -196,7 +185,7 @@ def calibrate(
         quickly, note = fit_orders_quickly(problems, wanted, search=search, rng=rng.spawn(1)[0], progress=progress)
         wanted = tuple(n for n in wanted if n in quickly) or wanted
     why = (note,) if note else ()
-    each = {n: partial(one, n, streams[n], found=quickly.get(n), why=why) for n in wanted}
+    each = {n: partial(_fit_order, problems, search, n, streams[n], found=quickly.get(n), why=why) for n in wanted}
     if executor is None:
         fits = [fit() for fit in each.values()]
     else:
@@ -232,8 +221,6 @@ def _fit_order(
     *,
     found: OrderPosterior | None,
     why: tuple[str, ...],
-    pixel_mm: float | None,
-    n_samples: int,
 ) -> OrderFit:
     """Fit one order; search its prior if it is not `found` yet, with `why` among the notes; make a sensor of it.
 
@@ -248,11 +235,10 @@ def _fit_order(
     if found is None:
         found = search(n_gaussians, rng)
     notes, result = (*notes, *why, *found.notes), found.result
-    samples = gaussians_sorted_by_mass(result.samples(n_samples, rng=rng), n_gaussians)
+    samples = gaussians_sorted_by_mass(result.samples(_N_SAMPLES, rng=rng), n_gaussians)
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
-    if pixel_mm is None:
-        pixel_mm = choose_pixel_mm(samples, n_gaussians, step_mm=scan_geometry(recording).step_mm)
+    pixel_mm = choose_pixel_mm(samples, n_gaussians, step_mm=scan_geometry(recording).step_mm)
     theta, weight = (samples, None) if isinstance(result, Weighted) else (result.theta, result.weight)
     blind, silent = blind_axis_rad(recording), _names_of_unconstrained_moments(samples, prior, rng)
     if blind is not None:

@@ -1,10 +1,12 @@
-"""The quick way to evidence and posterior of each order: from the peaks of its likelihood instead of the prior.
+"""The quick way to evidence and posterior of each order: from a density near the posterior instead of the prior.
 
-Where the readings need all Gaussians, importance sampling about the peaks suffices. Where a Gaussian more gains little,
-most of the posterior is far from the peaks: there it is faint. Then a search of the whole prior with few live points
-finds the posterior, and nested sampling from a prior near it (`probewise.nested.repartition`) its evidence.
+Evidence and posterior depend only on the product of prior and likelihood, so any density may take the prior's place if
+the likelihood makes up for it (Chen, Hobson, Das & Gelderblom 2019). Readings determine place and size of the whole
+footprint and the levels to a few percent, whatever its form, and the peaks of the likelihood show where. So here these
+seven numbers lie about the peaks, in a wide Student-t; all else is as in the prior. Nested sampling starts from this
+density, and its errors hold. Where the readings need all Gaussians, importance sampling about the peaks suffices.
 
-Orders are fitted upwards until the evidence has clearly fallen. A search of the whole prior with few live points
+Orders are fitted upwards until the evidence has clearly fallen. A search of the whole prior with few live points then
 vouches for the order that is chosen.
 """
 
@@ -13,40 +15,158 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.about_peaks import MOST_RELABELLED, weigh_draws_about_peaks
+from probewise.calibration.about_peaks import MOST_RELABELLED, distinct_peaks, laplace, weigh_draws_about_peaks
+from probewise.calibration.coordinates import WholeFootprintCoordinates
 from probewise.calibration.peaks import climb, starts_of_climbs
-from probewise.calibration.priors import SSFPrior
+from probewise.calibration.priors import SSFPrior, view_by_kind_and_gaussian
 from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, Search
 from probewise.errors import DoubtfulResultWarning
 from probewise.inference import SensorProblem
 from probewise.nested import NestedResult, Samplable, Weighted, least_live, run
-from probewise.nested.repartition import repartitioned
+from probewise.nested.repartition import Repartitioned
+from probewise.nested.weights import student_t_draws, student_t_log_norm
 from probewise.priors import Uniform
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
-_LOWER = 12.0  # ln L below the highest peak, up to which draws are made about peaks
+_LOWER = 12.0  # ln L below the highest peak, up to which peaks shape the density
 _LEAST_EFFECTIVE, _GAINED = 200, 3.0  # draws about peaks, and nats over the orders below, from which they suffice
-_N_LIVE, _N_SAMPLES = 200, 1000  # live points from near the posterior, and samples that say where that is
+_DEGREES_OF_FREEDOM, _WIDENED = 4.0, 2.0
+_N_LIVE = 200
 # The evidence has clearly fallen by so many errors and nats, unless the next order's peak is higher by much.
 _N_ERRORS, _FALLEN, _MUCH_HIGHER = 3.0, 2.0, 10.0
-# The search of the prior: live points; it disagrees beyond so many errors, one false alarm in 30,000, or where many of
+# The search that vouches: live points; it disagrees beyond so many errors, one false alarm in 30,000, or where many of
 # its samples have weights above all others.
-_SEARCHING_LIVE, _SEARCHING_PER_PARAM, _DISAGREE = 50, 4, 4.0
+_VOUCHING_LIVE, _VOUCHING_PER_PARAM, _DISAGREE = 50, 4, 4.0
 _N_VOUCHING, _MISSED, _HIGHER = 300, 0.2, 2.0
-
-_LogWeight = Callable[[FloatArray], FloatArray]
+_WHOLE = np.r_[1:6, -2, -1]  # columns of place and size of the whole footprint and levels
 
 
 def has_uniform_light(prior: SSFPrior) -> bool:
     """Return whether a Gaussian's light is uniform from 0, as draws about peaks require."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _NearPosterior:
+    """A prior near the posterior: a Student-t of place, size and levels about each peak; the rest as in the prior.
+
+    `centres`: of the peaks in the columns `_WHOLE` of the coordinates `space`, (n_peaks, 7); `root`: of the scale
+    matrix of all, (7, 7).
+    """
+
+    prior: SSFPrior
+    space: WholeFootprintCoordinates
+    centres: FloatArray
+    root: FloatArray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.prior.names
+
+    @property
+    def coordinates(self) -> _NearPosterior:
+        return self
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        return self.prior.from_unit_cube(u)  # of the prior; samplers use `draw`
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates, (n, 6 N + 2); some match no possible parameters."""
+        n_gaussians = self.prior.n_gaussians
+        x = np.empty((n, len(self.names)))
+        g, drawn = (
+            view_by_kind_and_gaussian(a) for a in (x, self.prior.from_unit_cube(rng.random((n, len(self.names)))))
+        )
+        det = drawn[3] * drawn[4] - drawn[5] ** 2
+        g[1:3], g[3:5] = drawn[1:3], np.log(0.5 * drawn[4:2:-1] / det)
+        g[5] = np.arctanh(-drawn[5] / np.sqrt(drawn[3] * drawn[4]))
+        g[0, 0] = np.log(rng.random(n)) / n_gaussians
+        g[0, 1:] = np.log(-np.sort(-rng.random((n_gaussians - 1, n)), axis=0))
+        white = student_t_draws(n, 7, _DEGREES_OF_FREEDOM, rng=rng)
+        x[:, _WHOLE] = self.centres[rng.integers(len(self.centres), size=n)] + white @ self.root.T
+        return x
+
+    @cached_property
+    def _inverse_root(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.root))
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """Natural log of the density in the coordinates, (n, 6 N + 2) -> (n,)."""
+        nu, n_gaussians = _DEGREES_OF_FREEDOM, self.prior.n_gaussians
+        white = (x[:, None, _WHOLE] - self.centres) @ self._inverse_root.T
+        norm = student_t_log_norm(7, nu) - math.log(len(self.centres)) - float(np.log(np.diag(self.root)).sum())
+        near = -0.5 * (nu + 7) * np.log1p(np.einsum("npk,npk->np", white, white) / nu)
+        # The heaviest one's light is the greatest of N; those of the others are uniform below it, in falling order.
+        g = view_by_kind_and_gaussian(x)
+        rest = 1.0 - np.tanh(g[5, 1:]) ** 2
+        each = g[0, 1:] + np.log(rest / (2 * self.prior.max_correlation))
+        for place, log_variance in zip(g[1:3, 1:], g[3:5, 1:], strict=True):
+            precision = 0.5 * np.exp(-log_variance) / rest
+            each += self.prior.offset_mm.log_prob(place) + self.prior.precision.log_prob(precision) + np.log(precision)
+        light = n_gaussians * g[0, 0] + math.lgamma(n_gaussians + 1)
+        return np.asarray(norm + np.logaddexp.reduce(near, axis=1) + light + each.sum(axis=0))
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        return self.space.enter(theta)
+
+    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates to parameters; also return the log density, -inf outside the prior's support."""
+        theta, log_prior = self.space.leave(x)
+        inside = np.isfinite(log_prior)
+        log_density = np.full(len(x), -np.inf)
+        log_density[inside] = self.log_density(x[inside])
+        return theta, log_density
+
+    def log_prior_ratio(self, theta: FloatArray) -> FloatArray:
+        """Log of the original prior's density over this one's, (n, n_params) -> (n,)."""
+        x = self.space.enter(theta)
+        return self.space.leave(x)[1] - self.log_density(x)
+
+
+def _nearby(problem: SensorProblem, alone: SensorProblem, one: FloatArray, peaks: FloatArray) -> Repartitioned:
+    """Make the density of N Gaussians from the highest peak of one Gaussian, (8,), and the `peaks` of N."""
+    prior = problem.prior
+    assert isinstance(prior, SSFPrior)
+    assert isinstance(alone.prior, SSFPrior)
+    space = WholeFootprintCoordinates.about(prior, one)
+    covariance = laplace(alone, replace(space, prior=alone.prior), one)[1][np.ix_(_WHOLE, _WHOLE)]
+    centres = space.enter(peaks)[:, _WHOLE]
+    off = centres - centres.mean(axis=0)
+    root = np.linalg.cholesky(_WIDENED**2 * covariance + off.T @ off / len(off))
+    return Repartitioned(problem, _NearPosterior(prior, space, centres, np.asarray(root)))
+
+
+def _sample(nearby: Repartitioned, n_live: int, rng: np.random.Generator, progress: Progress | None) -> Weighted:
+    """Estimate evidence and posterior by nested sampling from the density near the posterior."""
+    found = _run_silently(nearby, n_live, rng, progress)
+    rows = np.flatnonzero(found.log_weight > -math.inf)
+    theta = found.theta[rows]
+    return Weighted(
+        found.names,
+        theta,
+        log_likelihood=found.log_likelihood[rows] - nearby.prior.log_prior_ratio(theta),
+        log_weight=found.log_weight[rows],
+        log_z=found.log_z,
+        log_z_error=found.log_z_error,
+        n_eff=found.n_eff,
+        n_calls=found.n_calls,
+        pareto_k=-math.inf,
+        warnings=found.warnings,
+    )
+
+
+def _run_silently(problem: Samplable, n_live: int, rng: np.random.Generator, progress: Progress | None) -> NestedResult:
+    report = None if progress is None else partial(progress, len(problem.prior.names) // 6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # they are in the result
+        return run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
 
 
 def fit_orders_quickly(
@@ -67,35 +187,36 @@ def fit_orders_quickly(
         return {}, f"searched in full: {n_usable} usable readings, fewer than {_LEAST_READINGS}"
     if not all(has_uniform_light(problems.prior_of(n)) for n in range(1, max(orders) + 1)):
         return {}, "searched in full: the prior of a Gaussian's light is not uniform from 0"
-    alone, seen = problems.problem(1), dict[int, NestedResult]()
-    found, log_weight_at = dict[int, Weighted](), dict[int, _LogWeight]()
-    peaks, last, fallen, note = np.empty((0, 8)), -math.inf, False, ""
+    alone = problems.problem(1)
+    found: dict[int, Weighted] = {}
+    log_weight_at: dict[int, Callable[[FloatArray], FloatArray]] = {}
+    peaks, one = np.empty((0, 8)), np.empty(8)
+    last, fallen, note = -math.inf, False, ""
     for n in range(1, max(orders) + 1):
         problem = problems.problem(n)
         ends, high = climb(problem, alone, starts_of_climbs(problem, peaks, rng))
         peaks, gain, last = ends[high > high[0] - _LOWER], float(high[0]) - last, float(high[0])
+        one = peaks[0] if n == 1 else one
         if fallen and gain < _MUCH_HIGHER:
-            left = [str(m) for m in sorted(orders) if m >= n]
-            which = f"order{'s' if len(left) > 1 else ''} {' and '.join(left)}"
-            note = f"{which} not tried: the evidence has clearly fallen before" if left else ""
+            note = _orders_left_out_in_words(sorted(m for m in orders if m >= n))
             break
         if n not in orders:
             continue
         best = max((made.log_z for made in found.values()), default=-math.inf)
         if n <= MOST_RELABELLED:
-            found[n], log_weight_at[n] = weigh_draws_about_peaks(problem, peaks, rng=rng)
+            found[n], log_weight_at[n] = weigh_draws_about_peaks(problem, distinct_peaks(problem, peaks), rng=rng)
+        # Where a Gaussian more gains little, most of the posterior is far from the peaks: there it is faint.
         made = found.get(n)
         if made is None or not (made.sound and made.n_eff > _LEAST_EFFECTIVE and made.log_z > best + _GAINED):
-            seen[n] = _search_with_few_live_points(problem, rng, progress)
-            found[n], log_weight_at[n] = _sample_near(problem, seen[n], rng, progress)
+            nearby = _nearby(problem, alone, one, peaks)
+            found[n] = _sample(nearby, max(_N_LIVE, least_live(len(problem.prior.names))), rng, progress)
+            log_weight_at[n] = nearby.log_likelihood
         fallen = best - found[n].log_z > max(_FALLEN, _N_ERRORS * found[n].log_z_error)
     posteriors = {n: OrderPosterior(made, None) for n, made in found.items()}
     vouched: set[int] = set()
     while (chosen := max(posteriors, key=lambda n: posteriors[n].evidence_result.log_z)) in found.keys() - vouched:
         vouched.add(chosen)
-        if chosen not in seen:
-            seen[chosen] = _search_with_few_live_points(problems.problem(chosen), rng, progress)
-        why = _missed_part_in_words(seen[chosen], found[chosen], log_weight_at[chosen], rng)
+        why = _missed_part_in_words(problems.problem(chosen), found[chosen], log_weight_at[chosen], rng, progress)
         for n in [n for n in posteriors if why and n >= chosen]:
             found.pop(n, None)
             full = search(n, rng)
@@ -104,52 +225,25 @@ def fit_orders_quickly(
     return posteriors, note
 
 
-def _sample_near(
-    problem: SensorProblem, seen: NestedResult, rng: np.random.Generator, progress: Progress | None
-) -> tuple[Weighted, _LogWeight]:
-    """Estimate evidence and posterior by nested sampling from a prior near the samples of a search, `seen`.
-
-    Also return the log weight as a function of parameters: of prior times likelihood over the density of that prior.
-    """
-    nearby = repartitioned(problem, seen.samples(_N_SAMPLES, rng=rng))
-    found = _run_silently(nearby, max(_N_LIVE, least_live(len(problem.prior.names))), rng, progress)
-    rows = np.flatnonzero(found.log_weight > -math.inf)
-    theta = found.theta[rows]
-    made = Weighted(
-        found.names,
-        theta,
-        log_likelihood=found.log_likelihood[rows] - nearby.prior.log_prior_ratio(theta),
-        log_weight=found.log_weight[rows],
-        log_z=found.log_z,
-        log_z_error=found.log_z_error,
-        n_eff=found.n_eff,
-        n_calls=found.n_calls,
-        pareto_k=-math.inf,
-        warnings=found.warnings,
-    )
-    return made, nearby.log_likelihood
-
-
-def _search_with_few_live_points(
-    problem: SensorProblem, rng: np.random.Generator, progress: Progress | None
-) -> NestedResult:
-    return _run_silently(problem, max(_SEARCHING_LIVE, _SEARCHING_PER_PARAM * len(problem.prior.names)), rng, progress)
-
-
-def _run_silently(problem: Samplable, n_live: int, rng: np.random.Generator, progress: Progress | None) -> NestedResult:
-    report = None if progress is None else partial(progress, len(problem.prior.names) // 6)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # they are in the result
-        return run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
+def _orders_left_out_in_words(orders: list[int]) -> str:
+    if not orders:
+        return ""
+    which = "order" if len(orders) == 1 else "orders"
+    return f"{which} {' and '.join(map(str, orders))} not tried: the evidence has clearly fallen before"
 
 
 def _missed_part_in_words(
-    seen: NestedResult, made: Weighted, log_weight_at: _LogWeight, rng: np.random.Generator
+    problem: SensorProblem,
+    made: Weighted,
+    log_weight_at: Callable[[FloatArray], FloatArray],
+    rng: np.random.Generator,
+    progress: Progress | None,
 ) -> str:
-    """Describe in words what `made` missed of what a search of the whole prior has `seen`; "" if nothing.
+    """Search the whole prior with few live points; describe in words what `made` missed, "" if nothing.
 
     Where the density that `made` was drawn from has left out a part, that part's samples outweigh all others.
     """
+    seen = _run_silently(problem, max(_VOUCHING_LIVE, _VOUCHING_PER_PARAM * len(made.names)), rng, progress)
     if seen.log_z - made.log_z > _DISAGREE * math.hypot(seen.log_z_error, made.log_z_error):
         return (
             f"ln Z is {seen.log_z:.2f} ± {seen.log_z_error:.2f} by a search of the whole prior, "

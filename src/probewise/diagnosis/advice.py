@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
@@ -24,7 +24,6 @@ from probewise.diagnosis.apparatus import (
     NOTHING_NATS,
     SETTLED,
     Apparatus,
-    Command,
     rows_by_command,
 )
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covariance_root
@@ -43,23 +42,17 @@ COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_READINGS])
 _FREE = 1e-6  # prior precision of a rival's amounts, in changes of one noise sd: they are free
 
 
-@dataclass(frozen=True, eq=False)
-class EffectEntry:
-    """An effect at the settings of its parameters, (n_columns, n_effect_params), that make one template."""
+EffectEntry: TypeAlias = tuple[NamedEffect[Any], FloatArray]
+"""An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
-    effect: NamedEffect[Any]
-    settings: FloatArray
 
-    def changes(self, found: Fit, plan: Plan, without: FloatArray) -> FloatArray:
-        """Return the change of a plan's readings by each setting, about a fit, (n_points, n_columns).
-
-        `without` are the predictions of the fit, (n_points,). Changes are not finite where the model diverges.
-        """
-        model = replace(found.model, plan=plan).with_effect(self.effect)
-        own = model.z_of_last_effect(self.settings)
-        points = np.concatenate([np.repeat(found.z[None, :], len(own), axis=0), own], axis=1)
-        with np.errstate(all="ignore"):
-            return np.asarray((model.predict(points) - without).T)
+def _changes(entry: EffectEntry, found: Fit, plan: Plan, without: FloatArray) -> FloatArray:
+    """Return the change of a plan's predictions `without`, about a fit, by each setting, (n_points, n_columns)."""
+    model = replace(found.model, plan=plan).with_effect(entry[0])
+    own = model.z_of_last_effect(entry[1])
+    points = np.concatenate([np.repeat(found.z[None, :], len(own), axis=0), own], axis=1)
+    with np.errstate(all="ignore"):  # not finite where the model diverges
+        return np.asarray((model.predict(points) - without).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +78,11 @@ class _Columns:
     ) -> _Columns:
         """Linearise the readings of `usable` rows, and those of another plan with its predictions without effects."""
         model, (plan, expected) = found.model, everywhere
-        old = problem.whiten(entry.changes(found, model.plan, model.predict(found.z[None, :])[0])[usable])
+        old = problem.whiten(_changes(entry, found, model.plan, model.predict(found.z[None, :])[0])[usable])
         length = max(float(np.linalg.norm(old)), 1e-300)
-        further = entry.changes(found, plan, expected) / problem.sd
+        further = _changes(entry, found, plan, expected) / problem.sd
         n_known = len(apparatus.coordinates_of_new_run(model))
-        of_run = len(apparatus.coordinates_of_new_run(model.with_effect(entry.effect))) > n_known
+        of_run = len(apparatus.coordinates_of_new_run(model.with_effect(entry[0]))) > n_known
         if of_run:  # the new run's value is about the mean of the others
             further = np.repeat(further.mean(axis=1, keepdims=True), further.shape[1], axis=1)
         return cls(old / length, further / length, of_run)
@@ -144,14 +137,6 @@ class Alias:
     readings: int
 
 
-def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
-    """Return the largest principal cosine of two templates (n_points, k), a fit projected out; 0 if it absorbs one."""
-    bases = [_projected_basis(problem, problem.whiten(c))[0] for c in (first, second)]
-    if not all(basis.size for basis in bases):
-        return 0.0
-    return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
-
-
 def _projected_basis(problem: Linearised, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Orthonormalise a whitened template, (n_points, k), with a fit projected out; nothing is left if it is absorbed.
 
@@ -172,9 +157,12 @@ def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *,
     `templates`: for each effect, its best-fitting template columns (n_points, k); `otherwise`: the `settle_by` of each
     pair; its `readings` are 0.
     """
-    pairs = list(itertools.combinations(sorted(templates), 2))
-    cosines = [projected_cosine(problem, templates[one], templates[other]) for one, other in pairs]
-    out = [Alias(pair, c, otherwise, 0) for pair, c in zip(pairs, cosines, strict=True) if c >= ALIAS_COSINE]
+    bases = {name: _projected_basis(problem, problem.whiten(templates[name]))[0] for name in sorted(templates)}
+    out = []
+    for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
+        cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
+        if cosines[0] >= ALIAS_COSINE:
+            out.append(Alias(pair, float(min(cosines[0], 1.0)), otherwise, 0))
     return sorted(out, key=lambda alias: -alias.cosine)
 
 
@@ -194,7 +182,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
         telling[name] = templates.columns[best]
-        chosen[name] = EffectEntry(templates.variant_of_entry(best), templates.settings[best])
+        chosen[name] = templates.variant_of_entry(best), templates.settings[best]
     pairs = collinear_pairs(problem, telling, otherwise=prepared.apparatus.words.settles_nothing)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
 
@@ -365,6 +353,7 @@ class PredictiveNormal:
         return np.asarray(noise_2 * np.eye(len(self.mean)) + of_factor)
 
 
+@np.errstate(all="ignore")  # of predictions that ran away
 def measurement_separating_rivals(
     rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus
 ) -> NextMeasurement | None:
@@ -377,7 +366,6 @@ def measurement_separating_rivals(
     offered = apparatus.candidate_measurements(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _shortlisted_command_indices(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
@@ -472,41 +460,6 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
         log_det = np.linalg.slogdet(middle)[1] - (log_dets[a] + log_dets[b]) / 2
         distances[a, b] = distances[b, a] = apart @ np.linalg.solve(middle, apart) / 8 + log_det / 2
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
-
-
-@np.errstate(all="ignore")  # of predictions that ran away
-def _shortlisted_command_indices(
-    rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
-) -> list[int]:
-    """Return the indices of the four scans, for each pair of rivals, that separate it most per minute."""
-    if not offered:
-        return []
-    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
-    means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
-    minutes = np.array([option.minutes for option in offered])
-    leader = max(rivals, key=lambda rival: rival.probability)
-    model = replace(leader.model, plan=everywhere)
-    of_run = model.predict_and_differentiate(leader.z, by=leader.of_run)[1] / sd if leader.of_run.size else None
-    kept: dict[int, None] = {}
-    for a, b in itertools.combinations(range(len(rivals)), 2):
-        apart = means[a] - means[b]
-        squares = np.array([_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows])
-        # Separation beyond this adds nothing; a model that runs away there says nothing.
-        worth = np.minimum(np.where(np.isfinite(squares), squares, 0.0), _ENOUGH) / minutes
-        kept |= dict.fromkeys(np.argsort(-worth, kind="stable")[:_PROMISING].tolist())
-    return list(kept)
-
-
-def _squared_distance(apart: FloatArray, of_run: FloatArray | None) -> float:
-    """Return the squared distance of predictions, in noise sds, that unknown values of one new run leave.
-
-    `apart` is the difference of the predictions, (n_points,), `of_run` the slopes by those values, (n_points, k).
-    """
-    square = float(apart @ apart)
-    if of_run is None:
-        return square
-    along = of_run.T @ apart
-    return square - float(along @ np.linalg.solve(np.eye(len(along)) + of_run.T @ of_run, along))
 
 
 def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> FloatArray:

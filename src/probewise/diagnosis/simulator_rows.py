@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -78,17 +79,16 @@ def possible_run_commands(
         for kind, words, columns, slower in _variations_of_run(table, kept, ends, free, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
             made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
-            out.append(Command(kind, words, cast(Plan, made), _minutes_of_runs(made, time_unit)))
+            unit = _minutes_of_time_unit(made, time_unit)
+            minutes = len(made) * _A_READING if unit is None else float(np.ptp(made.time_s)) * unit
+            out.append(Command(kind, words, cast(Plan, made), _BREAK + minutes))
     return out
-
-
-Change = tuple[str, str, Mapping[str, FloatArray], float]
-"""Kind, words, the columns that are set, and how many times as long the run takes."""
 
 
 def _variations_of_run(
     table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], free: Container[str], of: str
-) -> Iterator[Change]:
+) -> Iterator[tuple[str, str, Mapping[str, FloatArray], float]]:
+    """Yield kind, words, the columns that are set, and how many times as long the run takes."""
     own = {name: table.covariates[name][rows] for name in ends}
     yield "again", f"take {of} again", {}, 1.0
     if not ends:
@@ -189,11 +189,6 @@ def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[Int
     return list(seen.values())[:_MOST_RUNS]
 
 
-def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
-    minutes = _minutes_of_time_unit(table, time_unit)
-    return _BREAK + (len(table) * _A_READING if minutes is None else float(np.ptp(table.time_s)) * minutes)
-
-
 def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
     return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
@@ -214,6 +209,7 @@ CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 
 # table as of a short one.
 _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
+_CONSTANT = 1e-12  # of a covariate's largest value: a range up to this is rounding
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
 _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
@@ -242,9 +238,19 @@ class SimulatorApparatus(Apparatus):
         """The simulator over the runs of the table."""
         return self.about.system
 
-    @property
+    @cached_property
     def rows_are_in_order(self) -> bool:
         return self.about.rows_are_in_order
+
+    @cached_property
+    def controls(self) -> tuple[str, ...]:
+        return self.system.simulator.controls
+
+    @cached_property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
+        # from `states` as it is planned, and a lag or a backlash would reach from one into the other.
+        return self.system.simulator.run is None
 
     @property
     def words(self) -> Words:
@@ -275,19 +281,14 @@ class SimulatorApparatus(Apparatus):
             tells_duration=_minutes_of_time_unit(self.about.table, own.time_unit) is not None,
         )
 
-    @property
-    def controls(self) -> tuple[str, ...]:
-        return self.system.simulator.controls
-
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
             kinds.remove(RandomWalk)
-        on_noise = [effect for kind in kinds if (effect := kind.for_extent(extent)) is not None]
+        beside = (*(kind.for_extent(extent) for kind in kinds), self.stop, self.lost)
         forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
-        known = {effect.name: effect for effect in (self.stop, self.lost) if effect is not None}
-        return forms | {effect.name: effect for effect in on_noise} | known
+        return forms | {effect.name: effect for effect in beside if effect is not None}
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
@@ -335,7 +336,7 @@ class SimulatorApparatus(Apparatus):
         out = []
         for name, values in pooled.items():
             there = np.flatnonzero(np.isfinite(values))
-            if there.size and _varies(values[there]):
+            if there.size > 1 and np.ptp(values[there]) > _CONSTANT * max(1e-300, float(np.abs(values[there]).max())):
                 out.append(Covariate(name, values[there], there))
         if len(table.scan_names) > 1:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
@@ -388,12 +389,6 @@ class SimulatorApparatus(Apparatus):
         values = [np.arange(model.n_params)[model.coordinate_slice(n)] for n in model.names if has_value_per_run(n)]
         return np.concatenate([np.array(parameters, dtype=np.int64), *values])
 
-    @property
-    def takes_one_measurement_at_a_time(self) -> bool:
-        # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
-        # from `states` as it is planned, and a lag or a backlash would reach from one into the other.
-        return self.system.simulator.run is None
-
     def settings_of(self, plan: Plan) -> FloatArray:
         table, own = cast(RunTable, plan), self.system.simulator
         columns = [v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)]
@@ -408,7 +403,3 @@ class SimulatorApparatus(Apparatus):
 
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_of_sequence = staticmethod(plan_of_sequence)
-
-
-def _varies(values: FloatArray) -> bool:
-    return values.size > 1 and float(np.ptp(values)) > 1e-12 * max(1e-300, float(np.abs(values).max()))

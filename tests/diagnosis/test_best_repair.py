@@ -139,7 +139,8 @@ def test_what_is_unknown_and_predicts_nothing_has_its_prior_odds_beside_a_law_th
 ):
     """.06 to .6 against nothing on the mean, .3 of the probability: .05 times the .6 that it has."""
     asked = []
-    monkeypatch.setattr(best_repair, "_corrects_held_out_readings", lambda *more: predicts)
+    fixed = SimpleNamespace(held_out=SimpleNamespace(per_reading=0.1 if predicts else -0.1))
+    monkeypatch.setattr(best_repair, "best_correction", lambda *more: (fixed, ()))
     monkeypatch.setattr(best_repair.BestRepair, "of", lambda *more, **options: "repair")
     monkeypatch.setattr(best_repair, "judge", lambda *more, unknown_weight: asked.append(unknown_weight) or judged)
     hypotheses = (

@@ -46,15 +46,6 @@ EffectEntry: TypeAlias = tuple[NamedEffect[Any], FloatArray]
 """An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
 
-def _changes(entry: EffectEntry, found: Fit, plan: Plan, without: FloatArray) -> FloatArray:
-    """Return the change of a plan's predictions `without`, about a fit, by each setting, (n_points, n_columns)."""
-    model = replace(found.model, plan=plan).with_effect(entry[0])
-    own = model.z_of_last_effect(entry[1])
-    points = np.concatenate([np.repeat(found.z[None, :], len(own), axis=0), own], axis=1)
-    with np.errstate(all="ignore"):  # not finite where the model diverges
-        return np.asarray((model.predict(points) - without).T)
-
-
 @dataclass(frozen=True, eq=False)
 class _Columns:
     """The columns of an effect, in noise sds: in `old` readings and `further` ones, (n_points, n_columns) each.
@@ -65,27 +56,6 @@ class _Columns:
     old: FloatArray
     further: FloatArray
     of_run: bool
-
-    @classmethod
-    def of(
-        cls,
-        entry: EffectEntry,
-        problem: Linearised,
-        found: Fit,
-        usable: IntArray,
-        everywhere: tuple[Plan, FloatArray],
-        apparatus: Apparatus,
-    ) -> _Columns:
-        """Linearise the readings of `usable` rows, and those of another plan with its predictions without effects."""
-        model, (plan, expected) = found.model, everywhere
-        old = problem.whiten(_changes(entry, found, model.plan, model.predict(found.z[None, :])[0])[usable])
-        length = max(float(np.linalg.norm(old)), 1e-300)
-        further = _changes(entry, found, plan, expected) / problem.sd
-        n_known = len(apparatus.coordinates_of_new_run(model))
-        of_run = len(apparatus.coordinates_of_new_run(model.with_effect(entry[0]))) > n_known
-        if of_run:  # the new run's value is about the mean of the others
-            further = np.repeat(further.mean(axis=1, keepdims=True), further.shape[1], axis=1)
-        return cls(old / length, further / length, of_run)
 
 
 Amounts = tuple[_Columns, FloatArray]
@@ -204,8 +174,8 @@ def pairs_with_separating_scans(
 
     `entries`: the entry of each effect's bank that is taken for it, by name.
     """
-    plan = found.model.plan
-    scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
+    plan, level = found.model.plan, found.model.predict(found.z[None, :])[0]
+    scans = apparatus.candidate_measurements(plan, level=level)
     if not (pairs and scans):
         return list(pairs)
     everywhere = apparatus.plan_of_alternatives(scans, plan)
@@ -215,10 +185,21 @@ def pairs_with_separating_scans(
     shared[:, of_run] = 0.0
     further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
     before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
-    columns = {
-        name: _Columns.of(entries[name], problem, found, usable, (everywhere, expected), apparatus)
-        for name in sorted({name for pair in pairs for name in pair.effects})
-    }
+
+    def columns_of(effect: NamedEffect[Any], settings: FloatArray) -> _Columns:
+        with_effect = found.model.with_effect(effect)
+        values = with_effect.z_of_last_effect(settings)
+        points = np.concatenate([np.repeat(found.z[None, :], len(values), axis=0), values], axis=1)
+        with np.errstate(all="ignore"):  # not finite where the model diverges
+            old = problem.whiten((with_effect.predict(points) - level).T[usable])
+            new = (replace(with_effect, plan=everywhere).predict(points) - expected).T / problem.sd
+        length = max(float(np.linalg.norm(old)), 1e-300)
+        is_of_run = len(apparatus.coordinates_of_new_run(with_effect)) > len(of_run)
+        if is_of_run:  # the new run's value is about the mean of the others
+            new = np.repeat(new.mean(axis=1, keepdims=True), new.shape[1], axis=1)
+        return _Columns(old / length, new / length, is_of_run)
+
+    columns = {name: columns_of(*entries[name]) for name in sorted({name for p in pairs for name in p.effects})}
     sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
     best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
@@ -249,23 +230,6 @@ def _collinear_amounts(problem: Linearised, *effects: _Columns) -> list[Amounts]
         seen = max(1.0, LEAST_SHARE * float(np.linalg.norm(effect.old @ values)))
         out.append((effect, values * (LAMBDA / seen)))
     return out
-
-
-def slopes_split_by_run(slopes: FloatArray, of_run: IntArray, plan: Plan) -> tuple[FloatArray, FloatArray]:
-    """Split slopes of planned readings into those by values already fitted, and those by values of the new runs.
-
-    A planned run is predicted at the values of a recorded run, by whose coordinates the slopes (n_points, n_params)
-    are; `of_run`: indices of those of which each run has a value of its own, with a standard normal prior. Returns the
-    slopes with 0 in the columns `of_run`; and, for each run and each of these columns that acts there, a column that is
-    0 in all other runs, (n_points, n_columns).
-    """
-    shared = slopes.copy()
-    shared[:, of_run] = 0.0
-    if not of_run.size:
-        return shared, np.zeros((len(slopes), 0))
-    inside = plan.scan[:, None] == np.arange(len(plan.scan_names))  # (n_points, n_runs)
-    own = (inside[:, :, None] * slopes[:, None, of_run]).reshape(len(slopes), -1)
-    return shared, own[:, np.any(own != 0, axis=0)]
 
 
 _STRIDES = (2, 4)
@@ -327,7 +291,12 @@ class Rival:
     def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
         mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
-        shared, own = slopes_split_by_run(slopes, self.of_run, plan)
+        shared, own = slopes.copy(), np.zeros((len(slopes), 0))
+        shared[:, self.of_run] = 0.0
+        if self.of_run.size:  # a planned run is predicted at a recorded one's values, but each has values of its own
+            inside = plan.scan[:, None] == np.arange(len(plan.scan_names))  # (n_points, n_runs)
+            own = (inside[:, :, None] * slopes[:, None, self.of_run]).reshape(len(slopes), -1)
+            own = own[:, np.any(own != 0, axis=0)]
         return PredictiveNormal(mean / sd, np.concatenate([shared @ self.root, own], axis=1) / sd)
 
 

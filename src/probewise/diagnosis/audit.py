@@ -206,7 +206,7 @@ def _run_start_indices(codes: IntArray) -> IntArray:
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
 _MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...
-_LINE = 100  # characters of a line of the summary
+_LINE = 99  # characters of a line of the summary
 _SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis, and where a hundred scans are tried
 _LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
 _READING_GUIDE = (
@@ -328,15 +328,12 @@ class PlanAudit(ShowsItself):
 
 
 def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
-    """Write a list of names after a label, in lines of up to 100 characters; no lines without names."""
-    lines, line = [], f"{label:<10} "
-    for k, name in enumerate(names):
-        piece = name + (", " if k + 1 < len(names) else "")
-        if len(line) + len(piece) > _LINE:
-            lines.append(line.rstrip())
-            line = " " * 11
-        line += piece
-    return [*lines, line.rstrip()] if names else []
+    """Write a list of names after a label, in lines of up to 99 characters; no lines without names."""
+    text = ", ".join(name.replace(" ", "\0") for name in names)  # a name stays in one line
+    lines = textwrap.wrap(
+        text, _LINE, initial_indent=f"{label:<10} ", subsequent_indent=" " * 11, break_on_hyphens=False
+    )
+    return [line.replace("\0", " ") for line in lines]
 
 
 @own_arithmetic

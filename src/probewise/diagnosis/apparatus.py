@@ -91,21 +91,27 @@ class Words:
 
 
 class Apparatus(ABC):
-    """What the engine asks of an apparatus: words, effects and their prior, covariates, held-out parts, next readings.
-
-    `controls`: covariates that a person sets and has declared as such; `rows_are_in_order`: whether the order of rows
-    is that of recording, as far as readings tell; `takes_one_measurement_at_a_time`: whether a plan holds one of the
-    candidate measurements only, since its file would not keep two apart.
-    """
-
-    controls: Sequence[str] = ()
-    rows_are_in_order: bool = True
-    takes_one_measurement_at_a_time: bool = False
+    """What the engine asks of an apparatus: its effects, priors, covariates, parts to hold out, next measurements."""
 
     @property
     @abstractmethod
     def words(self) -> Words:
         """Words for sentences about the apparatus."""
+
+    @property
+    def rows_are_in_order(self) -> bool:
+        """Whether the order of rows is that of recording, as far as readings tell."""
+        return True
+
+    @property
+    def controls(self) -> Sequence[str]:
+        """Covariates that a person sets and has declared as such."""
+        return ()
+
+    @property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        """Whether a plan holds one of the candidate measurements only, since its file would not keep two apart."""
+        return False
 
     @abstractmethod
     def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
@@ -176,9 +182,9 @@ class Apparatus(ABC):
         return None
 
     def coordinates_of_new_run(self, model: Model) -> IntArray:
-        """Return the indices of a model's coordinates of which a run yet to be recorded has values known by the prior.
+        """Return the indices of a model's coordinates of which each run has a value of its own; none by default.
 
-        None by default.
+        In a run that is yet to be recorded such a value is known by its prior alone.
         """
         return np.zeros(0, dtype=np.int64)
 

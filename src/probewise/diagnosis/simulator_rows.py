@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -67,7 +66,7 @@ def possible_run_commands(
     without any, runs can only be repeated. A function of the time may hold for constant controls alone, as a step
     response does: unless the simulator is a law (`by_law`), only a control that varies in a recorded run does so again.
     """
-    out: list[Command] = []
+    out, run = list[Command](), table.run or unused_name(_RUN, table.columns)
     settable = [name for name in controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
@@ -78,7 +77,15 @@ def possible_run_commands(
         of = f"run {name}" if table.run is not None else "the rows"
         for kind, words, columns, slower in _variations_of_run(table, kept, ends, free, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
-            made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
+            changed: dict[str, Any] = {**columns, run: np.full(len(kept), called)}
+            if reading in table.columns:
+                changed[reading] = np.full(len(kept), np.nan)
+            if table.time is not None:
+                time = table.time_s[kept]
+                begin = time[0] if table.time_begins_anew else _next_start_time(table)
+                changed[table.time] = begin + slower * (time - time[0])
+            taken, like = table.take(kept), {called: table.like.get(name, name)}  # parameters per run as in that run
+            made = replace(taken, columns={**taken.columns, **changed}, run=run, like=like, first_row=len(table))
             unit = _minutes_of_time_unit(made, time_unit)
             minutes = len(made) * _A_READING if unit is None else float(np.ptp(made.time_s)) * unit
             out.append(Command(kind, words, cast(Plan, made), _BREAK + minutes))
@@ -121,32 +128,6 @@ def _variations_of_run(
                 rounded = np.round(values, int(np.ceil(3 - np.log10(high - low))))
                 values = np.where((values == low) | (values == high), values, rounded)
             yield f"{name} {kind}", f"take {of} with {name} {text}", {name: values}, 1.0
-
-
-def _planned_run(
-    table: RunTable,
-    rows: IntArray,
-    columns: Mapping[str, FloatArray],
-    reading: str,
-    name: str,
-    like: str,
-    slower: float,
-) -> RunTable:
-    """Return rows of a table as a new run after it, called `name`: without readings, with `columns` set.
-
-    The run takes `slower` times as long as the rows did; parameters per run are taken as in the run `like`.
-    """
-    changed: dict[str, Any] = {**columns}
-    if reading in table.columns:
-        changed[reading] = np.full(len(rows), np.nan)
-    if table.time is not None:
-        time = table.time_s[rows]
-        begin = time[0] if table.time_begins_anew else _next_start_time(table)
-        changed[table.time] = begin + slower * (time - time[0])
-    run = table.run or unused_name(_RUN, table.columns)
-    changed[run] = np.full(len(rows), name)
-    taken, as_run = table.take(rows), {name: table.like.get(like, like)}
-    return replace(taken, columns={**taken.columns, **changed}, run=run, like=as_run, first_row=len(table))
 
 
 def _next_start_time(table: RunTable) -> float:
@@ -238,15 +219,15 @@ class SimulatorApparatus(Apparatus):
         """The simulator over the runs of the table."""
         return self.about.system
 
-    @cached_property
+    @property
     def rows_are_in_order(self) -> bool:
         return self.about.rows_are_in_order
 
-    @cached_property
+    @property
     def controls(self) -> tuple[str, ...]:
         return self.system.simulator.controls
 
-    @cached_property
+    @property
     def takes_one_measurement_at_a_time(self) -> bool:
         # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
         # from `states` as it is planned, and a lag or a backlash would reach from one into the other.

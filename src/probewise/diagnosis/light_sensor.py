@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -245,21 +245,21 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
         words = f"move pattern {name} by {aside_mm:g} mm along its normal and scan it"
         laid.append((f"{name}_by_{aside_mm:g}_mm", words, once, moved))
-    parts: list[tuple[str, str, Plan, Excerpt, Pattern]] = []
-    for label, words, whole, pattern in laid:
-        seen = ndtr(_distance_inside_edge_mm(whole, pattern) / (_FOOTPRINT * length))
-        excerpts = excerpts_of_scan(np.arange(len(whole)), strides=(_STRIDE,), level=seen)
-        parts += [(label, words, whole, part, pattern) for part in excerpts]
+    out: list[Command] = []
+
+    def lay(label: str, words: str, pattern: Pattern, whole: Plan, parts: Sequence[Excerpt]) -> None:
+        for part in parts:
+            taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+            out.append(scan_command("lay", f"{words}{part.words}", taken))
+
+    for label, words, whole, moved in laid:
+        seen = ndtr(_distance_inside_edge_mm(whole, moved) / (_FOOTPRINT * length))
+        lay(label, words, moved, whole, excerpts_of_scan(np.arange(len(whole)), strides=(_STRIDE,), level=seen))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
-        excerpts = excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE))
-        parts += [(label, words, plan, part, stripes) for part in excerpts]
-    out = []
-    for label, words, whole, part, laid_pattern in parts:
-        taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, laid_pattern)
-        out.append(scan_command("lay", f"{words}{part.words}", taken))
+        lay(label, words, stripes, plan, excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE)))
     return out
 
 
@@ -312,14 +312,6 @@ def held_out_parts(recording: Recording) -> Parts:
 
 _NOT_COLUMNS = frozenset({"time", "level", "edge_distance", "slope", "direction", "orientation", "scan", "place"})
 _MOST_SCANS_ALONE = 24  # number of scans above which residuals are not located in single scans
-
-
-def slope_along_motion(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
-    """Differentiate predictions of a plan along each row's direction of motion, in readings per mm, (n_points,)."""
-    step, (along_x, along_y) = 0.25, plan.direction_of_motion.T
-    ahead, behind = (replace(plan, x_mm=plan.x_mm + s * along_x, y_mm=plan.y_mm + s * along_y) for s in (step, -step))
-    # All rows are shifted together, so that directions, and hence backlash, do not change.
-    return np.asarray((predict(ahead) - predict(behind)) / (2 * step))
 
 
 def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:
@@ -420,8 +412,12 @@ class LightSensorApparatus(Apparatus):
         return frozenset(effects.keys() - EFFECTS)
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
-        slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
+        usable, plan = np.flatnonzero(recording.usable), found.model.plan
+        step, (along_x, along_y) = 0.25, plan.direction_of_motion.T
+        # All rows are shifted together, so that directions, and hence backlash, do not change.
+        moved = (replace(plan, x_mm=plan.x_mm + s * along_x, y_mm=plan.y_mm + s * along_y) for s in (step, -step))
+        ahead, behind = (found.model.predict(found.z[None, :], shifted)[0] for shifted in moved)
+        slope = ((ahead - behind) / (2 * step))[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
     def covariate_of_effect(

@@ -172,7 +172,7 @@ def sample_model(
         own[effect.name] = effect.redraw_by_variant(values, weights[effect.name], rng=rng)
     theta = found.model.joined_theta(null.theta(z[:, : null.n_params]), own)
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
-    of_noise = (_uniform_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)
+    of_noise = (noise_effect_samples(effect, noise, nodes, rng=rng) for effect in on_noise)
     theta = np.concatenate([theta, *of_noise], axis=1)
     names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
@@ -202,20 +202,16 @@ def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray
     return np.array([own.sigma * (own.sd_factor_of_rounding if with_rounding else 1.0) for own in noise.nodes.laws])
 
 
-def noise_effect_samples(effect: NoiseEffect, noise: NoiseEvidence, *, rng: np.random.Generator) -> FloatArray:
-    """Draw the parameters of an effect in a noise model from its posterior, (N_SAMPLES, n_params)."""
-    nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
-    return _uniform_draws_about_nodes(effect, noise, nodes, rng=rng)
-
-
-def _uniform_draws_about_nodes(
-    effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator
+def noise_effect_samples(
+    effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray | None = None, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw a noise effect's parameters uniformly about drawn nodes, half way to the next: (n_samples, n_params).
 
-    `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are. An effect
-    with a rule of its own (`draws_about`) follows that rule.
+    `nodes` (n_samples,) are indices of nodes, by default 500 drawn by their probability; parameters that are the same
+    in all nodes stay as they are. An effect with a rule of its own (`draws_about`) follows that rule.
     """
+    if nodes is None:
+        nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
     settings = noise.nodes.settings[:, noise.noise.columns_of_effect(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
     if own is not None:

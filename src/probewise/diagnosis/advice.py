@@ -233,8 +233,6 @@ def _collinear_amounts(problem: Linearised, *effects: _Columns) -> list[Amounts]
 
 
 _STRIDES = (2, 4)
-_PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
-_ENOUGH = 40.0  # squared distance of predictions, in noise sds, beyond which more separation adds nothing
 _SETTLED = 0.05  # share of the entropy that may remain
 _LEAST_NOISE_2 = 1e-12  # of the largest variance of a reading
 _WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove

@@ -137,7 +137,7 @@ class BestRepair:
             comes_next = None if later is None else gain_on(later, each_alone=True)
             p_after = p_value_after(searched, fit, after, rng=rng)
         log_evidence = fit.evidence[noise].log_z - test.null.evidence[searched.certain].log_z
-        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, *rms, p_after, comes_next)
+        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after, comes_next)
         return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 

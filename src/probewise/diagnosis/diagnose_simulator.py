@@ -89,7 +89,7 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         return recording
     no_inputs = system.simulator.reading, system.simulator.noise.sd
     inputs = {name: values for name, values in table.covariates.items() if name not in no_inputs}
-    missing = ~np.isfinite([np.zeros(len(table)), *inputs.values()]).all(axis=0)
+    missing = np.logical_or.reduce([np.zeros(len(table), dtype=np.bool_), *(~np.isfinite(v) for v in inputs.values())])
     gaps = np.flatnonzero(missing)
     if system.simulator.law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():

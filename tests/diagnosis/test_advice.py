@@ -396,21 +396,8 @@ def table() -> RunTable:
     return RunTable({"day": np.repeat(["a", "b", "c"], 12), "x": x, "temp_c": temp_c, "y_v": y_v}, run="day")
 
 
-COMPARED: list[Rival] = []
-
-
-@pytest.fixture(scope="module")
-def diagnosis():
-    def compare(rivals, *rest):
-        COMPARED.extend(rivals)
-        return measurement_separating_rivals(rivals, *rest)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("probewise.diagnosis.advice.measurement_separating_rivals", compare)
-        return diagnose_system(SIMULATOR, table(), rng=np.random.default_rng(1))
-
-
-def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so(diagnosis):
+def test_where_no_readings_separate_the_named_hypotheses_the_verdict_says_so():
+    diagnosis = diagnose_system(SIMULATOR, table(), rng=np.random.default_rng(1))
     nothing = diagnosis.apparatus.words.settles_nothing
     assert diagnosis.verdict == "cannot_tell"
     assert TO_SEPARATE not in diagnosis.reason

@@ -11,7 +11,6 @@ from heater import SIMULATOR, runs
 from probewise.diagnosis.advice import (
     COUNTS,
     Alias,
-    EffectEntry,
     pairs_with_separating_scans,
 )
 from probewise.diagnosis.apparatus import MOST_READINGS
@@ -31,7 +30,7 @@ NEW_START = 5 / PROBLEM.sd  # of each run yet to be recorded, the prior's sd
 
 
 def advised(*names: str) -> Alias:
-    entries = {name: EffectEntry(PREPARED.effects[name], PREPARED.effects[name].bank()[0]) for name in names}
+    entries = {name: (PREPARED.effects[name], PREPARED.effects[name].bank()[0]) for name in names}
     pair = Alias(cast(Any, names), 1.0, NOTHING, 0)
     (found,) = pairs_with_separating_scans(
         [pair], PROBLEM, FOUND, entries, np.arange(len(RECORDING.readings)), APPARATUS

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from mixtures import fixed_mixture
 
-from probewise.diagnosis import audit_plan, join
-from probewise.diagnosis.audit import ExpectedSensor, PlanTemplates, ProjectedTemplates, _curing_step_by_effect
+from probewise.diagnosis import audit_plan
+from probewise.diagnosis.audit import PlanTemplates, ProjectedTemplates, _curing_step_by_effect
 from probewise.diagnosis.light_sensor import candidate_scans
 from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
 from probewise.errors import ParameterError
-from probewise.recordings import Recording, paper_plan, two_way_plan
+from probewise.recordings import paper_plan, two_way_plan
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FreeLevels, FreeMixture
@@ -29,22 +29,26 @@ def thinned(plan: Plan, step: int = 4) -> Plan:
     return plan.take(np.arange(0, len(plan), step))
 
 
+SD = 0.5
+
+
 def sights_of(plan: Plan):
-    """The surviving share of backlash and its cosine to an edge that lies elsewhere, by `ProjectedTemplates`."""
-    sensor = default_sensor(Extent(10.0, 60.0, plan), 1)
-    expected = ExpectedSensor(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
-    seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, expected.effects_on(plan, TWO)), np.arange(len(plan)))
+    """A sensor, the surviving share of backlash and its cosine to an edge that lies elsewhere, and templates."""
+    extent = Extent(10.0, 60.0, plan)
+    sensor, built = default_sensor(extent, 1), {name: kind.for_extent(extent) for name, kind in TWO.items()}
+    laid = PlanTemplates.of(sensor, np.full(sensor.n_params, 0.1), SD, plan, built)
+    seen = ProjectedTemplates.of(laid, np.arange(len(plan)))
     share, like = seen.detectable_shares_and_cosines()["backlash"]
-    return expected, share, like["edge_misplacement"], seen
+    return sensor, share, like["edge_misplacement"], seen
 
 
-def by_least_squares(plan: Plan, expected: ExpectedSensor) -> tuple[float, float]:
+def by_least_squares(plan: Plan, sensor) -> tuple[float, float]:
     """The same two numbers from predictions of plain chains and ordinary least squares."""
-    z, sensor = expected.z, expected.null
+    z = np.full(sensor.n_params, 0.1)
 
     def predict(effects, theta):
         chain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns), effects)
-        return chain.predict(theta, plan)[0] / expected.sd
+        return chain.predict(theta, plan)[0] / SD
 
     def own(z):
         return predict((), sensor.theta(z[None, :]))
@@ -65,20 +69,20 @@ def by_least_squares(plan: Plan, expected: ExpectedSensor) -> tuple[float, float
 
 @pytest.mark.parametrize("plan", [thinned(paper_plan()), thinned(two_way_plan(), 8)])
 def test_share_and_cosine_are_those_of_least_squares(plan):
-    expected, share, cosine, _ = sights_of(plan)
-    np.testing.assert_allclose((share, cosine), by_least_squares(plan, expected), rtol=0.02, atol=1e-3)
+    sensor, share, cosine, _ = sights_of(plan)
+    np.testing.assert_allclose((share, cosine), by_least_squares(plan, sensor), rtol=0.02, atol=1e-3)
 
 
 def test_the_smallest_size_leaves_lambda_eight():
     """A trace of that size, from the chain, has length 8 once the fit has taken its part."""
     plan = thinned(two_way_plan(), 8)
-    expected, share, _, seen = sights_of(plan)
+    sensor, share, _, seen = sights_of(plan)
     (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"]).values()
-    theta = expected.null.theta(expected.z[None, :])
+    theta = sensor.theta(np.full((1, sensor.n_params), 0.1))
     plain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
     with_play = plain.with_effects(VOCABULARY["backlash"]())
     trace = with_play.predict(np.concatenate([theta, [[width_mm]]], axis=1), plan) - plain.predict(theta, plan)
-    assert share * np.linalg.norm(trace) / expected.sd == pytest.approx(8.0, rel=0.05)
+    assert share * np.linalg.norm(trace) / SD == pytest.approx(8.0, rel=0.05)
 
 
 @pytest.mark.slow
@@ -195,13 +199,3 @@ def test_an_audit_does_not_depend_on_the_unit_of_the_readings(calibrated):
             f"noise {(0.5 if calibrated else 0.8) * unit:.3g} " in audit.assumed
         )  # a hundredth of the span between the levels
     np.testing.assert_allclose(shares[1], shares[0], rtol=1e-4)
-
-
-def test_a_recording_joined_with_one_in_the_dark_is_lit_where_it_does_not_say():
-    plan = paper_plan().take(np.arange(30))
-    usual = Recording(plan, np.full(30, 20.0))
-    dark = Recording(replace(plan, covariates={"led": np.zeros(30)}), np.full(30, 10.0))
-    joined = join([usual, dark]).plan
-    assert np.isnan(joined.covariates["led"][:30]).all()
-    assert (joined.covariates["led"][30:] == 0).all()
-    assert (joined.covariates["battery_mv"][30:] == joined.covariates["battery_mv"][29]).all()  # nobody commands it

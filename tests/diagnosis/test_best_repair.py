@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis import diagnose
+from probewise.diagnosis import best_repair, diagnose
 from probewise.diagnosis.best_repair import correct_by_best_basis
 from probewise.diagnosis.evidence import SCALES, Linearised
 from probewise.diagnosis.held_out import partition_into_blocks
 from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.templates import TemplateBank
+from probewise.diagnosis.verdict import Hypothesis, Judged
 from probewise.recordings import Recording, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -129,3 +131,32 @@ def test_the_gain_is_that_of_the_conditional_densities(kind):
     columns = _BUMP[:, None] / np.sqrt(np.mean(_BUMP**2))
     expected = sum(log_density(columns, out) - log_density(plain, out) for out in np.equal.outer(range(5), _PARTS)) / _N
     assert corrected.held_out.per_reading == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize(("clean", "predicts", "weight"), [(0.3, False, 0.05), (0.3, True, None), (0.01, False, None)])
+def test_what_is_unknown_and_predicts_nothing_has_its_prior_odds_beside_a_law_that_may_be_complete(
+    monkeypatch, clean, predicts, weight
+):
+    """.06 to .6 against nothing on the mean, .3 of the probability: .05 times the .6 that it has."""
+    asked = []
+    fixed = SimpleNamespace(held_out=SimpleNamespace(per_reading=0.1 if predicts else -0.1))
+    monkeypatch.setattr(best_repair, "best_correction", lambda *more: (fixed, ()))
+    monkeypatch.setattr(best_repair.BestRepair, "of", lambda *more, **options: "repair")
+    monkeypatch.setattr(best_repair, "judge", lambda *more, unknown_weight: asked.append(unknown_weight) or judged)
+    hypotheses = (
+        Hypothesis(("unknown",), 0.6),
+        Hypothesis((), clean / 2),
+        Hypothesis(("outliers",), clean / 2),
+        Hypothesis(("lag",), 0.4 - clean),
+    )
+    judged = Judged("unknown", ("unknown",), 0.004, hypotheses)
+    searched = SimpleNamespace(
+        leading_combination_out_of_vocabulary=lambda: (),
+        likeliest_fit_beside_unknown=lambda noise: None,
+        prior=PriorOdds(),
+        prepared=SimpleNamespace(noise_effect_names=frozenset({"outliers"})),
+    )
+    test = SimpleNamespace(null=None, noise=())
+    found = best_repair.judged_and_best_repair(searched, test, judged, rng=np.random.default_rng(0))
+    assert found == (judged, "repair")
+    assert asked == ([] if weight is None else [pytest.approx(weight)])

@@ -149,8 +149,9 @@ def diagnosis_of_impossible():
 @pytest.mark.slow
 def test_every_probability_and_size_is_a_number(diagnosis_of_impossible):
     assert sum(h.probability for h in diagnosis_of_impossible.judged.hypotheses) == pytest.approx(1.0)
+    # Not the size of readings a thousand noise sds off, which stands for an impossible one.
     assert diagnosis_of_impossible.effects
-    assert all(math.isfinite(effect.size_lambda) for effect in diagnosis_of_impossible.effects)
+    assert all(effect.size_lambda < 200 for effect in diagnosis_of_impossible.effects)
     assert all(
         np.isfinite([place.start, place.end]).all()
         for place in diagnosis_of_impossible.where
@@ -328,9 +329,3 @@ def test_rows_after_the_recording_have_the_whole_walk_in_their_sd(diagnosis):
     law = np.var(samples.chain.predict(samples.theta, diagnosis.recording.plan)[:, -1])
     expected = np.sqrt(np.mean(samples.noise_sd**2) + np.mean(step**2) * (t + 1) + law)
     np.testing.assert_allclose(later.sd, expected, rtol=0.1)
-
-
-@pytest.mark.slow
-def test_a_size_is_that_of_a_refit_from_values_that_predict_something(diagnosis_of_impossible):
-    """Not that of readings a thousand noise sds off, which stands for an impossible one."""
-    assert max(effect.size_lambda for effect in diagnosis_of_impossible.effects) < 200

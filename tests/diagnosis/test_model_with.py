@@ -27,11 +27,7 @@ def test_the_effect_chosen_is_fitted():
     assert found.noise_sd.mean() < plain.noise_sd.mean()
 
 
-def test_a_name_that_cannot_be_is_refused():
-    with pytest.raises(ParameterError, match="hum"):
-        model_with(RECORDING, ["hum"], rng=np.random.default_rng(1))
-
-
-def test_lost_readings_of_which_there_is_none_are_refused():
-    with pytest.raises(ParameterError, match="dropouts"):
-        model_with(RECORDING, ["dropouts"], rng=np.random.default_rng(1))
+@pytest.mark.parametrize("name", ["hum", "dropouts"])
+def test_a_name_that_cannot_be_and_lost_readings_of_which_there_is_none_are_refused(name):
+    with pytest.raises(ParameterError, match=name):
+        model_with(RECORDING, [name], rng=np.random.default_rng(1))

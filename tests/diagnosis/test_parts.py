@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 
 from probewise.arm import readings_of_recording, recording_of_readings
-from probewise.diagnosis.advice import Alias, projected_cosine
+from probewise.diagnosis.advice import Alias, collinear_pairs
 from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
@@ -19,7 +19,7 @@ from probewise.diagnosis.evidence import (
     average_over_amplitude_scales,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
-from probewise.diagnosis.light_sensor import covariate_of_effect, rows_as_next_scan
+from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
 from probewise.diagnosis.locate import (
     Covariate,
     figure_name_of,
@@ -76,7 +76,7 @@ def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:
 
 
 def placed(effect, change, without, plan, covariates):
-    shows_in = covariate_of_effect(effect, change, without, plan, covariates)
+    shows_in = LightSensorApparatus().covariate_of_effect(effect, change, without, plan, covariates)
     scans = next((c for c in covariates if c.name == "scan"), None)
     return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0)
 
@@ -319,8 +319,9 @@ def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
     problem = Linearised(basis, np.zeros(52), white_noise(50), 1.0, 50)
     first = rng.normal(size=(50, 1))
     second = 3 * first + slopes @ np.array([[1e-5], [2e-5]])
-    assert projected_cosine(problem, first, second) == pytest.approx(1.0, abs=1e-6)
-    assert projected_cosine(problem, first, slopes[:, :1]) == 0.0
+    (alias,) = collinear_pairs(problem, {"a": first, "b": second, "c": slopes[:, :1]}, otherwise="")
+    assert alias.effects == ("a", "b")
+    assert alias.cosine == pytest.approx(1.0, abs=1e-6)
 
 
 def test_windows_never_part_equal_values():

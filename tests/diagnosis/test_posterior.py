@@ -30,24 +30,6 @@ def drawn(center, factor, log_p, seed, n_walkers=400, n_wanted=800):
     return draw_by_annealing(first, log_q, log_p, n_moves=6, n_wanted=n_wanted, rng=rng)
 
 
-@pytest.mark.slow
-def test_a_wrong_approximation_is_put_right():
-    """Ten parameters, correlated by 0.8 in pairs; the approximation is off by an sd, too wide and uncorrelated."""
-    n = 10
-    covariance = np.eye(n)
-    covariance[np.arange(0, n, 2), np.arange(1, n, 2)] = covariance[np.arange(1, n, 2), np.arange(0, n, 2)] = 0.8
-    precision = np.linalg.inv(covariance)
-    means, spreads = [], []
-    for seed in range(20):
-        z = drawn(np.ones(n), 1.5 * np.eye(n), lambda z: -0.5 * np.einsum("ij,jk,ik->i", z, precision, z), seed)
-        means.append(z[:, 0].mean())
-        spreads.append(z[:, 0].var())
-    # Walkers remember: the scatter between runs says how much. Four of its errors: one false alarm in 16,000.
-    for found, truth in ((means, 0.0), (spreads, 1.0)):
-        assert abs(np.mean(found) - truth) < 4 * np.std(found, ddof=1) / np.sqrt(20) + 0.02
-        assert np.std(found) < 0.25
-
-
 def test_a_bent_density_keeps_its_moments():
     """Route two: quadrature. x is normal, y is normal about x^2 / 2."""
 

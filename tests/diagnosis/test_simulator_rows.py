@@ -19,7 +19,6 @@ from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.simulator_rows import (
     SimulatorApparatus,
-    _minutes_of_runs,
     plan_of_alternatives,
     plan_of_sequence,
     possible_run_commands,
@@ -103,9 +102,9 @@ def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
 @pytest.mark.parametrize(("unit", "minutes"), [("s", 1 / 60), ("min.", 1.0), ("Month", 43_830.0), ("fortnight", None)])
 def test_the_time_that_runs_take_is_in_the_unit_of_the_table(unit, minutes):
     """Half a minute before each run; of an unknown unit a second a reading."""
-    taken = _minutes_of_runs(TABLE, unit)
-    of_rows = len(TABLE) / 60 if minutes is None else np.ptp(TABLE.time_s) * minutes
-    assert taken == pytest.approx(0.5 + of_rows)
+    again = possible_run_commands(TABLE, "temp_c", (), unit)[0]
+    of_rows = len(again.plan) / 60 if minutes is None else np.ptp(again.plan.time_s) * minutes
+    assert again.minutes == pytest.approx(0.5 + of_rows)
 
 
 @pytest.mark.parametrize("run", [None, "run"])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
@@ -24,7 +24,6 @@ from probewise.diagnosis.apparatus import (
     NOTHING_NATS,
     SETTLED,
     Apparatus,
-    Command,
     rows_by_command,
 )
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covariance_root
@@ -43,23 +42,8 @@ COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_READINGS])
 _FREE = 1e-6  # prior precision of a rival's amounts, in changes of one noise sd: they are free
 
 
-@dataclass(frozen=True, eq=False)
-class EffectEntry:
-    """An effect at the settings of its parameters, (n_columns, n_effect_params), that make one template."""
-
-    effect: NamedEffect[Any]
-    settings: FloatArray
-
-    def changes(self, found: Fit, plan: Plan, without: FloatArray) -> FloatArray:
-        """Return the change of a plan's readings by each setting, about a fit, (n_points, n_columns).
-
-        `without` are the predictions of the fit, (n_points,). Changes are not finite where the model diverges.
-        """
-        model = replace(found.model, plan=plan).with_effect(self.effect)
-        own = model.z_of_last_effect(self.settings)
-        points = np.concatenate([np.repeat(found.z[None, :], len(own), axis=0), own], axis=1)
-        with np.errstate(all="ignore"):
-            return np.asarray((model.predict(points) - without).T)
+EffectEntry: TypeAlias = tuple[NamedEffect[Any], FloatArray]
+"""An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,27 +56,6 @@ class _Columns:
     old: FloatArray
     further: FloatArray
     of_run: bool
-
-    @classmethod
-    def of(
-        cls,
-        entry: EffectEntry,
-        problem: Linearised,
-        found: Fit,
-        usable: IntArray,
-        everywhere: tuple[Plan, FloatArray],
-        apparatus: Apparatus,
-    ) -> _Columns:
-        """Linearise the readings of `usable` rows, and those of another plan with its predictions without effects."""
-        model, (plan, expected) = found.model, everywhere
-        old = problem.whiten(entry.changes(found, model.plan, model.predict(found.z[None, :])[0])[usable])
-        length = max(float(np.linalg.norm(old)), 1e-300)
-        further = entry.changes(found, plan, expected) / problem.sd
-        n_known = len(apparatus.coordinates_of_new_run(model))
-        of_run = len(apparatus.coordinates_of_new_run(model.with_effect(entry.effect))) > n_known
-        if of_run:  # the new run's value is about the mean of the others
-            further = np.repeat(further.mean(axis=1, keepdims=True), further.shape[1], axis=1)
-        return cls(old / length, further / length, of_run)
 
 
 Amounts = tuple[_Columns, FloatArray]
@@ -144,14 +107,6 @@ class Alias:
     readings: int
 
 
-def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
-    """Return the largest principal cosine of two templates (n_points, k), a fit projected out; 0 if it absorbs one."""
-    bases = [_projected_basis(problem, problem.whiten(c))[0] for c in (first, second)]
-    if not all(basis.size for basis in bases):
-        return 0.0
-    return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
-
-
 def _projected_basis(problem: Linearised, whitened: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Orthonormalise a whitened template, (n_points, k), with a fit projected out; nothing is left if it is absorbed.
 
@@ -172,9 +127,12 @@ def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *,
     `templates`: for each effect, its best-fitting template columns (n_points, k); `otherwise`: the `settle_by` of each
     pair; its `readings` are 0.
     """
-    pairs = list(itertools.combinations(sorted(templates), 2))
-    cosines = [projected_cosine(problem, templates[one], templates[other]) for one, other in pairs]
-    out = [Alias(pair, c, otherwise, 0) for pair, c in zip(pairs, cosines, strict=True) if c >= ALIAS_COSINE]
+    bases = {name: _projected_basis(problem, problem.whiten(templates[name]))[0] for name in sorted(templates)}
+    out = []
+    for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
+        cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
+        if cosines[0] >= ALIAS_COSINE:
+            out.append(Alias(pair, float(min(cosines[0], 1.0)), otherwise, 0))
     return sorted(out, key=lambda alias: -alias.cosine)
 
 
@@ -194,7 +152,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
         telling[name] = templates.columns[best]
-        chosen[name] = EffectEntry(templates.variant_of_entry(best), templates.settings[best])
+        chosen[name] = templates.variant_of_entry(best), templates.settings[best]
     pairs = collinear_pairs(problem, telling, otherwise=prepared.apparatus.words.settles_nothing)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
 
@@ -216,8 +174,8 @@ def pairs_with_separating_scans(
 
     `entries`: the entry of each effect's bank that is taken for it, by name.
     """
-    plan = found.model.plan
-    scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
+    plan, level = found.model.plan, found.model.predict(found.z[None, :])[0]
+    scans = apparatus.candidate_measurements(plan, level=level)
     if not (pairs and scans):
         return list(pairs)
     everywhere = apparatus.plan_of_alternatives(scans, plan)
@@ -227,10 +185,21 @@ def pairs_with_separating_scans(
     shared[:, of_run] = 0.0
     further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
     before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
-    columns = {
-        name: _Columns.of(entries[name], problem, found, usable, (everywhere, expected), apparatus)
-        for name in sorted({name for pair in pairs for name in pair.effects})
-    }
+
+    def columns_of(effect: NamedEffect[Any], settings: FloatArray) -> _Columns:
+        with_effect = found.model.with_effect(effect)
+        values = with_effect.z_of_last_effect(settings)
+        points = np.concatenate([np.repeat(found.z[None, :], len(values), axis=0), values], axis=1)
+        with np.errstate(all="ignore"):  # not finite where the model diverges
+            old = problem.whiten((with_effect.predict(points) - level).T[usable])
+            new = (replace(with_effect, plan=everywhere).predict(points) - expected).T / problem.sd
+        length = max(float(np.linalg.norm(old)), 1e-300)
+        is_of_run = len(apparatus.coordinates_of_new_run(with_effect)) > len(of_run)
+        if is_of_run:  # the new run's value is about the mean of the others
+            new = np.repeat(new.mean(axis=1, keepdims=True), new.shape[1], axis=1)
+        return _Columns(old / length, new / length, is_of_run)
+
+    columns = {name: columns_of(*entries[name]) for name in sorted({name for p in pairs for name in p.effects})}
     sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
     best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
@@ -263,26 +232,7 @@ def _collinear_amounts(problem: Linearised, *effects: _Columns) -> list[Amounts]
     return out
 
 
-def slopes_split_by_run(slopes: FloatArray, of_run: IntArray, plan: Plan) -> tuple[FloatArray, FloatArray]:
-    """Split slopes of planned readings into those by values already fitted, and those by values of the new runs.
-
-    A planned run is predicted at the values of a recorded run, by whose coordinates the slopes (n_points, n_params)
-    are; `of_run`: indices of those of which each run has a value of its own, with a standard normal prior. Returns the
-    slopes with 0 in the columns `of_run`; and, for each run and each of these columns that acts there, a column that is
-    0 in all other runs, (n_points, n_columns).
-    """
-    shared = slopes.copy()
-    shared[:, of_run] = 0.0
-    if not of_run.size:
-        return shared, np.zeros((len(slopes), 0))
-    inside = plan.scan[:, None] == np.arange(len(plan.scan_names))  # (n_points, n_runs)
-    own = (inside[:, :, None] * slopes[:, None, of_run]).reshape(len(slopes), -1)
-    return shared, own[:, np.any(own != 0, axis=0)]
-
-
 _STRIDES = (2, 4)
-_PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
-_ENOUGH = 40.0  # squared distance of predictions, in noise sds, beyond which more separation adds nothing
 _SETTLED = 0.05  # share of the entropy that may remain
 _LEAST_NOISE_2 = 1e-12  # of the largest variance of a reading
 _WORTHWHILE = 0.03  # least share of the entropy that a further scan must remove
@@ -339,7 +289,12 @@ class Rival:
     def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
         mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
-        shared, own = slopes_split_by_run(slopes, self.of_run, plan)
+        shared, own = slopes.copy(), np.zeros((len(slopes), 0))
+        shared[:, self.of_run] = 0.0
+        if self.of_run.size:  # a planned run is predicted at a recorded one's values, but each has values of its own
+            inside = plan.scan[:, None] == np.arange(len(plan.scan_names))  # (n_points, n_runs)
+            own = (inside[:, :, None] * slopes[:, None, self.of_run]).reshape(len(slopes), -1)
+            own = own[:, np.any(own != 0, axis=0)]
         return PredictiveNormal(mean / sd, np.concatenate([shared @ self.root, own], axis=1) / sd)
 
 
@@ -365,6 +320,7 @@ class PredictiveNormal:
         return np.asarray(noise_2 * np.eye(len(self.mean)) + of_factor)
 
 
+@np.errstate(all="ignore")  # of predictions that ran away
 def measurement_separating_rivals(
     rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus
 ) -> NextMeasurement | None:
@@ -377,7 +333,6 @@ def measurement_separating_rivals(
     offered = apparatus.candidate_measurements(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _shortlisted_command_indices(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
@@ -472,41 +427,6 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
         log_det = np.linalg.slogdet(middle)[1] - (log_dets[a] + log_dets[b]) / 2
         distances[a, b] = distances[b, a] = apart @ np.linalg.solve(middle, apart) / 8 + log_det / 2
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
-
-
-@np.errstate(all="ignore")  # of predictions that ran away
-def _shortlisted_command_indices(
-    rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
-) -> list[int]:
-    """Return the indices of the four scans, for each pair of rivals, that separate it most per minute."""
-    if not offered:
-        return []
-    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
-    means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
-    minutes = np.array([option.minutes for option in offered])
-    leader = max(rivals, key=lambda rival: rival.probability)
-    model = replace(leader.model, plan=everywhere)
-    of_run = model.predict_and_differentiate(leader.z, by=leader.of_run)[1] / sd if leader.of_run.size else None
-    kept: dict[int, None] = {}
-    for a, b in itertools.combinations(range(len(rivals)), 2):
-        apart = means[a] - means[b]
-        squares = np.array([_squared_distance(apart[own], None if of_run is None else of_run[own]) for own in rows])
-        # Separation beyond this adds nothing; a model that runs away there says nothing.
-        worth = np.minimum(np.where(np.isfinite(squares), squares, 0.0), _ENOUGH) / minutes
-        kept |= dict.fromkeys(np.argsort(-worth, kind="stable")[:_PROMISING].tolist())
-    return list(kept)
-
-
-def _squared_distance(apart: FloatArray, of_run: FloatArray | None) -> float:
-    """Return the squared distance of predictions, in noise sds, that unknown values of one new run leave.
-
-    `apart` is the difference of the predictions, (n_points,), `of_run` the slopes by those values, (n_points, k).
-    """
-    square = float(apart @ apart)
-    if of_run is None:
-        return square
-    along = of_run.T @ apart
-    return square - float(along @ np.linalg.solve(np.eye(len(along)) + of_run.T @ of_run, along))
 
 
 def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> FloatArray:

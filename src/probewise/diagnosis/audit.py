@@ -10,8 +10,9 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, Self, TypeAlias, cast, get_args
 
 import numpy as np
@@ -34,6 +35,7 @@ from probewise.diagnosis.light_sensor import (
 from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,
+    CalibratedSensor,
     SensorPrior,
     default_sensor,
     require_same_unit,
@@ -61,27 +63,11 @@ _MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyon
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedSensor:
-    """The expected sensor: `null` with its prior, point `z` (n_params,) of linearisation, low and high level, sd."""
-
-    null: Null
-    z: FloatArray
-    levels: tuple[float, float]
-    sd: float
-
-    def effects_on(self, plan: Plan, kinds: Mapping[str, EffectKind]) -> dict[str, NamedEffect[Any]]:
-        """Scale effects to a plan, by name, without those that cannot act there."""
-        extent = Extent(*self.levels, plan)
-        maybe = {name: kind.for_extent(extent) for name, kind in kinds.items()}
-        return {name: effect for name, effect in maybe.items() if effect is not None}
-
-
-@dataclass(frozen=True, eq=False)
 class PlanTemplates:
     """The templates of all effects under one plan: changes of its readings, in noise sds.
 
     `columns` (n_points, n_columns) are grouped in entries: one for each setting (parameter values) of an effect's
-    bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `names`,
+    bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `built`,
     `settings` its parameter values. `slopes` (n_points, n_params) are those of the sensor. `built`: effects by name.
     """
 
@@ -89,40 +75,43 @@ class PlanTemplates:
     columns: FloatArray
     entry: IntArray
     owner: IntArray
-    names: tuple[str, ...]
     built: Mapping[str, NamedEffect[Any]]
     settings: tuple[FloatArray, ...]
 
     @classmethod
     def of(
-        cls, expected: ExpectedSensor, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
+        cls,
+        expected: Null,
+        z: FloatArray,
+        sd: float,
+        plan: Plan,
+        built: Mapping[str, NamedEffect[Any]],
+        *,
+        most: int | None = None,
     ) -> Self:
-        """Build the templates of effects that are scaled to a plan, without those on the noise.
+        """Build the templates, about a point z (n_params,) of a model, of effects scaled to a plan; not on the noise.
 
         Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
         """
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
-        model = Model(expected.null, (), plan)
-        predicted, slopes = model.predict_and_differentiate(expected.z)
-        found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, sd=expected.sd, objective=0.0)
+        model = Model(expected, (), plan)
+        predicted, slopes = model.predict_and_differentiate(z)
+        found = Fit(model, z, predicted, np.zeros(len(plan)), slopes, sd=sd, objective=0.0)
         columns, settings, owner = [np.zeros((len(plan), 0))], list[FloatArray](), list[int]()
         for at, effect in enumerate(built.values()):
-            if effect.stage is Stage.NOISE:
-                continue
-            templates = templates_of_effect(found, effect, np.arange(len(plan)), most=most)
-            columns += templates.columns
-            settings += templates.settings
-            owner += [at] * len(templates.columns)
+            if effect.stage is not Stage.NOISE:
+                templates = templates_of_effect(found, effect, np.arange(len(plan)), most=most)
+                columns += templates.columns
+                settings += templates.settings
+                owner += [at] * len(templates.columns)
         entry = np.repeat(np.arange(len(settings)), [c.shape[1] for c in columns[1:]])
-        return cls(
-            slopes / expected.sd,
-            np.concatenate(columns, axis=1) / expected.sd,
-            entry,
-            np.array(owner, dtype=np.int64),
-            tuple(built),
-            built,
-            tuple(settings),
-        )
+        whole = np.concatenate(columns, axis=1) / sd
+        return cls(slopes / sd, whole, entry, np.array(owner, dtype=np.int64), built, tuple(settings))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the effects, in the order of `owner`."""
+        return list(self.built)
 
     def norms_of_entries(self, columns: FloatArray) -> FloatArray:
         """Return the root of the sum of squares of each entry's columns, (n_points, n_columns) -> (n_entries,)."""
@@ -217,7 +206,7 @@ def _run_start_indices(codes: IntArray) -> IntArray:
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
 _MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...
-_LINE = 100  # characters of a line of the summary
+_LINE = 99  # characters of a line of the summary
 _SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis, and where a hundred scans are tried
 _LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
 _READING_GUIDE = (
@@ -266,16 +255,9 @@ class EffectAudit:
 
 
 @dataclass(frozen=True, eq=False)
-class Cure:
-    """One scan to add: description, plan, duration in minutes, and the effects that it makes fine.
+class Cure(Command):
+    """One scan to add, and the effects that it makes fine."""
 
-    `kind` is "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet, "lay".
-    """
-
-    kind: str
-    description: str
-    plan: Plan
-    minutes: float
     cured: tuple[str, ...]
 
 
@@ -346,15 +328,12 @@ class PlanAudit(ShowsItself):
 
 
 def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
-    """Write a list of names after a label, in lines of up to 100 characters; no lines without names."""
-    lines, line = [], f"{label:<10} "
-    for k, name in enumerate(names):
-        piece = name + (", " if k + 1 < len(names) else "")
-        if len(line) + len(piece) > _LINE:
-            lines.append(line.rstrip())
-            line = " " * 11
-        line += piece
-    return [*lines, line.rstrip()] if names else []
+    """Write a list of names after a label, in lines of up to 99 characters; no lines without names."""
+    text = ", ".join(name.replace(" ", "\0") for name in names)  # a name stays in one line
+    lines = textwrap.wrap(
+        text, _LINE, initial_indent=f"{label:<10} ", subsequent_indent=" " * 11, break_on_hyphens=False
+    )
+    return [line.replace("\0", " ") for line in lines]
 
 
 @own_arithmetic
@@ -404,16 +383,12 @@ def audit_plan(
         require_same_unit(sensor, plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):
         noise_sd = float(sensor.noise_sd.mean())
-    expected, said = _expected_sensor_and_description(plan, sensor, noise_sd)
+    templates_on, said = _expected_templates_and_description(plan, sensor, noise_sd, effects)
     unit = plan.instrumentation.unit
     progress("judging the plan")
-
-    def templates_on(plan: Plan) -> PlanTemplates:
-        return PlanTemplates.of(expected, plan, expected.effects_on(plan, effects))
-
     before, cosines = audits_and_cosines(templates_on(plan), list(effects), unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
-    chosen = choose_cure_scans(plan, expected, effects, ailing, progress)
+    chosen = choose_cure_scans(plan, templates_on, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
@@ -422,8 +397,8 @@ def audit_plan(
     cured = _curing_step_by_effect(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
-        Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
-        for k, c in enumerate(chosen[:n_kept], start=1)
+        Cure(**vars(command), cured=tuple(name for name, step in cured.items() if step == k))
+        for k, command in enumerate(chosen[:n_kept], start=1)
     )
     return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])
 
@@ -464,8 +439,8 @@ def audit_plan_of_diagnosis(
     else:
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
-    expected = ExpectedSensor(null, z, _levels(known.chain.names, mean), float(known.noise_sd.mean()))
-    laid = PlanTemplates.of(expected, plan, expected.effects_on(plan, effects), most=_SETTINGS)
+    sd = float(known.noise_sd.mean())
+    laid = _templates_of_sensor(null, z, sd, _levels(known.chain.names, mean), effects, plan, most=_SETTINGS)
     effects_seen, cosines = audits_and_cosines(laid, list(effects), plan.instrumentation.unit)
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
 
@@ -475,10 +450,26 @@ def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
     return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
 
 
-def _expected_sensor_and_description(
-    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None
-) -> tuple[ExpectedSensor, str]:
-    """Return the expected sensor, and its description in words with its noise sd."""
+def _templates_of_sensor(
+    sensor: CalibratedSensor,
+    z: FloatArray,
+    sd: float,
+    levels: tuple[float, float],
+    kinds: Mapping[str, EffectKind],
+    plan: Plan,
+    *,
+    most: int | None = None,
+) -> PlanTemplates:
+    """Build the templates of effects scaled to the low and high level and to a plan, without those that cannot act."""
+    maybe = {name: kind.for_extent(Extent(*levels, plan)) for name, kind in kinds.items()}
+    able = {name: effect for name, effect in maybe.items() if effect is not None}
+    return PlanTemplates.of(sensor, z, sd, plan, able, most=most)
+
+
+def _expected_templates_and_description(
+    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None, effects: Mapping[str, EffectKind]
+) -> tuple[Callable[..., PlanTemplates], str]:
+    """Return a function of a plan, the templates about the expected sensor, and that in words with its noise sd."""
     if sensor is not None:
         null, said = sensor_from_samples(sensor), "the sensor as calibrated"
         low, high = _levels(sensor.names, np.asarray(sensor.samples, dtype=np.float64).mean(axis=0))
@@ -495,7 +486,7 @@ def _expected_sensor_and_description(
     if not sd > 0:
         raise ParameterError("noise_sd", sd, "greater than 0")
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
-    return ExpectedSensor(null, z, (low, high), sd), said
+    return partial(_templates_of_sensor, null, z, sd, (low, high), effects), said
 
 
 def audits_and_cosines(
@@ -538,16 +529,11 @@ _STRIDES = (1, 4)
 
 
 def choose_cure_scans(
-    plan: Plan,
-    expected: ExpectedSensor,
-    effects: Mapping[str, EffectKind],
-    ailing: Sequence[str],
-    progress: Progress = silent,
+    plan: Plan, templates_on: Callable[..., PlanTemplates], ailing: Sequence[str], progress: Progress = silent
 ) -> list[Command]:
     """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
 
-    They are timed one after another, in the order chosen. The deficit of an effect is 0 if it is detected and told from
-    others, up to 1 if aliased, 1 to 2 if invisible.
+    They are timed one after another, in the order chosen.
     """
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Command] = []
@@ -560,7 +546,7 @@ def choose_cure_scans(
         if not options:
             break
         together = join_plans([current, *(option.plan for option in options)])
-        laid = PlanTemplates.of(expected, together, expected.effects_on(together, effects), most=_SETTINGS)
+        laid = templates_on(together, most=_SETTINGS)
         now = np.arange(len(current))
         trouble = _total_detectability_deficit(laid, now, ailing)
         worth = []
@@ -695,8 +681,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
-    expected = ExpectedSensor(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
-    laid = PlanTemplates.of(expected, cast(Plan, own), built, most=_SETTINGS_OF_TABLE)
+    laid = PlanTemplates.of(cast(Null, system), z, sd, cast(Plan, own), built, most=_SETTINGS_OF_TABLE)
     rows = np.arange(len(own))
     if len(own) > _MOST_ROWS:  # one in each of as many stretches; by the golden ratio, so that no column keeps step
         stretch = np.arange(_MOST_ROWS)

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.apparatus import SETTLED
 from probewise.diagnosis.evidence import SCALES, Linearised
 from probewise.diagnosis.fit import Fit, fit_each_start
 from probewise.diagnosis.held_out import (
     HeldOutGain,
+    Parts,
     held_out_gain,
     mean_gain_over_parts,
     partition_into_blocks,
@@ -25,11 +28,12 @@ from probewise.diagnosis.held_out import (
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import walk_given_readings
+from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.templates import TemplateBank
-from probewise.diagnosis.verdict import GlobalTest, Judged
+from probewise.diagnosis.verdict import GlobalTest, Judged, judge
 from probewise.recordings.plan import Recording
 
 
@@ -51,9 +55,9 @@ def fit_under_noise(candidate: WeighedFit, law: NoiseLaw, recording: Recording) 
     return again if np.isfinite(again.objective) else found
 
 
-def residuals_beside_walk(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
-    """Return residuals without the random walk that they all together show, if the noise has one, (n_usable,)."""
-    return residuals - walk_given_readings(law, residuals)
+def rms_beside_walk(residuals: FloatArray, law: NoiseLaw, recording: Recording) -> float:
+    """Return the rms of residuals without the random walk that they all together show, if the noise has one."""
+    return recording.rms(residuals - walk_given_readings(law, residuals))
 
 
 N_DRAWS = 499
@@ -121,23 +125,19 @@ class BestRepair:
         repaired = fit_under_noise(fit, law, recording)
         calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
         after = Linearised.of(repaired, law)
-        rms = [recording.rms(residuals_beside_walk(found.residuals, law)) for found in (calibrated, repaired)]
-        held, p_after = HeldOutGain(0.0, 0.0, 0, ()), test.p_value
-        comes_next = None
+        rms = [rms_beside_walk(found.residuals, law, recording) for found in (calibrated, repaired)]
+        held, p_after, comes_next = HeldOutGain(0.0, 0.0, 0, ()), test.p_value, None
         if fit is not test.null:
-            parts = searched.prepared.apparatus.held_out_parts(recording)
+            apparatus = searched.prepared.apparatus
             # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
             own = test.null.evidence[test.null.possible_noise(noise)].likeliest_law
             own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
-            held = held_out_gain(calibrated, repaired, recording, law, parts, law_of_null=own)
-            later = searched.prepared.apparatus.what_comes_next(recording)
-            if later is not None:
-                fits = (calibrated, repaired, recording, law, later)
-                comes_next = held_out_gain(*fits, law_of_null=own, each_alone=True)
+            gain_on = partial(held_out_gain, calibrated, repaired, recording, law, law_of_null=own)
+            held, later = gain_on(apparatus.held_out_parts(recording)), apparatus.what_comes_next(recording)
+            comes_next = None if later is None else gain_on(later, each_alone=True)
             p_after = p_value_after(searched, fit, after, rng=rng)
         log_evidence = fit.evidence[noise].log_z - test.null.evidence[searched.certain].log_z
-        of_parts = held.per_reading, held.sd, held.by_scan
-        gain = Improvement(log_evidence, *of_parts, rms[0], rms[1], p_after, comes_next)
+        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after, comes_next)
         return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 
@@ -152,7 +152,8 @@ def judged_and_best_repair(
     """Choose the fit that belongs to a verdict; the null if nothing was found.
 
     Returns the verdict, withdrawn if the named effects predict held-out readings far worse; and the fit. A formula that
-    predicts them no better than the null is none.
+    predicts them no better than the null is none. If nothing unknown does, its odds against nothing on the mean are
+    those of the prior, if the latter is credible.
     """
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
@@ -163,7 +164,16 @@ def judged_and_best_repair(
             if best.improvement.heldout_log_density_per_reading > 0:
                 return judged, best
         best = BestRepair.of(searched, test, searched.likeliest_fit_beside_unknown(noise) or null, noise, rng=rng)
-        return judged, best
+        # Outlying readings that cluster change no mean: there is nothing of them to predict.
+        clusters = sum(share for form, share in judged.unknown_shares.items() if form.endswith(FAR_OUT))
+        if clusters < 0.5 and not best_correction(searched, best)[0].held_out.per_reading > 0:
+            on_noise, prior = searched.prepared.noise_effect_names, searched.prior
+            mean_is_right = sum(h.probability for h in judged.hypotheses if {*h.effects} <= on_noise)
+            if mean_is_right > 1 - SETTLED:
+                odds = prior.unknown / prior.clean_mean * mean_is_right / judged.unknown_probability
+                judged = judge(searched, test, unknown_weight=min(odds, 1.0))
+        if judged.verdict == "unknown":
+            return judged, best
     on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
         stated = tuple(name for name in judged.repaired_by if name in on_noise)
@@ -211,11 +221,33 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
     amount, _ = _amounts_and_covariance(found, problem, columns, np.ones(len(columns), dtype=np.bool_))
     change = np.concatenate([found.slopes, columns], axis=1) @ amount
 
+    law = problem.law.without_tail_or_rounding()
+
+    def log_densities(columns: FloatArray, out: BoolArray) -> FloatArray:
+        amount, covariance = _amounts_and_covariance(found, problem, columns, ~out)
+        design, rest = np.concatenate([found.slopes, columns], axis=1), law.take_readings(~out)
+        kept_miss = rest((found.residuals - design @ amount)[~out])
+        sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
+        return predictive_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)
+
     def gain_per_reading(out: BoolArray) -> FloatArray:
-        with_basis, plain = (_held_out_log_densities(found, problem, c, out) for c in (columns, columns[:, :0]))
-        return with_basis - plain
+        return log_densities(columns, out) - log_densities(columns[:, :0], out)
 
     return Correction(change, columns, mean_gain_over_parts(part, gain_per_reading))
+
+
+def best_correction(searched: Searched, best: BestRepair) -> tuple[Correction, Parts]:
+    """Return the correction of the best fit by one basis, and the parts held out.
+
+    If it gains nothing on other scans, these are blocks within scans, for residuals that are local in time.
+    """
+    prepared, bases = searched.prepared, searched.misfit_templates.unknown_bases
+    parts = prepared.apparatus.held_out_parts(prepared.recording)
+    fixed = correct_by_best_basis(best.repaired, best.problem, bases, parts[0])
+    if not fixed.gains_nothing:
+        return fixed, parts
+    parts = partition_into_blocks(prepared.recording)
+    return correct_by_best_basis(best.repaired, best.problem, bases, parts[0]), parts
 
 
 def improvement_and_correction(
@@ -224,29 +256,22 @@ def improvement_and_correction(
     """Correct the residuals of the best fit by basis functions, if this improves held-out predictions.
 
     Bases are added one at a time, at most six, until the global test finds nothing or the next one gains less than the
-    gain's sd. If the first gains nothing on other scans, blocks within scans are held out instead, for residuals that
-    are local in time. Where nothing can be held out, one basis is added without that check.
+    gain's sd. Where nothing can be held out, one basis is added without that check.
 
     Returns `improvement, change`: the improvement of `best` including the correction, and the correction of the usable
     readings, (n_usable,).
     """
-    prepared, bases, problem = searched.prepared, searched.misfit_templates.unknown_bases, best.problem
-    found, gain = best.repaired, best.improvement
-    parts, part_names = prepared.apparatus.held_out_parts(prepared.recording)
-    fixed = correct_by_best_basis(found, problem, bases, parts)
-    if fixed.gains_nothing:
-        parts, part_names = partition_into_blocks(prepared.recording)
-        fixed = correct_by_best_basis(found, problem, bases, parts)
-        gain = replace(gain, heldout_by_scan=())
+    recording, problem, found, gain = searched.prepared.recording, best.problem, best.repaired, best.improvement
+    fixed, (parts, part_names) = best_correction(searched, best)
     change = np.zeros(len(fixed.change))
     if fixed.gains_nothing:
-        return best.improvement, change
+        return gain, change
     plain_z = test.null.evidence[test.null.possible_noise(best.noise)].log_z
     key = (best.fit.n_gaussians, best.fit.names, best.noise)
     log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
     for step in range(_MOST_BASES):
         if step:
-            fixed = correct_by_best_basis(found, problem, bases, parts)
+            fixed = correct_by_best_basis(found, problem, searched.misfit_templates.unknown_bases, parts)
         held = fixed.held_out
         if step and held.per_reading <= held.sd:
             break
@@ -258,7 +283,7 @@ def improvement_and_correction(
         )
         change = change + fixed.change
         problem = Linearised.of(found, problem.law)
-        before = dict(gain.heldout_by_scan)
+        before = dict(gain.heldout_by_scan)  # of blocks, none
         by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
         gain = replace(
             gain,
@@ -266,7 +291,7 @@ def improvement_and_correction(
             heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
             heldout_sd=math.hypot(gain.heldout_sd, held.sd),
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
-            rms_after=searched.prepared.recording.rms(residuals_beside_walk(found.residuals, problem.law)),
+            rms_after=rms_beside_walk(found.residuals, problem.law, recording),
             p_value_after=p_value_after(searched, best.fit, problem, rng=rng),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
@@ -295,14 +320,3 @@ def _amounts_and_covariance(
         if columns.shape[1] > 1:
             size = max(float(np.sqrt(np.mean(amount[p:] ** 2))), 1e-3 * sd)
     return np.asarray(amount), np.asarray(covariance)
-
-
-def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
-    """Return the log density of each held-out reading from a correction fitted to the others, 0 for lost ones."""
-    law = problem.law.without_tail_or_rounding()
-    amount, covariance = _amounts_and_covariance(found, problem, columns, ~out)
-    design = np.concatenate([found.slopes, columns], axis=1)
-    rest = law.take_readings(~out)
-    kept_miss = rest((found.residuals - design @ amount)[~out])
-    sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
-    return predictive_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)

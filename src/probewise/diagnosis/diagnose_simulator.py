@@ -87,48 +87,30 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     lost = unpredictable & recording.usable
     if not unpredictable.any():
         return recording
-    missing = np.zeros(len(table), dtype=np.bool_)
     no_inputs = system.simulator.reading, system.simulator.noise.sd
     inputs = {name: values for name, values in table.covariates.items() if name not in no_inputs}
-    for values in inputs.values():
-        missing |= ~np.isfinite(values)
+    missing = np.logical_or.reduce([np.zeros(len(table), dtype=np.bool_), *(~np.isfinite(v) for v in inputs.values())])
     gaps = np.flatnonzero(missing)
     if system.simulator.law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():
             missing[rows] = np.maximum.accumulate(missing[rows])
     wrong = np.flatnonzero((unpredictable if every_row else lost) & ~missing)
     if wrong.size:
-        what = "simulate" if system.simulator.law is None else "rates"
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + table.first_line}"
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
-        raise ParameterError(what, where, allowed)
+        raise ParameterError("simulate" if system.simulator.law is None else "rates", where, allowed)
     filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
-    said = list[str]()
-    if lost.any():
-        note = f"{count_with_noun(int(lost.sum()), 'reading')} left out: a column that the "
+    recording = replace(recording, plan=cast(Plan, filled))
+    if not lost.any():
+        return recording
+    why = "simulator reads is missing there"
+    if system.simulator.law is not None:
         more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
-        if system.simulator.law is None:
-            note += "simulator reads is missing there"
-        else:
-            note += f"law reads is missing in row {gaps[0] + table.first_line}{more}, and a law ends at the first gap "
-            note += "of its run; fill the gaps in to use them"
-        said.append(note)
-    kept, notes = np.where(lost, np.nan, recording.readings), (*recording.notes, *said)
-    return replace(recording, plan=cast(Plan, filled), readings=kept, notes=notes)
-
-
-def without_readings_at_stop(
-    simulator: Simulator, table: RunTable, recording: RunRecording
-) -> tuple[RunRecording, MeterStop | None]:
-    """Leave out, with a note, readings at an undeclared stop of the meter.
-
-    Returns the recording without them, and the stop; None if there is none.
-    """
-    found = find_meter_stop_and_mask(as_recording(simulator, table), simulator.reading)
-    if found is None:
-        return recording, None
-    stop, rows = found
-    return _without_rows_at_stop(recording, stop, rows), stop
+        why = f"law reads is missing in row {gaps[0] + table.first_line}{more}, and a law ends at the first gap of its "
+        why += "run; fill the gaps in to use them"
+    note = f"{count_with_noun(int(lost.sum()), 'reading')} left out: a column that the {why}"
+    kept = np.where(lost, np.nan, recording.readings)
+    return replace(recording, readings=kept, notes=(*recording.notes, note))
 
 
 def without_readings_at_scattered_stop(
@@ -136,7 +118,7 @@ def without_readings_at_scattered_stop(
 ) -> tuple[RunRecording, MeterStop | None]:
     """Leave out, with a note, readings at an undeclared stop of the meter that are scattered over the table.
 
-    The stop counts only if a fit to the other readings predicts these beyond it. Returns as `without_readings_at_stop`.
+    The stop, None if there is none, counts only if a fit to the other readings predicts these beyond it.
     """
     for stop, rows in possible_meter_stops_and_masks(recording, system.simulator.reading):
         without = _without_rows_at_stop(recording, stop, rows)
@@ -180,18 +162,12 @@ def without_readings_near_ends(system: System, recording: RunRecording, near_end
     would be left for a fit, all stay.
     """
     at_end = near_ends & recording.censored
-    cut = near_ends & ~at_end
-    if (recording.usable & ~near_ends).sum() < system.least_readings:
-        cut = np.zeros_like(cut)
-    said = []
-    if at_end.any():
-        n_at_end = count_with_noun(int(at_end.sum()), "reading")
-        said.append(
-            f"{n_at_end} at an end of the declared range: used only as the statement that the signal is there or beyond"
-        )
-    if cut.any():
-        n_cut = count_with_noun(int(cut.sum()), "reading")
-        said.append(f"{n_cut} left out near an end of the declared range, which cuts off the noise")
+    cut = near_ends & ~at_end & ((recording.usable & ~near_ends).sum() >= system.least_readings)
+    words = (
+        (at_end, "at an end of the declared range: used only as the statement that the signal is there or beyond"),
+        (cut, "left out near an end of the declared range, which cuts off the noise"),
+    )
+    said = (f"{count_with_noun(int(rows.sum()), 'reading')} {what}" for rows, what in words if rows.any())
     return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))
 
 
@@ -330,7 +306,9 @@ def prepare_system(
     plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)
-    recording, stop = without_readings_at_stop(simulator, table, recording)
+    stopped = find_meter_stop_and_mask(as_recording(simulator, table), simulator.reading)
+    stop = None if stopped is None else stopped[0]
+    recording = recording if stopped is None else _without_rows_at_stop(recording, *stopped)
     least = system.least_readings if with_effects else system.n_params + 1
     n_usable, n_within = int(recording.usable.sum()), int((recording.usable & ~recording.censored).sum())
     if n_usable < (1 if with_effects else least):

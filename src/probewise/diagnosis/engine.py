@@ -15,12 +15,11 @@ import numpy as np
 from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_texts, require_like, require_one_of, require_progress, require_rng
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
-from probewise.diagnosis.best_repair import BestRepair, improvement_and_correction, judged_and_best_repair
+from probewise.diagnosis.best_repair import improvement_and_correction, judged_and_best_repair
 from probewise.diagnosis.diagnosis import Diagnosis, VerdictReport, locate_effects_and_residuals, repair_of
-from probewise.diagnosis.findings import EffectFound, effects_found, formula_of, noise_found, remainder_of
+from probewise.diagnosis.findings import effects_found, formula_of, noise_found, remainder_of
 from probewise.diagnosis.fit import Null
 from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.diagnosis.locate import Place
 from probewise.diagnosis.prepared import Prepared, prepare
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.reason import (
@@ -37,7 +36,7 @@ from probewise.diagnosis.search.search import MAX_ORDER, search, search_with_for
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.diagnosis.sensors import SensorPrior
-from probewise.diagnosis.verdict import GlobalTest, Judged, judge, run_global_test
+from probewise.diagnosis.verdict import Judged, judge, run_global_test
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import EFFECTS, VOCABULARY, EffectKind, Extent, NamedEffect
 from probewise.effects.effect import require_effect_kinds, sentence_from_samples
@@ -147,9 +146,24 @@ def diagnosis_of_search(
     noise = noise_found(searched, best, best_samples, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, best_samples)
-    grounds = replace(
-        _facts_for_reason(searched, test, judged, best, samples=best_samples, found=found, where=where, asked=asked),
+    shares, orders = searched.evidences.unknown_shares, searched.posterior.order_probabilities
+    beside = searched.likeliest_fit_beside_unknown(test.noise)
+    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
+    settles, apart = _separating_readings_in_words(searched, judged, asked)
+    grounds = Grounds(
+        words=prepared.apparatus.words,
+        n_readings=len(prepared.usable_rows),
+        least_readings=prepared.least_readings,
+        form=searched.nulls[max(orders, key=lambda n: orders[n])].ssf_in_words,
+        sentences={effect.name: effect.sentence for effect in found},
+        like=tuple(sentence_from_samples(each, best_samples.effect_samples(each.name)) for each in formulas),
+        family=max(shares, key=lambda family: shares[family], default=""),
+        beside=beside.names if beside else (),
+        shows_in=tuple(place.covariate for place in where),
+        p_value_after=best.improvement.p_value_after,
         nuisances=noise.nuisances,
+        settles=settles,
+        apart=apart,
     )
     reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
     if prepared.is_thinned:
@@ -163,39 +177,6 @@ def diagnosis_of_search(
         next_measurement=asked,
         report=VerdictReport(reason, found, noise, weighings, remainder, formula, is_settled=is_settled(searched)),
         apparatus=prepared.apparatus,
-    )
-
-
-def _facts_for_reason(
-    searched: Searched,
-    test: GlobalTest,
-    judged: Judged,
-    best: BestRepair,
-    *,
-    samples: ModelSamples,
-    found: Sequence[EffectFound],
-    where: Sequence[Place],
-    asked: NextMeasurement | None,
-) -> Grounds:
-    prepared, shares = searched.prepared, searched.evidences.unknown_shares
-    orders = searched.posterior.order_probabilities
-    beside = searched.likeliest_fit_beside_unknown(test.noise)
-    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
-    columns = [samples.effect_samples(effect.name) for effect in formulas]
-    settles, apart = _separating_readings_in_words(searched, judged, asked)
-    return Grounds(
-        words=prepared.apparatus.words,
-        n_readings=len(prepared.usable_rows),
-        least_readings=prepared.least_readings,
-        form=searched.nulls[max(orders, key=lambda n: orders[n])].ssf_in_words,
-        sentences={effect.name: effect.sentence for effect in found},
-        like=tuple(sentence_from_samples(e, own) for e, own in zip(formulas, columns, strict=True)),
-        family=max(shares, key=lambda family: shares[family], default=""),
-        beside=beside.names if beside else (),
-        shows_in=tuple(place.covariate for place in where),
-        p_value_after=best.improvement.p_value_after,
-        settles=settles,
-        apart=apart,
     )
 
 

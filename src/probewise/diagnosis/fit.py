@@ -159,10 +159,12 @@ _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
 def difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return z and points one small step along each coordinate, (n_params + 1, n_params), and the signed steps."""
-    # Steps point inwards, to stay within the bounds.
-    steps = np.where(z > 0, -DIFFERENCE, DIFFERENCE)
-    return np.concatenate([z[None, :], z + np.diag(steps)]), steps
+    """Return points z and, one small step along each coordinate, others, (..., n_params + 1, n_params), and the steps.
+
+    The steps, (..., n_params) as z, point inwards, to stay within the bounds.
+    """
+    steps, n_params = np.where(z > 0, -DIFFERENCE, DIFFERENCE), z.shape[-1]
+    return z[..., None, :] + steps[..., None, :] * np.eye(n_params + 1, n_params, -1), steps
 
 
 def _prediction_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -388,8 +390,8 @@ def _fit_coroutine(
         tries = _points_after_steps(z, tries)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
         in_bulk = model.sensor.predicts_in_bulk
-        about = [difference_points_and_steps(at) for at in tries] if in_bulk and not dear else []
-        batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if dear else None]
+        about, steps = difference_points_and_steps(tries) if in_bulk and not dear else (tries[:0], tries[:0])
+        batch = yield np.concatenate(about) if len(about) else tries[: 1 if dear else None]
         if dear and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
             if not exact:
                 (predicted, slopes), exact = (yield from request_slopes(z)), True
@@ -413,7 +415,7 @@ def _fit_coroutine(
             break
         step, z, best = tries[at] - z, tries[at], float(values[at])
         if at < len(about):
-            predicted, slopes = _prediction_and_slopes(all_predicted[at], about[at][1])
+            predicted, slopes = _prediction_and_slopes(all_predicted[at], steps[at])
         elif one_by_one and not settled:  # Broyden's update, until the fit is as good as its slopes tell
             before, predicted, exact = predicted, all_predicted[at, 0], False
             slopes = slopes + np.outer(predicted - before - slopes @ step, step / (step @ step))

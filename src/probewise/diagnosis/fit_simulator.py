@@ -32,7 +32,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for
 from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.binding import StoredFit, extract_stored_fit
+from probewise.systems.forms.binding import extract_stored_fit
 from probewise.systems.table import table_digest
 
 
@@ -60,27 +60,19 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     if not isinstance(apparatus, SimulatorApparatus):
         raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
     before = diagnosis.repair.before.readings
-    return fitted_system_from_samples(
-        apparatus.system, model, diagnosis.recording, before, known=recorded_table_if_needed(apparatus.about, model)
-    )
-
-
-def recorded_table_if_needed(about: ReferenceFit, model: ModelSamples) -> StoredFit | None:
-    """Return the recorded table with the first fit's predictions if a model's file needs them, else None.
-
-    A file needs them if the model has effects, whose scales the first fit set, or if a column holds the noise sds.
-    """
-    return extract_stored_fit(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
+    return fitted_system_from_samples(apparatus.about, model, diagnosis.recording, before)
 
 
 def fitted_system_from_samples(
-    system: System, model: ModelSamples, recording: Recording, predicted: FloatArray, *, known: StoredFit | None = None
+    about: ReferenceFit, model: ModelSamples, recording: Recording, predicted: FloatArray
 ) -> FittedSystem:
     """Return posterior samples of a system with effects as a FittedSystem, which can be written to a file.
 
-    `predicted`: prediction for every row, (n_points,); `known`: the recorded table, if the file needs it.
+    `about`: the first fit and the recorded table, which the file needs if the model has effects, whose scales that fit
+    set, or if a column holds the noise sds; `predicted`: prediction for every row, (n_points,).
     """
-    level = predicted[recording.usable]
+    level, system = predicted[recording.usable], about.system
+    needed = bool(model.effects) or isinstance(system.simulator.noise.sd, str)
     return FittedSystem(
         system.simulator,
         names=tuple(model.chain.names),
@@ -91,7 +83,7 @@ def fitted_system_from_samples(
         level=(float(np.min(level)), float(np.max(level))),
         max_step=system.max_step,
         stiff=system.stiff,
-        known=known,
+        known=extract_stored_fit(about) if needed else None,
         recording=table_digest(cast(RunTable, recording.plan)),
         source=recording.source,
         notes=recording.notes,
@@ -207,7 +199,8 @@ def fit_simulator(
     require_rng(rng)
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, with_effects=False)
-    recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
+    recording, about = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).about
+    system = about.system
     usable = recording.usable
     if prepared.has_only_equal_readings:
         raise ParameterError("readings", "all equal", "readings of which some differ")
@@ -216,12 +209,9 @@ def fit_simulator(
     first = cast(FloatArray, cast(System, prepared.null).first)
     modes, n_even = modes_of(system, recording, law, first)
     fits = _distinct(fit_each_start(Model(system, (), recording.plan), recording, [first, *modes], law), law)
-    step, least = (
-        recording.plan.instrumentation.step or 0.0,
-        _ROUNDING * float(np.abs(recording.readings[usable]).max()),
-    )
+    step, largest = recording.plan.instrumentation.step or 0.0, float(np.abs(recording.readings[usable]).max())
     rounding = step if fits[0].sd < HIDDEN * step else 0.0
-    noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding, least))
+    noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding, _ROUNDING * largest))
     problem = ProblemInBlocks(fits[0].model, recording, noise)
     progress("sampling the posterior")
     draws, is_settled = draw_by_importance(problem, fits, law, rng=rng, progress=progress)
@@ -237,16 +227,12 @@ def fit_simulator(
     else:
         noise_sd = draw_noise_sd(likeliest, recording.readings[usable] - predicted[:, usable], rng=rng)
     samples = ModelSamples(system.chain(recording.plan, ()), system.theta(z), noise_sd, (), 0)
-    notes = (
-        *note_on_improbable_rows(fits[0], recording),
-        *notes_on_declared_noise(simulator, noise_sd),
-        *_doubts(problem, draws, modes[0], n_even, is_settled=is_settled),
-    )
-    recording = replace(recording, notes=(*recording.notes, *notes))
+    said = [*note_on_improbable_rows(fits[0], recording), *notes_on_declared_noise(simulator, noise_sd)]
+    said += _doubts(problem, draws, modes[0], n_even, is_settled=is_settled)
+    recording = replace(recording, notes=(*recording.notes, *said))
     mean = predicted.mean(axis=0)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(noise_sd**2) * recording.relative_sd**2)
-    known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
-    fitted = fitted_system_from_samples(system, samples, recording, mean, known=known)
+    fitted = fitted_system_from_samples(about, samples, recording, mean)
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
     evidence = Evidence(draws.log_z, max(draws.log_z_error, _LEAST_ERROR), "importance sampling")
     beside = _nested_sampling(problem, z, rng=rng, progress=progress) if thorough else None
@@ -313,24 +299,19 @@ def _nested_sampling(
 def fit_json(fit: SystemFit) -> dict[str, Any]:
     """Convert a fit to the content of fit.json, format "fit/1"."""
     require_kind("fit", fit, SystemFit, "a SystemFit, as fit_simulator returns it")
-    own, interval = fit.fitted, fit.fitted.interval()
-    median, sd = np.median(own.samples, axis=0).tolist(), own.samples.std(axis=0).tolist()
+    own = fit.fitted
+    interval, median, sd = own.interval(), own.median(), own.sd()
     return {
         "format": "fit/1",
         "simulator": {"source": own.simulator.source, "fingerprint": own.simulator.fingerprint},
         "recording": {"source": own.source, "fingerprint": own.recording, "readings": int(fit.recording.usable.sum())},
         "parameters": [
-            {"name": name, "median": median[k], "sd": sd[k], "interval95": list(interval[name])}
-            for k, name in enumerate(own.names)
+            {"name": name, "median": median[name], "sd": sd[name], "interval95": list(interval[name])}
+            for name in own.names
         ],
         "mode": own.mode(),
         "noise": {"unit": own.simulator.unit, "median": float(np.median(own.noise_sd))},
-        "log_evidence": {
-            "value": fit.evidence.log_z,
-            "error": fit.evidence.error,
-            "method": fit.evidence.method,
-            "reason": fit.evidence.reason,
-        },
+        "log_evidence": {"value" if key == "log_z" else key: value for key, value in asdict(fit.evidence).items()},
         **({"nested_sampling": asdict(fit.nested)} if fit.nested is not None else {}),
         "rms": fit.rms,
         "samples": "samples.csv",

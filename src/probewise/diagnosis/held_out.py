@@ -65,15 +65,38 @@ def held_out_gain(
     `law`, `law_of_null`: noise distribution of the repaired model, and of the null; `held_out`: number of the part of
     each usable reading, and names of the parts.
     """
-    plan, usable = recording.plan, recording.usable
-    parts, names = held_out
+    usable, (parts, names) = recording.usable, held_out
+
+    def log_densities(found: Fit, law: NoiseLaw, out: BoolArray) -> FloatArray:
+        """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
+
+        At an end of the range it is a log likelihood relative to its peak: 0 where the prediction is beyond the end.
+        Lost readings (dropouts at one value) add the same to every model of the mean.
+        """
+        readings, rest = recording.readings.copy(), law.take_readings(~out)
+        readings[np.flatnonzero(usable)[out]] = np.nan
+        if not rest.n_kept:  # without them the noise sd, and so the density, is unknown
+            return np.zeros(int(out.sum()))
+        without = fit(found.model, recording.with_readings(readings), found.z, rest, max_steps=4, tolerance=0.05)
+        of_its_own = are_of_part_alone(found.slopes, out)
+        turned = np.where(of_its_own, 0.0, rest(without.slopes))
+        # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the
+        # other readings may bound them on one side only, as for a ceiling.
+        about = np.where(of_its_own, found.z, without.z)
+        predicted, slopes = (part[usable] for part in found.model.predict_and_differentiate(about))
+        free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information), rest.n_kept)
+        sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
+        curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
+        covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
+        # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
+        hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
+        sequential = bool((of_its_own | hardly_told).any())
+        told = (law, out, recording.readings[usable] - predicted, slopes, without.z - about, covariance, sigma_2)
+        return predictive_log_densities(*told, sequential=sequential, each_alone=each_alone)
 
     def gain_per_reading(out: BoolArray) -> FloatArray:
-        rows = np.zeros(len(plan), dtype=np.bool_)
-        rows[np.flatnonzero(usable)[out]] = True
-        each = ((repaired, law), (null, law_of_null))
         with np.errstate(invalid="ignore"):  # without them a model may predict no number
-            densities = (_refit_log_densities(f, recording, rows, own, out, each_alone) for f, own in each)
+            densities = (log_densities(repaired, law, out), log_densities(null, law_of_null, out))
             repaired_one, null_one = (np.where(np.isnan(each), _NO_DENSITY, each) for each in densities)
         return np.asarray(repaired_one - null_one)
 
@@ -111,38 +134,6 @@ def mean_gain_over_parts(
     joined = np.concatenate(gains)
     sd = float(joined.std(ddof=1)) / math.sqrt(len(joined))
     return HeldOutGain(float(joined.mean()), sd, len(joined), by_scan)
-
-
-def _refit_log_densities(
-    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray, each_alone: bool
-) -> FloatArray:
-    """Return the log predictive density of each held-out reading, from a refit to the others; 0 for lost readings.
-
-    At an end of the range it is a log likelihood relative to its peak: 0 where the prediction is beyond the end.
-    `rows` (n_points,) and `out` (n_usable,) are masks of the held-out readings. Lost readings (dropouts at one value)
-    add the same to every model of the mean.
-    """
-    kept = recording.with_readings(np.where(rows, np.nan, recording.readings))
-    rest = law.take_readings(~out)
-    if not rest.n_kept:  # without them the noise sd, and so the density, is unknown
-        return np.zeros(int(out.sum()))
-    without = fit(found.model, kept, found.z, rest, max_steps=4, tolerance=0.05)
-    of_its_own = are_of_part_alone(found.slopes, out)
-    turned = np.where(of_its_own, 0.0, rest(without.slopes))
-    # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the other
-    # readings may bound them on one side only, as for a ceiling.
-    about = np.where(of_its_own, found.z, without.z)
-    predicted, slopes = (part[recording.usable] for part in found.model.predict_and_differentiate(about))
-    free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information), rest.n_kept)
-    sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
-    curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
-    miss = recording.readings[recording.usable] - predicted
-    covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
-    # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
-    hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
-    sequential = bool((of_its_own | hardly_told).any())
-    told = (law, out, miss, slopes, without.z - about, covariance, sigma_2)
-    return predictive_log_densities(*told, sequential=sequential, each_alone=each_alone)
 
 
 def predictive_log_densities(
@@ -212,7 +203,11 @@ def sequential_log_densities(
     turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
     mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
     noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
-    shares, widths = np.array([1 - law.share, law.share]), _variances_of_narrow_and_wide(law, out, sd)
+    shares, widths = np.array([1 - law.share, law.share]), np.tile([1.0, law.times**2], (len(sd), 1))
+    if law.wide.size:  # variances, in units of sd^2, if each is narrow and if it is wide: it may be either
+        own = law.sd[out] ** 2
+        narrow = own * law.relative_precision[out]
+        widths = np.stack([sd**2 - own + narrow, sd**2 - own + narrow * law.times**2], axis=1) / sd[:, None] ** 2
     for k in np.flatnonzero(kept):
         row = turned[k]
         gain = covariance @ row
@@ -230,18 +225,6 @@ def sequential_log_densities(
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
     return np.asarray((densities - np.where(censored, 0.0, np.log(sd))) * kept)
-
-
-def _variances_of_narrow_and_wide(law: NoiseLaw, out: BoolArray, sd: FloatArray) -> FloatArray:
-    """Return the variances of each held-out reading if it is narrow and if it is wide, in units of sd^2, (n_out, 2).
-
-    `sd` is that of each reading, (n_out,), given the others. Whatever it reads, it may be either.
-    """
-    if not law.wide.size:
-        return np.tile([1.0, law.times**2], (len(sd), 1))
-    own = law.sd[out] ** 2
-    narrow = own * law.relative_precision[out]
-    return np.stack([sd**2 - own + narrow, sd**2 - own + narrow * law.times**2], axis=1) / sd[:, None] ** 2
 
 
 def _log_normal_density(miss: FloatArray, variance: FloatArray) -> FloatArray:

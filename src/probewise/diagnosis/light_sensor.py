@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -65,18 +65,13 @@ def plan_of_sequence(commands: Sequence[Command], after: Plan) -> Plan:
     """
     out: list[Command] = []
     for scan in commands:
-        start_s = _earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])
-        out.append(_scan_started_at(scan, start_s))
+        out.append(scan_started_after(scan, out[-1].plan if out else after))
     return plan_of_alternatives(out, after)
 
 
 def scan_started_after(scan: Command, plan: Plan) -> Command:
     """Move a scan to after a plan, with time to lay its sheet."""
-    return _scan_started_at(scan, _earliest_start_s(plan))
-
-
-def _scan_started_at(scan: Command, start_s: float) -> Command:
-    delay_s = start_s + _sheet_laying_s(scan.kind) - float(scan.plan.time_s[0])
+    delay_s = _earliest_start_s(plan) + _sheet_laying_s(scan.kind) - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))
 
 
@@ -250,21 +245,21 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
         words = f"move pattern {name} by {aside_mm:g} mm along its normal and scan it"
         laid.append((f"{name}_by_{aside_mm:g}_mm", words, once, moved))
-    parts: list[tuple[str, str, Plan, Excerpt, Pattern]] = []
-    for label, words, whole, pattern in laid:
-        seen = ndtr(_distance_inside_edge_mm(whole, pattern) / (_FOOTPRINT * length))
-        excerpts = excerpts_of_scan(np.arange(len(whole)), strides=(_STRIDE,), level=seen)
-        parts += [(label, words, whole, part, pattern) for part in excerpts]
+    out: list[Command] = []
+
+    def lay(label: str, words: str, pattern: Pattern, whole: Plan, parts: Sequence[Excerpt]) -> None:
+        for part in parts:
+            taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+            out.append(scan_command("lay", f"{words}{part.words}", taken))
+
+    for label, words, whole, moved in laid:
+        seen = ndtr(_distance_inside_edge_mm(whole, moved) / (_FOOTPRINT * length))
+        lay(label, words, moved, whole, excerpts_of_scan(np.arange(len(whole)), strides=(_STRIDE,), level=seen))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
-        excerpts = excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE))
-        parts += [(label, words, plan, part, stripes) for part in excerpts]
-    out = []
-    for label, words, whole, part, laid_pattern in parts:
-        taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, laid_pattern)
-        out.append(scan_command("lay", f"{words}{part.words}", taken))
+        lay(label, words, stripes, plan, excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE)))
     return out
 
 
@@ -317,14 +312,6 @@ def held_out_parts(recording: Recording) -> Parts:
 
 _NOT_COLUMNS = frozenset({"time", "level", "edge_distance", "slope", "direction", "orientation", "scan", "place"})
 _MOST_SCANS_ALONE = 24  # number of scans above which residuals are not located in single scans
-
-
-def slope_along_motion(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
-    """Differentiate predictions of a plan along each row's direction of motion, in readings per mm, (n_points,)."""
-    step, (along_x, along_y) = 0.25, plan.direction_of_motion.T
-    ahead, behind = (replace(plan, x_mm=plan.x_mm + s * along_x, y_mm=plan.y_mm + s * along_y) for s in (step, -step))
-    # All rows are shifted together, so that directions, and hence backlash, do not change.
-    return np.asarray((predict(ahead) - predict(behind)) / (2 * step))
 
 
 def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:
@@ -383,31 +370,6 @@ def _place_covariates_along_scans(plan: Plan, usable: IntArray) -> list[Covariat
     return out
 
 
-def covariate_of_effect(
-    effect: NamedEffect[Any], change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
-) -> Covariate | None:
-    """Return the first of an effect's covariates that varies here; None if none varies, or `change` is 0 everywhere.
-
-    `change`: its change of the readings, (n_points,); `without`: predicted readings without it, (n_points,), the values
-    of the covariate `level`; `plan`: plan of the readings; a place is along the scans with the largest change.
-    """
-    pooled = {c.name: c for c in known if c.scan is None}
-    sign = sign_of_motion(plan)
-    if "direction" not in pooled and np.ptp(sign) > 0:  # a reading at rest has no direction, but serves for comparison
-        pooled["direction"] = Covariate("direction", sign, np.arange(len(sign)), groups=True)
-    name = next((name for name in effect.covariates if name in pooled), None)
-    if name is None or not np.any(change):
-        return None
-    if name == "level":
-        return replace(pooled[name], values=without[pooled[name].rows])
-    if name == "place":  # along X or Y, of the readings approached along it, whichever has the larger change
-        along_x, along_y = (np.flatnonzero(plan.direction_of_motion[:, k] != 0) for k in (0, 1))
-        strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
-        rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
-        return Covariate("place", values[rows], rows) if rows.size else pooled[name]
-    return pooled[name]
-
-
 def _varies(values: FloatArray, size: float = 0.0) -> bool:
     return values.size > 1 and float(np.ptp(values)) > 1e-9 * max(size, float(np.abs(values).max()))
 
@@ -437,25 +399,47 @@ class LightSensorApparatus(Apparatus):
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         extent, plan = Extent.of(recording), recording.plan
-        kinds = {**self.vocabulary, **RARE_EFFECTS, **NUISANCES}
-        if null is None:  # the SSF is free, and absorbs effects on the SSF
-            kinds = {
-                name: kind
-                for name, kind in kinds.items()
-                if not (isinstance(kind, LightEffect) and kind.is_absorbed_by_ssf(plan))
-            }
-        able = {name: effect for name, kind in kinds.items() if (effect := kind.for_extent(extent)) is not None}
-        return {name: effect for name, effect in able.items() if null is None or null.admits(effect)}
+        out: dict[str, NamedEffect[Any]] = {}
+        for name, kind in {**self.vocabulary, **RARE_EFFECTS, **NUISANCES}.items():
+            if null is None and isinstance(kind, LightEffect) and kind.is_absorbed_by_ssf(plan):  # by a free SSF
+                continue
+            effect = kind.for_extent(extent)
+            if effect is not None and (null is None or null.admits(effect)):
+                out[name] = effect
+        return out
 
     def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         return frozenset(effects.keys() - EFFECTS)
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
-        slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
+        usable, plan = np.flatnonzero(recording.usable), found.model.plan
+        step, (along_x, along_y) = 0.25, plan.direction_of_motion.T
+        # All rows are shifted together, so that directions, and hence backlash, do not change.
+        moved = (replace(plan, x_mm=plan.x_mm + s * along_x, y_mm=plan.y_mm + s * along_y) for s in (step, -step))
+        ahead, behind = (found.model.predict(found.z[None, :], shifted)[0] for shifted in moved)
+        slope = ((ahead - behind) / (2 * step))[usable]
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
-    covariate_of_effect = staticmethod(covariate_of_effect)
+    def covariate_of_effect(
+        self,
+        effect: NamedEffect[Any],
+        change: FloatArray,
+        without: FloatArray,
+        plan: Plan,
+        known: Sequence[Covariate],
+    ) -> Covariate | None:
+        whole, sign = [c for c in known if c.scan is None], sign_of_motion(plan)
+        if np.ptp(sign) > 0 and all(c.name != "direction" for c in whole):  # one at rest serves for comparison
+            whole.append(Covariate("direction", sign, np.arange(len(sign)), groups=True))
+        shown = super().covariate_of_effect(effect, change, without, plan, whole)
+        if shown is None or shown.name != "place":
+            return shown
+        # Along X or Y, of the readings approached along it, whichever has the larger change.
+        along_x, along_y = (np.flatnonzero(plan.direction_of_motion[:, k] != 0) for k in (0, 1))
+        strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
+        rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
+        return Covariate("place", values[rows], rows) if rows.size else shown
+
     held_out_parts = staticmethod(held_out_parts)
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_of_sequence = staticmethod(plan_of_sequence)

@@ -17,13 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import FloatArray
 from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.effects import HeavyTailedPrior, NamedEffect
@@ -230,14 +230,15 @@ class ConditionallyLinearDensity:
     Those are the value of the effect's amplitude, in units of its typical size, and the straight coordinates (see
     `LinearView`) of every other parameter.
 
-    `view`: the tangent of the simulation; `at`: index of the coordinate of the grid; `amplitude`: the amplitude;
-    `nodes`: the grid, equally spaced, (n_nodes,); `log_shares`: log probability of each node and component, (n_nodes,
-    n_components); `means`: means of the others, (n_nodes, n_components, n_params - 1); `roots`: lower Cholesky factors
-    of their precisions, (n_nodes, n_components, n_params - 1, n_params - 1).
+    `view`: the tangent of the simulation; `at`: index of the coordinate of the grid; `own`: that of the amplitude among
+    the others; `amplitude`: the amplitude; `nodes`: the grid, equally spaced, (n_nodes,); `log_shares`: log probability
+    of each node and component, (n_nodes, n_components); `means`: means of the others, (n_nodes, n_components, n_params
+    - 1); `roots`: lower Cholesky factors of their precisions, (n_nodes, n_components, n_params - 1, n_params - 1).
     """
 
     view: LinearView
     at: int
+    own: int
     amplitude: AmplitudeGroup
     nodes: FloatArray
     log_shares: FloatArray
@@ -257,71 +258,46 @@ class ConditionallyLinearDensity:
         if view is None:
             return None
         at, amplitude = max(able, key=lambda each: covariance[each[0], each[0]])
-        on_grid = partial(cls._on_grid, view, found, law, recording, sd, at, amplitude)
-        reach = _REACH * math.sqrt(covariance[at, at])
-        low, high = found.z[at] - reach, found.z[at] + reach
-        while (out := on_grid(low, high)) is not None and not out._ends_are_improbable and high - low < 2 * FARTHEST:
-            reach *= _WIDER
-            low, high = max(found.z[at] - reach, -FARTHEST), min(found.z[at] + reach, FARTHEST)
-        if out is None:
-            return None
-        first, last = np.flatnonzero(out._probable_mask)[[0, -1]]  # with one more on either side
-        return on_grid(float(out.nodes[max(first - 1, 0)]), float(out.nodes[min(last + 1, _N_NODES - 1)]))
-
-    @classmethod
-    def _on_grid(
-        cls,
-        view: LinearView,
-        found: Fit,
-        law: NoiseLaw,
-        recording: Recording,
-        sd: float,
-        at: int,
-        amplitude: AmplitudeGroup,
-        low: float,
-        high: float,
-    ) -> Self | None:
-        nodes = np.asarray(np.linspace(low, high, _N_NODES), dtype=np.float64)
-        rest = np.delete(np.arange(len(found.z)), at)
-        own = _number_without(at, amplitude.at[0])
-        x = found.z[rest]
+        own = amplitude.at[0] - (amplitude.at[0] > at)
+        x = np.delete(found.z, at)
         x[own] = amplitude.values(found.z[None, list(amplitude.at)])[0, 0]
         moved = x + np.concatenate([np.zeros((1, len(x))), DIFFERENCE * np.eye(len(x))])
-        points = np.tile(_inserted(moved, at, amplitude), (len(nodes), 1, 1))
-        points[:, :, at] = nodes[:, None]
-        sigma = law.likeliest_sigma(law(found.residuals)[:, None])
-        n_at_once = max(1, _BLOCK // (len(moved) * len(found.residuals)))
-        parts = [
-            _quadratic_log_likelihood(view, law, recording, points[first : first + n_at_once], x, sigma, sd)
-            for first in range(0, len(nodes), n_at_once)
-        ]
-        height, downhill, curvature = (np.concatenate(part) for part in zip(*parts, strict=True))
-        if not (np.isfinite(height).all() and np.isfinite(curvature).all()):
-            return None
         precision = np.ones((len(amplitude.sds), len(x)))
         precision[:, own] = amplitude.sds**-2.0
-        every = curvature[:, None] + precision[:, :, None] * np.eye(len(x))
-        roots = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
-        means = np.linalg.solve(every, downhill[:, None, :, None])[..., 0]
-        volume = np.log(np.diagonal(roots, axis1=2, axis2=3)).sum(axis=2) - 0.5 * np.log(precision).sum(axis=1)
-        log_prior = -0.5 * nodes**2
-        log_shares = (height + log_prior)[:, None] + 0.5 * np.einsum("ncj,nj->nc", means, downhill) - volume
-        return cls(view, at, amplitude, nodes, log_shares - logsumexp(log_shares), means, roots)
+        sigma = law.likeliest_sigma(law(found.residuals)[:, None])
+        n_at_once = max(1, _BLOCK // (len(moved) * len(found.residuals)))
 
-    @cached_property
-    def _own(self) -> int:
-        return _number_without(self.at, self.amplitude.at[0])
+        def on_grid(low: float, high: float) -> Self | None:
+            nodes = np.asarray(np.linspace(low, high, _N_NODES), dtype=np.float64)
+            points = np.tile(_inserted(moved, at, own, amplitude), (len(nodes), 1, 1))
+            points[:, :, at] = nodes[:, None]
+            parts = [
+                _quadratic_log_likelihood(view, law, recording, points[first : first + n_at_once], x, sigma, sd)
+                for first in range(0, len(nodes), n_at_once)
+            ]
+            height, downhill, curvature = (np.concatenate(part) for part in zip(*parts, strict=True))
+            if not (np.isfinite(height).all() and np.isfinite(curvature).all()):
+                return None
+            every = curvature[:, None] + precision[:, :, None] * np.eye(len(x))
+            roots = np.asarray(np.linalg.cholesky(every), dtype=np.float64)
+            means = np.linalg.solve(every, downhill[:, None, :, None])[..., 0]
+            volume = np.log(np.diagonal(roots, axis1=2, axis2=3)).sum(axis=2) - 0.5 * np.log(precision).sum(axis=1)
+            log_prior = -0.5 * nodes**2
+            log_shares = (height + log_prior)[:, None] + 0.5 * np.einsum("ncj,nj->nc", means, downhill) - volume
+            return cls(view, at, own, amplitude, nodes, log_shares - logsumexp(log_shares), means, roots)
 
-    @cached_property
-    def _probable_mask(self) -> BoolArray:
-        of_nodes = logsumexp(self.log_shares, axis=1)
-        return np.asarray(of_nodes > of_nodes.max() - _IMPROBABLE)
-
-    @property
-    def _ends_are_improbable(self) -> bool:
-        # Not the outermost nodes alone: between two branches of a hyperbola is a narrow gap.
-        n = len(self.nodes) // 8
-        return not (self._probable_mask[:n].any() or self._probable_mask[-n:].any())
+        reach = _REACH * math.sqrt(covariance[at, at])
+        low, high = found.z[at] - reach, found.z[at] + reach
+        while (out := on_grid(low, high)) is not None:
+            of_nodes = logsumexp(out.log_shares, axis=1)
+            probable = np.flatnonzero(of_nodes > of_nodes.max() - _IMPROBABLE)
+            # Not the outermost nodes alone: between two branches of a hyperbola is a narrow gap.
+            if (probable[0] >= _N_NODES // 8 and probable[-1] < _N_NODES - _N_NODES // 8) or high - low >= 2 * FARTHEST:
+                first, last = max(probable[0] - 1, 0), min(probable[-1] + 1, _N_NODES - 1)  # one more on either side
+                return on_grid(float(out.nodes[first]), float(out.nodes[last]))
+            reach *= _WIDER
+            low, high = max(found.z[at] - reach, -FARTHEST), min(found.z[at] + reach, FARTHEST)
+        return None
 
     def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""
@@ -333,14 +309,14 @@ class ConditionallyLinearDensity:
         apart = np.linalg.solve(self.roots[node, component].transpose(0, 2, 1), eps)[..., 0]
         value = self.nodes[node] + (rng.random(n_samples) - 0.5) * (self.nodes[1] - self.nodes[0])
         middle = self._interpolated_means(value)[np.arange(n_samples), component]
-        out = _inserted(middle + apart, self.at, self.amplitude)
+        out = _inserted(middle + apart, self.at, self.own, self.amplitude)
         out[:, self.at] = value
         return self.view.coordinates(out)
 
     def log_density(self, z: FloatArray) -> FloatArray:
         """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""
         x, at = np.delete(self.view.straightened(z), self.at, axis=1), list(self.amplitude.at)
-        x[:, self._own] = self.amplitude.values(z[:, at])[:, 0]
+        x[:, self.own] = self.amplitude.values(z[:, at])[:, 0]
         steps = np.rint((z[:, self.at] - self.nodes[0]) / (self.nodes[1] - self.nodes[0]))
         node = np.clip(steps, 0, len(self.nodes) - 1).astype(np.int64)
         apart = x[:, None] - self._interpolated_means(z[:, self.at])
@@ -348,7 +324,7 @@ class ConditionallyLinearDensity:
         volume = np.log(np.diagonal(self.roots[node], axis1=2, axis2=3)).sum(axis=2)
         in_values = logsumexp(self.log_shares[node] + volume - 0.5 * np.sum(eps**2, axis=2), axis=1)
         # From a density of the amplitude's value to that of its coordinate.
-        log_prior = self.amplitude.prior.log_prob(x[:, [self._own]] * self.amplitude.typical)
+        log_prior = self.amplitude.prior.log_prob(x[:, [self.own]] * self.amplitude.typical)
         with np.errstate(invalid="ignore"):
             out = in_values - 0.5 * z[:, at[0]] ** 2 - log_prior + self.view.log_volume(z)
         # Outside the support of the null's prior: there the posterior is 0, whatever this density.
@@ -388,12 +364,8 @@ def _quadratic_log_likelihood(
     return height, gradient + curvature @ x, curvature
 
 
-def _number_without(at: int, other: int) -> int:
-    return other - (other > at)
-
-
-def _inserted(x: FloatArray, at: int, amplitude: AmplitudeGroup) -> FloatArray:
-    out, own = x.copy(), _number_without(at, amplitude.at[0])
+def _inserted(x: FloatArray, at: int, own: int, amplitude: AmplitudeGroup) -> FloatArray:
+    out = x.copy()
     out[:, [own]] = amplitude.coordinates(x[:, [own]])
     return np.insert(out, at, 0.0, axis=1)
 

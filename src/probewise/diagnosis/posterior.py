@@ -22,7 +22,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
+from probewise.diagnosis.hypothesis_problem import log_likelihood_marginal_over_sigma
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.simulator_posterior import ProblemInBlocks, draw_by_importance
@@ -273,8 +273,8 @@ def posterior_draws(
     if not annealed:
         linear = LinearAmplitudes.of(found, laplace.slopes, laplace.residual) or laplace
         return linear.draw(n_samples, rng=rng)
-    steps = rng.standard_normal((_N_NEAR, len(found.z)))
-    problem = HypothesisProblem(found.model, recording, noise.with_likeliest_node_alone)
+    normal = rng.standard_normal((_N_NEAR, len(found.z)))
+    problem = ProblemInBlocks(found.model, recording, noise.with_likeliest_node_alone)
 
     def log_posterior(z: FloatArray) -> FloatArray:
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)
@@ -291,11 +291,25 @@ def posterior_draws(
         if drawn is not None:
             return drawn
     if in_bulk:
-        asked = ProblemInBlocks(found.model, recording, problem.noise)
-        draws, _ = draw_by_importance(asked, [found], laplace.law, sizes=_SIZES, rng=rng, progress=progress)
+        draws, _ = draw_by_importance(problem, [found], laplace.law, sizes=_SIZES, rng=rng, progress=progress)
         if draws.n_eff >= _LEAST_OF_IT * _ENOUGH * n_samples:
             return draws.samples(n_samples, rng=rng)
-    return _annealed(laplace, steps, log_posterior, n_samples, rng=rng, progress=progress)
+    model, usable, center, steps = found.model, recording.usable, laplace.center, laplace.steps
+    quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
+    near = surrogate_log_density(quadratic, center, steps, recording.readings[usable], laplace.law)
+
+    def resampled_or_annealed(
+        first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int, tried: int | None = None
+    ) -> FloatArray:
+        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng, n_tried=tried)
+        if weighed is not None:
+            return weighed
+        some = first[:_N_WALKERS]
+        return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
+
+    e = resampled_or_annealed(normal, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)
+    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples, n_tried(model))
+    return center + e @ steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,31 +355,3 @@ class _Laplace:
     def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""
         return np.asarray(self.center + rng.standard_normal((n_samples, len(self.center))) @ self.steps)
-
-
-def _annealed(
-    laplace: _Laplace,
-    draws: FloatArray,
-    log_posterior: Density,
-    n_samples: int,
-    *,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> FloatArray:
-    """Move standard normal draws, (n, n_params), to the surrogate of the posterior, then to the posterior itself."""
-    model, usable, center, steps = laplace.found.model, laplace.recording.usable, laplace.center, laplace.steps
-    quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
-    near = surrogate_log_density(quadratic, center, steps, laplace.recording.readings[usable], laplace.law)
-
-    def resampled_or_annealed(
-        first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int, tried: int | None = None
-    ) -> FloatArray:
-        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng, n_tried=tried)
-        if weighed is not None:
-            return weighed
-        some = first[:_N_WALKERS]
-        return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
-
-    e = resampled_or_annealed(draws, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)
-    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples, n_tried(model))
-    return center + e @ steps

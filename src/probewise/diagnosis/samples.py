@@ -53,21 +53,17 @@ def weights_beside_other_effects(
     out = dict(weights)
     for effect in effects:
         if effect.has_change_point and len(effect.variants()) == len(weights[effect.name]) > 1:
-            without = _fit_without(found, effect.name, usable)
+            # What the effect explains is in the residuals; the other parameters stay.
+            model, stay = found.model.model_and_mask_without(effect.name)
+            change, slopes = found.change_by_effect(effect.name, usable), found.slopes[:, stay]
+            left, predicted = found.residuals + change, found.predicted - change
+            without = Fit(model, found.z[stay], predicted, left, slopes, found.sd, found.objective)
             templates = templates_of_effect(without, effect, usable)
             bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
             scores = log_bayes_factors_by_label(Linearised.of(without, law), bank)[effect.name]
             if np.isfinite(scores).all():
                 out[effect.name] = templates.variant_probabilities(scores)
     return out
-
-
-def _fit_without(found: Fit, name: str, usable: IntArray) -> Fit:
-    """Return a fit without one of its effects: what that explains is in the residuals, the other parameters stay."""
-    model, stay = found.model.model_and_mask_without(name)
-    change = found.change_by_effect(name, usable)
-    left, slopes = found.residuals + change, found.slopes[:, stay]
-    return Fit(model, found.z[stay], found.predicted - change, left, slopes, found.sd, found.objective)
 
 
 N_SAMPLES = 500
@@ -108,7 +104,11 @@ class ModelSamples:
         from_chain = self.theta
         if self.has_exchangeable_gaussians:
             from_chain = gaussians_sorted_by_mass(self.theta, self.n_gaussians)
-        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_median_step_mm(recording))
+        plan = recording.plan
+        moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
+        moves = moves[moves > rounding_error(np.append(plan.x_mm, plan.y_mm))]
+        step_mm = float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)
+        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=step_mm)
         field = posterior_mean_ssf_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
         residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
@@ -172,7 +172,7 @@ def sample_model(
         own[effect.name] = effect.redraw_by_variant(values, weights[effect.name], rng=rng)
     theta = found.model.joined_theta(null.theta(z[:, : null.n_params]), own)
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
-    of_noise = (_uniform_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)
+    of_noise = (noise_effect_samples(effect, noise, nodes, rng=rng) for effect in on_noise)
     theta = np.concatenate([theta, *of_noise], axis=1)
     names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
@@ -202,20 +202,16 @@ def noise_sd_by_node(noise: NoiseEvidence, *, with_rounding: bool) -> FloatArray
     return np.array([own.sigma * (own.sd_factor_of_rounding if with_rounding else 1.0) for own in noise.nodes.laws])
 
 
-def noise_effect_samples(effect: NoiseEffect, noise: NoiseEvidence, *, rng: np.random.Generator) -> FloatArray:
-    """Draw the parameters of an effect in a noise model from its posterior, (N_SAMPLES, n_params)."""
-    nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
-    return _uniform_draws_about_nodes(effect, noise, nodes, rng=rng)
-
-
-def _uniform_draws_about_nodes(
-    effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator
+def noise_effect_samples(
+    effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray | None = None, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw a noise effect's parameters uniformly about drawn nodes, half way to the next: (n_samples, n_params).
 
-    `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are. An effect
-    with a rule of its own (`draws_about`) follows that rule.
+    `nodes` (n_samples,) are indices of nodes, by default 500 drawn by their probability; parameters that are the same
+    in all nodes stay as they are. An effect with a rule of its own (`draws_about`) follows that rule.
     """
+    if nodes is None:
+        nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
     settings = noise.nodes.settings[:, noise.noise.columns_of_effect(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
     if own is not None:
@@ -227,13 +223,6 @@ def _uniform_draws_about_nodes(
     return np.where(spread, effect.prior.from_unit_cube(moved), values)
 
 
-def _median_step_mm(recording: Recording) -> float:
-    plan = recording.plan
-    moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
-    moves = moves[moves > rounding_error(np.append(plan.x_mm, plan.y_mm))]
-    return float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)
-
-
 def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
     """Return whether hypotheses of these effects can be combined in one model.
 
@@ -242,13 +231,13 @@ def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[Name
     """
     known = {effect.name: effect for effect in first}
     shared = {effect.name for effect in second if effect.name in known}
-    alike = all(_change_readings_alike(known[effect.name], effect) for effect in second if effect.name in shared)
+
+    def acts_alike(one: NamedEffect[Any], other: NamedEffect[Any]) -> bool:
+        act = getattr(one, "act", None)
+        return one == other or (act is not None and act is getattr(other, "act", None))
+
+    alike = all(acts_alike(known[effect.name], effect) for effect in second if effect.name in shared)
     return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
-
-
-def _change_readings_alike(one: NamedEffect[Any], other: NamedEffect[Any]) -> bool:
-    act = getattr(one, "act", None)
-    return one == other or (act is not None and act is getattr(other, "act", None))
 
 
 def mix(
@@ -408,19 +397,13 @@ def draw_models(
         model = cached.averaged(fit, {fit.names: 1 - doubt, (): doubt})
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
         model = cached.averaged(fit, cached.compatible_probabilities(fit))
-    elif not (judged.too_little or judged.withdrawn):
-        model = _average_of_named_and_null(cached, searched, test, best.noise)
+    elif not (judged.too_little or judged.withdrawn):  # no effect is named: the null is what named ones leave
+        by_mean = searched.posterior.marginal_over_noise
+        named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
+        lead = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), best.noise) or null
+        if lead.names and predicts_far_worse(BestRepair.of(searched, test, lead, best.noise, rng=rng).improvement):
+            model = cached.averaged(null)
+        else:
+            shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(lead) if names}
+            model = cached.averaged(lead, {**shares, (): max(1 - sum(shares.values()), 0.0)})
     return samples if fit is null else cached.averaged(null), samples, model
-
-
-def _average_of_named_and_null(
-    cached: HypothesisSamples, searched: Searched, test: GlobalTest, noise: Names
-) -> ModelSamples:
-    """Average over named hypotheses by probability, and the null for the rest, where the verdict names no effect."""
-    by_mean = searched.posterior.marginal_over_noise
-    named = [names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)]
-    fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
-    if fit.names and predicts_far_worse(BestRepair.of(searched, test, fit, noise, rng=cached.rng).improvement):
-        return cached.averaged(test.null)
-    shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(fit) if names}
-    return cached.averaged(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit
+from probewise.diagnosis.fit import FARTHEST, Fit, difference_points_and_steps
 from probewise.diagnosis.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.simulator_fit import log_evidence_of
@@ -171,12 +171,11 @@ class _Ridge:
 
     def _linearise(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Return slopes (k, n_params, n), residuals (k, n), both in noise sds, precisions, and which are possible."""
-        usable, steps = self.problem.recording.usable, np.where(z > 0, -DIFFERENCE, DIFFERENCE)
-        points = np.concatenate([z[:, None], z[:, None] + steps[:, :, None] * self.eye], axis=1)
+        usable, (points, steps) = self.problem.recording.usable, difference_points_and_steps(z)
         predicted = self.problem.predict(points.reshape(-1, z.shape[1]))[:, usable]
         with np.errstate(all="ignore"):
             left = self.law((self.problem.recording.readings[usable] - predicted).T).T
-            left = (left / self._variance(self.best) ** 0.5).reshape(len(z), z.shape[1] + 1, -1)
+            left = (left / self._variance(self.best) ** 0.5).reshape(*points.shape[:2], -1)
             slopes, residuals = (left[:, :1] - left[:, 1:]) / steps[:, :, None], left[:, 0]
         possible = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
         slopes, residuals = np.where(possible[:, None, None], slopes, 0.0), np.where(possible[:, None], residuals, 0.0)

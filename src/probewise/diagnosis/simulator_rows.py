@@ -66,7 +66,7 @@ def possible_run_commands(
     without any, runs can only be repeated. A function of the time may hold for constant controls alone, as a step
     response does: unless the simulator is a law (`by_law`), only a control that varies in a recorded run does so again.
     """
-    out: list[Command] = []
+    out, run = list[Command](), table.run or unused_name(_RUN, table.columns)
     settable = [name for name in controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
@@ -77,18 +77,25 @@ def possible_run_commands(
         of = f"run {name}" if table.run is not None else "the rows"
         for kind, words, columns, slower in _variations_of_run(table, kept, ends, free, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
-            made = _planned_run(table, kept, columns=columns, reading=reading, name=called, like=name, slower=slower)
-            out.append(Command(kind, words, cast(Plan, made), _minutes_of_runs(made, time_unit)))
+            changed: dict[str, Any] = {**columns, run: np.full(len(kept), called)}
+            if reading in table.columns:
+                changed[reading] = np.full(len(kept), np.nan)
+            if table.time is not None:
+                time = table.time_s[kept]
+                begin = time[0] if table.time_begins_anew else _next_start_time(table)
+                changed[table.time] = begin + slower * (time - time[0])
+            taken, like = table.take(kept), {called: table.like.get(name, name)}  # parameters per run as in that run
+            made = replace(taken, columns={**taken.columns, **changed}, run=run, like=like, first_row=len(table))
+            unit = _minutes_of_time_unit(made, time_unit)
+            minutes = len(made) * _A_READING if unit is None else float(np.ptp(made.time_s)) * unit
+            out.append(Command(kind, words, cast(Plan, made), _BREAK + minutes))
     return out
-
-
-Change = tuple[str, str, Mapping[str, FloatArray], float]
-"""Kind, words, the columns that are set, and how many times as long the run takes."""
 
 
 def _variations_of_run(
     table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], free: Container[str], of: str
-) -> Iterator[Change]:
+) -> Iterator[tuple[str, str, Mapping[str, FloatArray], float]]:
+    """Yield kind, words, the columns that are set, and how many times as long the run takes."""
     own = {name: table.covariates[name][rows] for name in ends}
     yield "again", f"take {of} again", {}, 1.0
     if not ends:
@@ -121,32 +128,6 @@ def _variations_of_run(
                 rounded = np.round(values, int(np.ceil(3 - np.log10(high - low))))
                 values = np.where((values == low) | (values == high), values, rounded)
             yield f"{name} {kind}", f"take {of} with {name} {text}", {name: values}, 1.0
-
-
-def _planned_run(
-    table: RunTable,
-    rows: IntArray,
-    columns: Mapping[str, FloatArray],
-    reading: str,
-    name: str,
-    like: str,
-    slower: float,
-) -> RunTable:
-    """Return rows of a table as a new run after it, called `name`: without readings, with `columns` set.
-
-    The run takes `slower` times as long as the rows did; parameters per run are taken as in the run `like`.
-    """
-    changed: dict[str, Any] = {**columns}
-    if reading in table.columns:
-        changed[reading] = np.full(len(rows), np.nan)
-    if table.time is not None:
-        time = table.time_s[rows]
-        begin = time[0] if table.time_begins_anew else _next_start_time(table)
-        changed[table.time] = begin + slower * (time - time[0])
-    run = table.run or unused_name(_RUN, table.columns)
-    changed[run] = np.full(len(rows), name)
-    taken, as_run = table.take(rows), {name: table.like.get(like, like)}
-    return replace(taken, columns={**taken.columns, **changed}, run=run, like=as_run, first_row=len(table))
 
 
 def _next_start_time(table: RunTable) -> float:
@@ -189,11 +170,6 @@ def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[Int
     return list(seen.values())[:_MOST_RUNS]
 
 
-def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
-    minutes = _minutes_of_time_unit(table, time_unit)
-    return _BREAK + (len(table) * _A_READING if minutes is None else float(np.ptp(table.time_s)) * minutes)
-
-
 def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
     return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
@@ -214,6 +190,7 @@ CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 
 # table as of a short one.
 _EVALUATIONS_PER_ROW = 6_000
 _LEAST_EVALUATIONS = 1_500_000
+_CONSTANT = 1e-12  # of a covariate's largest value: a range up to this is rounding
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
 _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
@@ -247,6 +224,16 @@ class SimulatorApparatus(Apparatus):
         return self.about.rows_are_in_order
 
     @property
+    def controls(self) -> tuple[str, ...]:
+        return self.system.simulator.controls
+
+    @property
+    def takes_one_measurement_at_a_time(self) -> bool:
+        # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
+        # from `states` as it is planned, and a lag or a backlash would reach from one into the other.
+        return self.system.simulator.run is None
+
+    @property
     def words(self) -> Words:
         own, caller = self.system.simulator, self.system.caller
         facts = [("simulator", own.source or "given in Python")]
@@ -275,19 +262,14 @@ class SimulatorApparatus(Apparatus):
             tells_duration=_minutes_of_time_unit(self.about.table, own.time_unit) is not None,
         )
 
-    @property
-    def controls(self) -> tuple[str, ...]:
-        return self.system.simulator.controls
-
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
             kinds.remove(RandomWalk)
-        on_noise = [effect for kind in kinds if (effect := kind.for_extent(extent)) is not None]
+        beside = (*(kind.for_extent(extent) for kind in kinds), self.stop, self.lost)
         forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
-        known = {effect.name: effect for effect in (self.stop, self.lost) if effect is not None}
-        return forms | {effect.name: effect for effect in on_noise} | known
+        return forms | {effect.name: effect for effect in beside if effect is not None}
 
     def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
@@ -335,7 +317,7 @@ class SimulatorApparatus(Apparatus):
         out = []
         for name, values in pooled.items():
             there = np.flatnonzero(np.isfinite(values))
-            if there.size and _varies(values[there]):
+            if there.size > 1 and np.ptp(values[there]) > _CONSTANT * max(1e-300, float(np.abs(values[there]).max())):
                 out.append(Covariate(name, values[there], there))
         if len(table.scan_names) > 1:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))
@@ -388,12 +370,6 @@ class SimulatorApparatus(Apparatus):
         values = [np.arange(model.n_params)[model.coordinate_slice(n)] for n in model.names if has_value_per_run(n)]
         return np.concatenate([np.array(parameters, dtype=np.int64), *values])
 
-    @property
-    def takes_one_measurement_at_a_time(self) -> bool:
-        # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
-        # from `states` as it is planned, and a lag or a backlash would reach from one into the other.
-        return self.system.simulator.run is None
-
     def settings_of(self, plan: Plan) -> FloatArray:
         table, own = cast(RunTable, plan), self.system.simulator
         columns = [v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)]
@@ -408,7 +384,3 @@ class SimulatorApparatus(Apparatus):
 
     plan_of_alternatives = staticmethod(plan_of_alternatives)
     plan_of_sequence = staticmethod(plan_of_sequence)
-
-
-def _varies(values: FloatArray) -> bool:
-    return values.size > 1 and float(np.ptp(values)) > 1e-12 * max(1e-300, float(np.abs(values).max()))

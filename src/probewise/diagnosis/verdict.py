@@ -195,8 +195,11 @@ class Judged:
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
 
-def judge(searched: Searched, test: GlobalTest) -> Judged:
-    """Return the verdict, with probabilities and aliases, from a search and the global test."""
+def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) -> Judged:
+    """Return the verdict, with probabilities and aliases, from a search and the global test.
+
+    The probability of what is out of vocabulary counts `unknown_weight` times against all others.
+    """
     prepared, prior = searched.prepared, searched.prior
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
     on_noise, certain, half = prepared.pure_noise_effect_names, frozenset(searched.certain), prior.named_needs_half
@@ -219,7 +222,9 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
             named_needs_half=half,
         )
 
-    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(searched, test.p_value, verdict_on)
+    hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
+        searched, test.p_value, verdict_on, unknown_weight=unknown_weight
+    )
     judged = Judged(
         verdict,
         combination,
@@ -234,7 +239,11 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
 
 
 def hypotheses_with_verdict(
-    searched: Searched, p_value: float, verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]]
+    searched: Searched,
+    p_value: float,
+    verdict_on: Callable[[tuple[Hypothesis, ...]], tuple[Verdict, Names]],
+    *,
+    unknown_weight: float = 1.0,
 ) -> tuple[tuple[Hypothesis, ...], Names, tuple[Verdict, Names]]:
     """Return the hypotheses, most probable first, the rare effects that they name (or ()), and the verdict on them.
 
@@ -252,7 +261,7 @@ def hypotheses_with_verdict(
         verdict, combination = verdict_on(hypotheses)
         if verdict == "named" and {*rare} <= {*combination}:
             return hypotheses, rare, (verdict, combination)
-    hypotheses = ranked_hypotheses(posterior.probabilities, reported_as)
+    hypotheses = ranked_hypotheses(posterior.probabilities, reported_as, unknown_weight=unknown_weight)
     return hypotheses, (), verdict_on(hypotheses)
 
 
@@ -308,7 +317,10 @@ def _leader_on_mean(
 
 
 def ranked_hypotheses(
-    probabilities: Mapping[tuple[Names, Names], float], reported_as: Callable[[Names], Names]
+    probabilities: Mapping[tuple[Names, Names], float],
+    reported_as: Callable[[Names], Names],
+    *,
+    unknown_weight: float = 1.0,
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
@@ -318,7 +330,7 @@ def ranked_hypotheses(
     for (mean, noise), p in probabilities.items():
         key = reported_as(mean)
         key = key if key == ("unknown",) else tuple(sorted((*key, *noise_effects_in_vocabulary(noise))))
-        joined[key] = joined.get(key, 0.0) + p
+        joined[key] = joined.get(key, 0.0) + p * (unknown_weight if key == ("unknown",) else 1.0)
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)

@@ -103,15 +103,6 @@ def distinct_values(values: FloatArray, within: float | None = None) -> FloatArr
     return np.asarray(ordered[np.diff(ordered, prepend=-np.inf) > apart])
 
 
-def without_rounding_errors(values: FloatArray) -> FloatArray:
-    """Return values, (n_values,), those that differ by no more than rounding made equal: each is a distinct value."""
-    distinct = distinct_values(values)
-    if not distinct.size:
-        return values
-    nearest = distinct[np.maximum(np.searchsorted(distinct, values, side="right") - 1, 0)]
-    return np.asarray(np.where(np.isfinite(values), nearest, values))
-
-
 def varies(values: FloatArray) -> bool:
     """Return whether finite values differ by more than the rounding error of arithmetic."""
     finite = values[np.isfinite(values)]

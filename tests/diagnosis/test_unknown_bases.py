@@ -99,19 +99,6 @@ def test_what_a_name_describes_is_no_unknown():
     assert factors[of_runs[0]] < -40
 
 
-def test_a_level_that_returns_each_year_tells_no_year():
-    """Twelve levels, each with another rounding error in each year: no basis of the level parts equal ones."""
-    month = np.tile(np.arange(12), 14)
-    level = np.cos(2 * np.pi * month / 12) + 1e-15 * np.arange(len(month))
-    bank = bank_of_unknown_effects(
-        [Covariate("level", level, np.arange(len(level)))], level, np.zeros(len(level)), None
-    )
-    assert {"level", "level, locally"} <= set(bank.labels)
-    for k in range(len(bank.labels)):
-        by_year = np.reshape(bank[k], (14, 12, -1))
-        np.testing.assert_allclose(by_year, np.broadcast_to(by_year[:1], by_year.shape), atol=1e-9)
-
-
 def _three_columns_and_bases():
     """Return three columns, (3, 200), of 190, 200 and 200 rows, and the bases with and without their products."""
     rng = np.random.default_rng(8)

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, without_rounding_errors
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.templates import TemplateBank
 from probewise.effects import NamedEffect
@@ -29,9 +29,8 @@ class Covariate:
     """One covariate (time, place, level, ...) of the usable readings.
 
     `rows` (n_rows,): indices of the usable readings for which it is defined; `values` (n_rows,): its values there, in
-    its unit, those that differ by rounding alone made equal: sorted by their last digits, a level that returns each
-    year would be sorted by the year; `groups`: whether it is categorical (an orientation, a scan); `scan`: name of the
-    scan to which it is restricted, or None.
+    its unit; `groups`: whether it is categorical (an orientation, a scan); `scan`: name of the scan to which it is
+    restricted, or None.
     """
 
     name: str
@@ -39,9 +38,6 @@ class Covariate:
     rows: IntArray
     groups: bool = False
     scan: str | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "values", without_rounding_errors(self.values))
 
     @property
     def published_name(self) -> str:
@@ -149,17 +145,6 @@ def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], dra
     return float((1 + above.sum()) / (1 + len(above)))
 
 
-def bounds_of_windows(ordered: FloatArray, firsts: Sequence[int], width: int) -> Iterator[tuple[int, int]]:
-    """Yield the first and last (exclusive) of about `width` sorted values from each of `firsts` on.
-
-    Equal values stay together: a window that split them would select by something else.
-    """
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(ordered)) + 1, [len(ordered)]])
-    yield from (
-        (int(edges[low]), int(edges[high])) for low, high in np.searchsorted(edges, [(k, k + width) for k in firsts])
-    )
-
-
 def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
     """Build windows over the sorted values of a covariate: of half the readings, a quarter and so on, half overlapping.
 
@@ -181,12 +166,14 @@ def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[Floa
             add_window(np.flatnonzero(values == value))
         return np.stack(columns, axis=1), ends
     order = np.argsort(values, kind="stable")
-    n = len(values)
+    edges, n = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]]), len(values)
     width = n // 2
     looked: set[tuple[int, int]] = set()
     while width >= _LEAST_ROWS and len(columns) <= 160:
-        firsts = sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width})
-        for low, high in bounds_of_windows(values[order], firsts, width):
+        for first in sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width}):
+            # Equal values stay together: a window that split them would select by something else.
+            low = int(edges[np.searchsorted(edges, first)])
+            high = int(edges[np.searchsorted(edges, first + width)])
             if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
                 looked.add((low, high))
                 add_window(order[low:high])

@@ -16,9 +16,9 @@ from itertools import combinations
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, without_rounding_errors
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks
-from probewise.diagnosis.locate import Covariate, bounds_of_windows
+from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.templates import TemplateBank
 
 PRODUCTS = "products of two columns"
@@ -167,8 +167,7 @@ def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterat
         yield from _window_bases(covariate, ways.adds, _WINDOWS)
     elif covariate.name in ("level", "edge_distance"):
         yield from _smooth_bases(covariate, _TERMS, ways.adds)
-        gain = without_rounding_errors(ways.gain)
-        side = np.where(gain > 0.5 * gain.max(), 1.0, -1.0)
+        side = np.where(ways.gain > 0.5 * ways.gain.max(), 1.0, -1.0)
         yield _cosine_bases(covariate, side * ways.adds, _TERMS[1])
         yield _cosine_bases(covariate, ways.turned, 3)
         yield from _window_bases(covariate, ways.adds, _WINDOWS)
@@ -264,12 +263,9 @@ def _window_bases(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -
     order, n = np.argsort(covariate.values, kind="stable"), len(covariate.values)
     for n_parts in parts:
         width = max(n // n_parts, 2)
-        firsts = range(0, n - width + 1, max(width // 2, 1))
-        for low, high in dict.fromkeys(bounds_of_windows(covariate.values[order], firsts, width)):
-            if high - low == n:
-                continue
+        for first in range(0, n - width + 1, max(width // 2, 1)):
             window = np.zeros(n)
-            window[order[low:high]] = 1.0
+            window[order[first : first + width]] = 1.0
             yield _on_all_rows((window * way[covariate.rows])[:, None], covariate, len(way))
 
 

@@ -51,14 +51,17 @@ def journal(doubting, seed):
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 20))])
 def test_evidence_from_the_prior_is_that_of_nested_sampling(doubting, seed):
-    """Within a nat, and two of the stated errors of nested sampling, for every kind above a thousandth."""
+    """Within a nat, and two of the stated errors of nested sampling, for every kind above a thousandth.
+
+    With 400 live points that misses a mode of the step of the light in two of five runs.
+    """
     recording, rng = journal(doubting, seed), np.random.default_rng(seed)
     kinds = [kind for kind in doubting.kinds if kind.left_out in NAMES]
     found = [from_nothing(kind.problem(recording), rng=rng) for kind in kinds]
     odds = np.array([kind.log_prior + f.log_z for kind, f in zip(kinds, found, strict=True)])
     for kind, f, behind in zip(kinds, found, odds.max() - odds, strict=True):
         if behind < math.log(1000.0):
-            right = nested_sampling_from_scratch(kind.problem(recording), n_live=400, rng=rng)
+            right = nested_sampling_from_scratch(kind.problem(recording), n_live=1000, rng=rng)
             assert f.log_z == pytest.approx(right.log_z, abs=1.0 + 2 * right.log_z_error), kind.left_out
 
 

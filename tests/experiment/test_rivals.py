@@ -459,14 +459,13 @@ def test_a_robot_that_doubts_finds_the_circle_and_what_is_wrong_with_its_sensor(
 
 @pytest.mark.slow
 def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
-    """A step of the light that had moved the circle by 8 mm at a claimed 2.4 mm: two readings more find both."""
+    """A step of the light, which would move the circle by 8 mm at a claimed 2.4 mm if it were not looked for."""
     trial = ConcealedTrial("ambient_step", 1, 0, 0.9, 40, 8101)
     experiment = replace(experiment_of(REFERENCE), trust=0.9)
     steps = [
         s for s, _ in timed_steps(_arm_in_concealed_world(trial), experiment, seed=8101, circle=0, max_readings=40)
     ]
     known = [step.number for step in steps if step.largest_sd_mm < 4.0 and step.chance_off < 0.01]
-    assert known[0] < steps[-1].number
     assert [step.number for step in steps if step.checks_sensor] == known[:-1]
     assert steps[-1].map.label == NAMES
     assert steps[-1].map.highest_utility < ENOUGH_BITS

@@ -122,7 +122,7 @@ def posterior_from_prior(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DoubtfulResultWarning)
-            result = nested_sampling_from_scratch(problem, n_live=n_live // 2, moves=_MOVES, rng=rng)
+            result = nested_sampling_from_scratch(problem, n_live=n_live, moves=_MOVES, rng=rng)
     except NotConvergedError:
         return None
     points = result.samples(n, rng=rng)

@@ -128,10 +128,11 @@ class TemplateBank:
             yield from ((group, _whitened_with_grams(self.templates[group], law)) for group in self.groups)
             return
         key = law.whitening_key
-        self._whitened[key] = self._whitened.pop(key, None) or _whitened_with_grams(self.templates, law)
+        known = self._whitened.pop(key, None)
+        self._whitened[key] = known = known or _whitened_with_grams(self.templates, law)
         if len(self._whitened) > _REMEMBERED:
             self._whitened.pop(next(iter(self._whitened)))
-        yield self.groups[0], self._whitened[key]
+        yield self.groups[0], known
 
 
 def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:

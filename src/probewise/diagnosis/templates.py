@@ -128,8 +128,8 @@ class TemplateBank:
             yield from ((group, _whitened_with_grams(self.templates[group], law)) for group in self.groups)
             return
         key = law.whitening_key
-        known = self._whitened.pop(key) if key in self._whitened else _whitened_with_grams(self.templates, law)
-        self._whitened[key] = known  # the last one used is the last one to go
+        known = self._whitened.pop(key, None)
+        self._whitened[key] = known = known or _whitened_with_grams(self.templates, law)
         if len(self._whitened) > _REMEMBERED:
             self._whitened.pop(next(iter(self._whitened)))
         yield self.groups[0], known

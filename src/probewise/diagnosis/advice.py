@@ -174,8 +174,8 @@ def pairs_with_separating_scans(
 
     `entries`: the entry of each effect's bank that is taken for it, by name.
     """
-    plan, level = found.model.plan, found.model.predict(found.z[None, :])[0]
-    scans = apparatus.candidate_measurements(plan, level=level)
+    plan = found.model.plan
+    scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
     if not (pairs and scans):
         return list(pairs)
     everywhere = apparatus.plan_of_alternatives(scans, plan)
@@ -190,8 +190,9 @@ def pairs_with_separating_scans(
         with_effect = found.model.with_effect(effect)
         values = with_effect.z_of_last_effect(settings)
         points = np.concatenate([np.repeat(found.z[None, :], len(values), axis=0), values], axis=1)
+        without = found.model.predict(found.z[None, :])[0]  # just before: a law is solved from what was solved last
         with np.errstate(all="ignore"):  # not finite where the model diverges
-            old = problem.whiten((with_effect.predict(points) - level).T[usable])
+            old = problem.whiten((with_effect.predict(points) - without).T[usable])
             new = (replace(with_effect, plan=everywhere).predict(points) - expected).T / problem.sd
         length = max(float(np.linalg.norm(old)), 1e-300)
         is_of_run = len(apparatus.coordinates_of_new_run(with_effect)) > len(of_run)

@@ -213,7 +213,7 @@ def test_a_journal_is_not_continued_with_an_arm_that_is_known_otherwise(small_fo
         return list(explore(small_for_all.arm(), experiment, rng=rng, max_readings=2, journal=tmp_path / "j.jsonl"))
 
     steps(0.8)
-    with pytest.raises(FileError, match="fitted_arm"):
+    with pytest.raises(FileError, match="another geometry of the arm"):
         steps(0.9)
 
 

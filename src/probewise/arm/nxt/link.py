@@ -74,6 +74,13 @@ class Timing:
     keep_awake_s: float = 60.0  # between keep-alive commands; a third of the brick's sleep limit if that is shorter
     n_repeats: int = 2  # of a question without a valid answer, if repeating it is harmless
 
+    @property
+    def longest_s(self) -> float:
+        """Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
+        draining_s = self.answer_s + self.silence_s
+        waiting_s = 2 * self.turn_s + self.answer_s
+        return (1 + self.n_repeats) * (waiting_s + draining_s + len(FENCES) * (waiting_s + draining_s))
+
 
 class NoAnswerError(LinkError):
     """Raised if the brick did not answer a command in time; the command may or may not have been executed."""

@@ -12,7 +12,6 @@ import glob
 import itertools
 import json
 import os
-import secrets
 import shutil
 import stat
 import sys
@@ -61,7 +60,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, name
                 if left.is_file():  # a pipe would be waited for
                     _lock(opened.enter_context(open(left, "rb")).fileno())
                 left.unlink()
-        temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+        temporary = target.with_name(f".{target.name}.{os.urandom(4).hex()}.part")
         stack.enter_context(defer_signals())
         with open(temporary, "xb", buffering=0) as file:
             stack.callback(temporary.unlink, missing_ok=True)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import logging
 import os
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
@@ -22,7 +20,7 @@ from probewise.cli._common import add, count_up_to, finish, message_to_resume
 from probewise.errors import DoubtfulResultWarning, LinkError
 
 if TYPE_CHECKING:
-    from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures import Executor, ProcessPoolExecutor
 
     from probewise.proof.campaign import Campaign, Keyed, Result
     from probewise.proof.pages import CampaignPage
@@ -88,6 +86,8 @@ def _message_to_resume_campaign(path: Path, noun: str, arguments: argparse.Names
 
 @contextlib.contextmanager
 def _cluster_executor(address: str) -> Iterator[Executor]:
+    import logging
+
     try:
         from distributed import Client
     except ImportError as error:

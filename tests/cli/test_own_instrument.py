@@ -185,7 +185,7 @@ def test_a_run_is_not_resumed_with_another_geometry(sensor_file, tmp_path, capsy
     words = ["explore", "--sensor", sensor_file, "--out", out, "--quiet", "--max-readings"]
     assert run(*words, 1, "--geometry", mine) == 0
     assert run(*words, 2, "--geometry", other, "--resume") == 2
-    assert "geometry_sha256" in capsys.readouterr().err
+    assert "another geometry of the arm" in capsys.readouterr().err
     assert run(*words, 2, "--geometry", mine, "--resume") == 0
     # A journal of an earlier version says nothing of the geometry.
     journal = out / "journal.jsonl"

@@ -228,14 +228,21 @@ def run_cell(cell: Cell) -> dict[str, Any]:
                 warnings.simplefilter("default", own)
             for words in wanted:
                 words = [str(out / word) if word in FITTED else word for word in words]
-                target = out / "predicted.csv" if words[0] == "predict" else out
+                target = out / {"predict": "predicted.csv", "fit": "fit"}.get(words[0], "")
                 with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
                     status = command_line([*words, "--out", str(target)])
                 if status != 0:
                     raise SystemExit(f"{words[0]} exits {status}: {said.getvalue().strip().splitlines()[-1][:200]}")
             results = [call.args[0] for summary in shown for call in summary.call_args_list]
             row |= _of_result(cell, out, results)
-            row["failure"] = next(complaints(out, said.getvalue(), results), "")
+            row["failure"] = next(
+                (
+                    complaint
+                    for folder in (out, *(page.parent for page in out.glob("*/report.html")))
+                    for complaint in complaints(folder, said.getvalue(), results)
+                ),
+                "",
+            )
         except SystemExit as stop:
             row["failure"] = str(stop)
         except Exception as error:  # a traceback, for a person

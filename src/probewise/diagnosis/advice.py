@@ -416,7 +416,9 @@ def measurement_at_place(
 
 @np.errstate(all="ignore")  # of predictions that ran away
 def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Return a lower bound on the mutual information of hypothesis and readings, in nats; NaN if one is not finite.
+    """Return a lower bound on the mutual information of hypothesis and readings, in nats.
+
+    NaN where predictions ran away: if one is not finite, or so uncertain that rounding swallows the noise.
 
     `weights`: probabilities (n_hypotheses,), which sum to one.
     """
@@ -426,6 +428,8 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
     for a, b in itertools.combinations(range(len(predictives)), 2):
         middle, apart = (covariances[a] + covariances[b]) / 2, predictives[a].mean - predictives[b].mean
         log_det = np.linalg.slogdet(middle)[1] - (log_dets[a] + log_dets[b]) / 2
+        if not np.isfinite(log_det):
+            return float("nan")
         distances[a, b] = distances[b, a] = apart @ np.linalg.solve(middle, apart) / 8 + log_det / 2
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 

@@ -274,7 +274,7 @@ class NoiseLaw:
         """
         number, nearest, carry = np.cumsum(rows) - 1, np.full(len(rows), -1), np.zeros(len(rows))
         for k in np.flatnonzero(self.carry).tolist():  # a reading comes after the one before it
-            above = self._number_before[k]
+            above = self.before[k] if self.before.size else k - 1
             if rows[above]:
                 nearest[k], carry[k] = number[above], self.carry[k]
             elif nearest[above] >= 0:
@@ -290,13 +290,14 @@ class NoiseLaw:
             return y[:, 0] if flat else y
         y = y * (self.kept / self._whitening_sd)[:, None]
         if np.any(self.carry):
-            carry = self.carry[:, None]
-            y = (y - carry * y[self._number_before]) / np.sqrt(1 - carry**2)
+            carry, told = self.carry[:, None], np.zeros_like(y)
+            if self.before.size:
+                told = carry * y[self.before]
+            else:  # a view: an indexed copy of thousands of columns takes longer than the rest
+                np.multiply(carry[1:], y[:-1], out=told[1:])
+            y = np.subtract(y, told, out=told)
+            y /= np.sqrt(1 - carry**2)
         return y[:, 0] if flat else y
-
-    @cached_property
-    def _number_before(self) -> IntArray:
-        return self.before if self.before.size else np.maximum(np.arange(len(self.sd)) - 1, 0)
 
     def _whiten_with_walk(self, columns: FloatArray) -> FloatArray:
         """Whiten columns (n_points, n_columns) with a random walk: differences correlate only with their neighbours."""

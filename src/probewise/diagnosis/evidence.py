@@ -276,12 +276,16 @@ class OrthonormalBlocks:
 
 def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
     """Whiten templates (n_points, k), scale to unit rms, project the fit out; concatenated, (n_rows, n_columns)."""
-    widths = [t.shape[1] for t in templates]
-    whitened = problem.law(np.concatenate(templates, axis=1))
-    per_column = np.repeat(widths, widths)
+    return problem.project_whitened(whiten_to_unit_rms(templates, problem.law))
+
+
+def whiten_to_unit_rms(templates: Sequence[FloatArray], law: NoiseLaw) -> FloatArray:
+    """Whiten templates (n_points, k) and scale each to unit rms; concatenated, (n_points, n_columns)."""
+    widths = [template.shape[1] for template in templates]
+    whitened = law(np.concatenate(templates, axis=1))
     norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-    whitened *= np.sqrt(problem.n_kept / per_column) / np.where(norms > 0, norms, 1.0)
-    return problem.project_whitened(whitened)
+    whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+    return whitened
 
 
 def orthonormalise_groups(

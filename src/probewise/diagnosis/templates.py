@@ -22,6 +22,7 @@ from probewise.diagnosis.evidence import (
     Linearised,
     average_over_amplitude_scales,
     scale_and_project,
+    whiten_to_unit_rms,
 )
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
@@ -138,9 +139,7 @@ class TemplateBank:
 def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
     widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
     firsts = np.cumsum(widths) - widths
-    whitened = law(np.concatenate(templates, axis=1))
-    norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-    whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+    whitened = whiten_to_unit_rms(templates, law)
     ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
     products: dict[int, list[FloatArray]] = {}
     for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width

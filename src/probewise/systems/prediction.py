@@ -207,7 +207,7 @@ def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> RunTabl
     if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
         return table
     recorded = fitted.known.table
-    first = {name: table.time_s[rows].min() for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)}
+    first = _first_times(table)
     begins = np.array([first.get(name, -np.inf) for name in recorded.scan_names])
     rows = np.flatnonzero(recorded.time_s < begins[recorded.scan])
     if not rows.size:
@@ -221,6 +221,13 @@ def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> RunTabl
     return replace(table, columns=columns, first_line=table.first_line - len(rows), notes=())
 
 
+def _first_times(table: RunTable) -> dict[str, float]:
+    """Return the earliest time of each run."""
+    return {
+        name: float(table.time_s[rows].min()) for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)
+    }
+
+
 def _note_on_runs_started_again(fitted: FittedSystem, table: RunTable) -> tuple[str, ...]:
     """Return a note where a law starts runs again that may have been recorded before their first rows here; else ().
 
@@ -230,7 +237,7 @@ def _note_on_runs_started_again(fitted: FittedSystem, table: RunTable) -> tuple[
     if fitted.simulator.law is None or fitted.known is not None or fitted.recording == table_digest(table):
         return ()
     known = {name.partition("[")[2][:-1] for name in fitted.names if name.partition("[")[0] in fitted.simulator.per_run}
-    first = {name: table.time_s[rows].min() for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)}
+    first = _first_times(table)
     again = [name for name, time in first.items() if time > 0 and (not known or name in known)]
     runs = f"run{'s' * (len(again) > 1)} {', '.join(again)}" if table.run else "the run"
     how = "started again at its first row here, as `states` says; give the recorded rows before it to go on from them"

@@ -407,7 +407,7 @@ def measurement_at_place(
         commands[best].description,
         commands[best].minutes,
         float(nats[best]),
-        (f"{apparatus.words.null} as {apparatus.words.unrepaired}", NO_NAME),
+        (f"{apparatus.words.null} {apparatus.words.before_in_words}", NO_NAME),
         ((), ("unknown",)),
         np.full(2, 0.5),
         nats[best] * (1 - np.eye(2)),
@@ -505,7 +505,7 @@ def choose_next_measurement(
         return measurement_at_place(unknown_shows_in, null.found, prepared.everything, sd, plan, apparatus)
     if is_settled(searched) or len(found) == 1:
         return None
-    unrepaired = f"{apparatus.words.null} as {apparatus.words.unrepaired}"
+    unrepaired = f"{apparatus.words.null} {apparatus.words.before_in_words}"
     rivals = []
     for fit in found:
         label = hypothesis_in_words(fit.names, nothing=unrepaired)

@@ -82,6 +82,11 @@ class Words:
         """The model before a repair, as an adjective: a light sensor is calibrated, a simulator fitted."""
         return "calibrated" if self.covariates is None else "fitted"
 
+    @property
+    def before_in_words(self) -> str:
+        """As what the model before a repair predicts, beside `Repair.after_in_words`."""
+        return f"as {self.unrepaired}"
+
     def as_sentence(self, text: str) -> str:
         """Return a text with a capital first letter, unless its first word is a person's own name."""
         first = (text.split() or [""])[0].rstrip(",.;:")

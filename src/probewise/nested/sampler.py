@@ -41,6 +41,7 @@ from probewise.nested.evidence import (
     insertion_p_value,
     insertion_ranks,
     integrate,
+    log_volumes,
     n_independent,
     relative_lineage_variance,
     warning_of_coarse_coordinates,
@@ -423,7 +424,7 @@ def _do_round(
     chains = volume <= _PRIOR_VOLUME  # else new points are drawn from the whole prior
     move = now.moving if chains else PriorRejection(volume)
     live, gone, tally = replace_worst_live_points(now.live, move, evaluate, n_replaced=n_replaced, rng=rng)
-    edges = now.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / (len(live) - np.arange(n_replaced)))])
+    edges = np.concatenate([[now.log_volume], log_volumes(len(live) - np.arange(n_replaced), now.log_volume)])
     log_volume = float(edges[-1])
     # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(live.log_likelihood.max())

@@ -73,7 +73,7 @@ _NOISE_CAPTIONS = {
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Section]:
     """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `figure_drawers`."""
-    repair, before = diagnosis.repair, f"as {diagnosis.apparatus.words.unrepaired}"
+    repair, before = diagnosis.repair, diagnosis.apparatus.words.before_in_words
     changed = f"Before and after: {before}, {repair.after_in_words}" if repair.changes_predictions else "The model"
     return [
         html.Section("What it could be", _explanation_elements(diagnosis)),
@@ -120,7 +120,7 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = f", blue squares: {diagnosis.repair.after_in_words}" if diagnosis.repair.changes_predictions else ""
     where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
-    circles = f"Orange circles: as {diagnosis.apparatus.words.unrepaired}{after}."
+    circles = f"Orange circles: {diagnosis.apparatus.words.before_in_words}{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
     return f"Residuals, averaged in bins. {circles}{_walk_note(diagnosis)} {band}{where} {bars}"
 
@@ -172,7 +172,7 @@ def _rms_in_words(diagnosis: Diagnosis, weighting: str = "") -> str:
     before = f"{gain.rms_before:.3g} {unit}"
     if not diagnosis.repair.changes_predictions:
         return before
-    before += f" as {diagnosis.apparatus.words.unrepaired}"
+    before += f" {diagnosis.apparatus.words.before_in_words}"
     return f"{before}, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
 
 
@@ -316,7 +316,7 @@ def before_and_after_caption(diagnosis: Diagnosis) -> str:
     which, colours = f"One {run}", "orange"
     if diagnosis.repair.changes_predictions:
         which = f"The {run} that changes most"
-        colours = f"orange as {diagnosis.apparatus.words.unrepaired}, blue {diagnosis.repair.after_in_words}"
+        colours = f"orange {diagnosis.apparatus.words.before_in_words}, blue {diagnosis.repair.after_in_words}"
     walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
     shown = f"readings (black) and predictions ({colours}{walk})"
     return f"{which}: {shown}, and below the residuals with their running means."
@@ -338,7 +338,7 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str | Mapping[str, str]]:
     gain, changes = diagnosis.improvement, diagnosis.repair.changes_predictions
     words = diagnosis.apparatus.words
-    unchanged = f"The predicted mean is as {words.unrepaired}: there is no repair to test on held-out readings."
+    unchanged = f"The predicted mean is {words.before_in_words}: there is no repair to test on held-out readings."
     shown = words.nothing_held_out if changes else unchanged
     if "gain.svg" in drawn:
         caption = (

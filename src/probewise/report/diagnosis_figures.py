@@ -139,7 +139,7 @@ def _draw_means_along(
         each=(at, diagnosis.repair.before.residuals) if each else None,
         window=view.window,
         names=names,
-        before=f"as {diagnosis.apparatus.words.unrepaired}",
+        before=diagnosis.apparatus.words.before_in_words,
         after=diagnosis.repair.after_in_words,
         ax=ax,
     )
@@ -165,7 +165,7 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     walking = ", with the walk" if after.has_walk else ""
-    named = ((f"as {diagnosis.apparatus.words.unrepaired}", before), (diagnosis.repair.after_in_words, after))
+    named = ((diagnosis.apparatus.words.before_in_words, before), (diagnosis.repair.after_in_words, after))
     models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in named]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
@@ -188,7 +188,7 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
 def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
     plan, repair = diagnosis.recording.plan, diagnosis.repair
-    unrepaired = f"as {diagnosis.apparatus.words.unrepaired}"
+    unrepaired = diagnosis.apparatus.words.before_in_words
     models = [(unrepaired, repair.before.residuals), (repair.after_in_words, repair.after.residuals)]
     models = models if repair.changes_predictions else models[:1]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")

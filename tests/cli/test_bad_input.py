@@ -123,6 +123,7 @@ CONTRADICTIONS = [
         ((*EXPLORE, "--truth", truth), f"{name} of --truth {truth} is {value}; allowed: {allowed},")
         for truth, (name, value, allowed) in TRUTHS.items()
     ),
+    ((*EXPLORE, "--field=--"), "argument --field: -- is not a value"),
     ((*EXPLORE, "--field", "10"), "--field is '10'; allowed: WIDTH,HEIGHT in mm"),
     ((*EXPLORE, "--field=-5,20"), "-5"),
     ((*EXPLORE, "--seed", "x"), "'x' is not a whole number of 0 or more"),

@@ -49,9 +49,11 @@ class OneLineParser(argparse.ArgumentParser):
         if self._subparsers is None:  # otherwise words may be options of a verb
             options = self._option_string_actions
             for word in itertools.takewhile(lambda word: word != "--", words):
-                name = word.partition("=")[0]
+                name, _, value = word.partition("=")
                 if name.startswith("--") and not any(option.startswith(name) for option in options):
                     self.error(f"no option {name}{did_you_mean(name, options)}")
+                if value == "--":  # argparse, until Python 3.13, would make an empty list of it
+                    self.error(f"argument {name}: -- is not a value")
         parsed, surplus = super().parse_known_args(words, namespace)
         if surplus and self._subparsers is None:
             self.error(f"unrecognized arguments: {' '.join(surplus)}")

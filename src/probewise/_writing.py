@@ -8,6 +8,7 @@ only then are they moved. A process killed before that has changed nothing; afte
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import itertools
 import json
@@ -155,6 +156,7 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
         if main not in ("", name) and os.path.exists(path / name):
             allowed = f"another folder: this one holds {results} ({name}), with which these results would mix"
             raise ParameterError("--out", str(path), allowed)
+    _require_short_name(path)
     nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
         what = "is no directory" if nearest.is_symlink() else "is a file"
@@ -169,12 +171,23 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     return path
 
 
+def _require_short_name(path: Path) -> None:
+    """Raise FileError if a path, or a name in it, is too long: before any work, since it just seems not to exist."""
+    for name in (path, *path.parts):
+        try:
+            os.lstat(name)
+        except OSError as error:
+            if error.errno == errno.ENAMETOOLONG:
+                raise FileError(path, "cannot be written (a name is too long)", "shorter names") from error
+
+
 def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out") -> Path:
     """Check before any work that a file, device or named pipe, given by an `option`, can be written; return the path.
 
     Raises ParameterError if it is a directory, an input or below a file, FileError if its directory cannot be written
     to.
     """
+    _require_short_name(path)
     if path.is_dir():
         raise ParameterError(option, str(path), "a file name; this is a directory")
     for taken in inputs:

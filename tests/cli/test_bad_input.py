@@ -201,6 +201,13 @@ def test_a_directory_that_nobody_can_write_to_is_refused_before_any_work(verb, r
     assert said == f"probewise {verb}: /proc/foo: /proc cannot be written to; allowed: a directory you may write to\n"
 
 
+@pytest.mark.parametrize("words", [("calibrate", "paper"), ("demo",), ("arm", "check"), ("study",)], ids=" ".join)
+@pytest.mark.parametrize("name", ["x" * 300, f"new/{'x' * 300}/new", "/".join(["x" * 200] * 30)], ids=[1, 2, 3])
+def test_a_name_that_no_folder_takes_is_refused_before_any_work(words, name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert "too long" in refused(capsys, tmp_path / "new", *words, "--out", name)
+
+
 @pytest.mark.parametrize("verb", ["predict", "audit", "calibrate"])
 def test_a_journal_is_no_recording_and_it_is_said_what_to_do_with_it(verb, tmp_path, capsys):
     journal = tmp_path / "journal.jsonl"

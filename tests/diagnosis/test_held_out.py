@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.held_out import are_of_part_alone, mean_gain_over_parts, sequential_log_densities
+from probewise.diagnosis.held_out import are_of_part_alone, mean_gain_over_parts, predictive_log_densities
 from probewise.diagnosis.light_sensor import held_out_parts
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.recordings import Recording, paper_plan
@@ -71,7 +71,7 @@ def test_a_part_held_out_of_noise_with_memory_has_its_density_given_the_rest(kin
     rest = np.linalg.inv(sigma**2 * covariance[np.ix_(~out, ~out)])
     spread = np.linalg.inv(slopes[~out].T @ rest @ slopes[~out] + np.eye(3))
     mean = spread @ slopes[~out].T @ rest @ readings[~out]
-    found = sequential_log_densities(law, out, readings, slopes, mean, spread, sigma**2)
+    found = predictive_log_densities(law, out, readings, slopes, mean, spread, sigma**2)
     kept = multivariate_normal(np.zeros(n - 12), every[np.ix_(~out, ~out)])
     assert found.sum() == pytest.approx(
         multivariate_normal(np.zeros(n), every).logpdf(readings) - kept.logpdf(readings[~out])
@@ -81,7 +81,7 @@ def test_a_part_held_out_of_noise_with_memory_has_its_density_given_the_rest(kin
         readings[out] - told @ readings[~out],
         np.diag(every[np.ix_(out, out)] - told @ every[~out][:, out]),
     )
-    alone = sequential_log_densities(law, out, readings, slopes, mean, spread, sigma**2, each_alone=True)
+    alone = predictive_log_densities(law, out, readings, slopes, mean, spread, sigma**2, sequential=False)
     np.testing.assert_allclose(alone, -0.5 * (np.log(2 * np.pi * variance) + left**2 / variance), rtol=1e-6)
 
 

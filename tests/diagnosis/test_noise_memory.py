@@ -11,7 +11,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.held_out import sequential_log_densities
+from probewise.diagnosis.held_out import predictive_log_densities
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import innovations_given_rest, walk_given_readings, with_known_wide_readings
 from probewise.diagnosis.outlying import outlier_probabilities
@@ -186,7 +186,7 @@ def test_a_held_out_reading_is_wide_or_narrow_by_prior_not_by_what_it_reads():
     known = with_known_wide_readings(law, residuals)
     out = np.arange(N) == 5
     slopes = np.zeros((N, 1))
-    own = sequential_log_densities(known, out, residuals, slopes, np.zeros(1), np.eye(1), 1.0)
+    own = predictive_log_densities(known, out, residuals, slopes, np.zeros(1), np.eye(1), 1.0)
     # The other readings are plainly narrow: the density from dense covariances, with reading 5 narrow and wide.
     rest = ~out
     parts = []

@@ -228,7 +228,8 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
         design, rest = np.concatenate([found.slopes, columns], axis=1), law.take_readings(~out)
         kept_miss = rest((found.residuals - design @ amount)[~out])
         sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
-        return predictive_log_densities(law, out, found.residuals, design, amount, covariance, sigma_2)
+        told = (law, out, found.residuals, design, amount, covariance, sigma_2)
+        return predictive_log_densities(*told, sequential=law.has_memory)
 
     def gain_per_reading(out: BoolArray) -> FloatArray:
         return log_densities(columns, out) - log_densities(columns[:, :0], out)

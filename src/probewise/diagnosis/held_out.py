@@ -90,9 +90,9 @@ def held_out_gain(
         covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
         # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
         hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)
-        sequential = bool((of_its_own | hardly_told).any())
+        sequential = not each_alone and bool(law.has_memory or (of_its_own | hardly_told).any())
         told = (law, out, recording.readings[usable] - predicted, slopes, without.z - about, covariance, sigma_2)
-        return predictive_log_densities(*told, sequential=sequential, each_alone=each_alone)
+        return predictive_log_densities(*told, sequential=sequential)
 
     def gain_per_reading(out: BoolArray) -> FloatArray:
         with np.errstate(invalid="ignore"):  # without them a model may predict no number
@@ -145,29 +145,46 @@ def predictive_log_densities(
     covariance: FloatArray,
     sigma_2: float,
     *,
-    sequential: bool = False,
-    each_alone: bool = False,
+    sequential: bool = True,
 ) -> FloatArray:
     """Return the log density of each held-out reading from a linear model of the others, (n_out,); 0 for lost ones.
 
-    Arguments as of `sequential_log_densities`, which is used if asked for, or if the noise has memory.
+    `out`: mask of the held-out readings, (n_points,); `miss`, `slopes`: residuals of all readings, (n_points,), and
+    slopes, (n_points, n_params), at one point; `mean`, `covariance`: of the coordinates about that point, from the
+    readings that are not held out. If `sequential`, each is given those held out before it too: the sum is the log of
+    the joint density. Of censored readings, densities are relative to the peak.
     """
-    if sequential or law.has_memory:
-        told = (law, out, miss, slopes, mean, covariance, sigma_2)
-        return sequential_log_densities(*told, each_alone=each_alone)
-    own, left = law.take_readings(out), (miss - slopes @ mean)[out]
-    spread = np.einsum("ij,jk,ik->i", slopes[out], covariance, slopes[out])
+    columns = np.concatenate([slopes, miss[:, None]], axis=1)
+    whitened, sd = innovations_given_rest(law, columns, out, each_alone=not sequential)
+    turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
+    noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
+    log_shares = np.log(np.maximum([1 - law.share, law.share], 1e-300))
+    widths = np.tile([1.0, law.times**2], (len(sd), 1))
+    if law.wide.size:  # variances, in units of sd^2, if each is narrow and if it is wide: it may be either
+        own = law.sd[out] ** 2
+        narrow = own * law.relative_precision[out]
+        widths = np.stack([sd**2 - own + narrow, sd**2 - own + narrow * law.times**2], axis=1) / sd[:, None] ** 2
 
-    def log_density(left: FloatArray) -> FloatArray:
-        narrow, wide = (
-            _log_normal_density(left, sigma_2 * sd**2 + spread) + math.log(max(share, 1e-300))
-            for sd, share in ((own.sd_with_rounding, 1 - law.share), (law.times * own.sd, law.share))
-        )
-        return np.asarray(np.logaddexp(narrow, wide))
+    def given(rows: slice, mean: FloatArray, gain: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return log densities, residuals, and most probable variances, (n_rows,) each; `gain` (n_rows, n_params)."""
+        left, spread = innovations[rows] - turned[rows] @ mean, np.maximum(np.sum(turned[rows] * gain, axis=1), 0.0)
+        parts = noise_2[rows, None] * widths[rows] + spread[:, None]
+        at_zero = log_shares - 0.5 * np.log(2 * np.pi * parts)
+        by_width = at_zero - 0.5 * left[:, None] ** 2 / parts
+        density = np.logaddexp(*by_width.T)
+        variance = np.sum(np.exp(by_width - density[:, None]) * parts, axis=1)
+        unit = np.where(censored[rows], np.logaddexp(*at_zero.T), np.log(sd[rows]))
+        return density - unit, left, variance
 
-    # At an end of the range it is a likelihood, relative to its peak.
-    at_end = np.where(own.is_censored, log_density(np.zeros(len(left))), 0.0)
-    return np.asarray((log_density(left) - at_end) * own.kept)
+    if not sequential:
+        return given(slice(None), mean, turned @ covariance)[0] * kept
+    mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
+    for k in np.flatnonzero(kept).tolist():
+        gain = covariance @ turned[k]
+        densities[k], left, variance = (float(own[0]) for own in given(slice(k, k + 1), mean, gain[None]))
+        mean += gain * left / variance
+        covariance -= np.outer(gain, gain) / variance
+    return densities
 
 
 def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:
@@ -177,55 +194,3 @@ def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:
     """
     here, elsewhere = (np.linalg.norm(slopes[rows], axis=0) for rows in (part, ~part))
     return np.asarray((here > 0.0) & (elsewhere <= _NO_SLOPE * here))
-
-
-def sequential_log_densities(
-    law: NoiseLaw,
-    out: BoolArray,
-    miss: FloatArray,
-    slopes: FloatArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    sigma_2: float,
-    *,
-    each_alone: bool = False,
-) -> FloatArray:
-    """Return the log density of each held-out reading given the others and those held out before it, 0 for lost ones.
-
-    `out`: mask of the held-out readings, (n_points,); `miss`, `slopes`: residuals of all readings, (n_points,), and
-    slopes, (n_points, n_params), at one point; `mean`, `covariance`: of the coordinates about that point, from the
-    readings that are not held out. Returns log densities, (n_out,), whose sum is the log of the joint density; of
-    censored readings, relative to the peak. With `each_alone`, none is given those held out before it.
-    """
-    whitened, sd = innovations_given_rest(
-        law, np.concatenate([slopes, miss[:, None]], axis=1), out, each_alone=each_alone
-    )
-    turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
-    mean, covariance, densities = mean.copy(), covariance.copy(), np.zeros(len(innovations))
-    noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
-    shares, widths = np.array([1 - law.share, law.share]), np.tile([1.0, law.times**2], (len(sd), 1))
-    if law.wide.size:  # variances, in units of sd^2, if each is narrow and if it is wide: it may be either
-        own = law.sd[out] ** 2
-        narrow = own * law.relative_precision[out]
-        widths = np.stack([sd**2 - own + narrow, sd**2 - own + narrow * law.times**2], axis=1) / sd[:, None] ** 2
-    for k in np.flatnonzero(kept):
-        row = turned[k]
-        gain = covariance @ row
-        left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
-        parts = noise_2[k] * widths[k] + spread
-        density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
-        densities[k] = np.logaddexp(*density)
-        variance = float(np.exp(density - densities[k]) @ parts)  # the most probable noise variance of this reading
-        if censored[k]:
-            densities[k] -= np.logaddexp(
-                *(_log_normal_density(np.zeros(2), parts) + np.log(np.maximum(shares, 1e-300)))
-            )
-        if each_alone:
-            continue
-        mean += gain * left / variance
-        covariance -= np.outer(gain, gain) / variance
-    return np.asarray((densities - np.where(censored, 0.0, np.log(sd))) * kept)
-
-
-def _log_normal_density(miss: FloatArray, variance: FloatArray) -> FloatArray:
-    return np.asarray(-0.5 * np.log(2 * np.pi * variance) - 0.5 * miss**2 / variance)

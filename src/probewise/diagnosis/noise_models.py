@@ -41,6 +41,8 @@ def innovations_given_rest(
     `each_alone`, none is given those asked for before it, and they are not independent.
     """
     law, there = replace(law, flat=0.0), ~law.lost[asked]
+    if not law.has_memory:
+        return law(columns)[asked], np.where(there, law.sd[asked], 1.0)
     # A whitening w of all readings has w^T w for their precision; a part of it is that of some given all others.
     own = law(np.eye(len(columns))[:, asked & ~law.lost])
     precision, told = own.T @ own, own.T @ law(columns)

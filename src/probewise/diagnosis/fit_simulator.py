@@ -17,13 +17,13 @@ from probewise.diagnosis.diagnose_simulator import notes_on_declared_noise, prep
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit, Model, fit_each_start
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem
+from probewise.diagnosis.hypothesis_problem import NUMBERS, HypothesisProblem
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.noise_models import HIDDEN, NoiseModel
 from probewise.diagnosis.outlying import note_on_improbable_rows
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node
 from probewise.diagnosis.simulator_fit import log_evidence_of, modes_of
-from probewise.diagnosis.simulator_posterior import NUMBERS, ProblemInBlocks, draw_by_importance
+from probewise.diagnosis.simulator_posterior import draw_by_importance
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
 from probewise.nested import Weighted
@@ -212,7 +212,7 @@ def fit_simulator(
     step, largest = recording.plan.instrumentation.step or 0.0, float(np.abs(recording.readings[usable]).max())
     rounding = step if fits[0].sd < HIDDEN * step else 0.0
     noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding, _ROUNDING * largest))
-    problem = ProblemInBlocks(fits[0].model, recording, noise)
+    problem = HypothesisProblem(fits[0].model, recording, noise)
     progress("sampling the posterior")
     draws, is_settled = draw_by_importance(problem, fits, law, rng=rng, progress=progress)
     n_samples = N_SAMPLES

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import cast
@@ -22,6 +23,9 @@ from probewise.diagnosis.fit import FARTHEST, Model
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.recordings.plan import Recording
+
+NUMBERS = 4_000_000
+"""Readings that are predicted at once."""
 
 _HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
 
@@ -60,6 +64,8 @@ class StandardNormal:
 class HypothesisProblem:
     """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
 
+    Predictions of many samples are made in blocks, to fit in memory.
+
     `model`, `recording`: model and data; `noise`: evidence of a fit by node of the noise model (a set of its
     parameters); the probable nodes are averaged over; `near`: a point, (n_params,), such as its best fit, onto the
     nearest order of whose Gaussians the prior is folded. Predictions do not depend on the order, nor does the evidence.
@@ -78,8 +84,19 @@ class HypothesisProblem:
             return StandardNormal(n_params)
         return FoldedNormal(n_params, cast(CalibratedSensor, sensor), self.near)
 
+    def predict(self, z: FloatArray) -> FloatArray:
+        """Return the readings of all rows, (n_samples, n_params) -> (n_samples, n_points)."""
+        return self._in_blocks(self.model.predict, z)
+
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood, averaged over the kept noise nodes: (n_samples, n_params) -> (n_samples,)."""
+        return self._in_blocks(self._log_likelihood_of_block, theta)
+
+    def _in_blocks(self, function: Callable[[FloatArray], FloatArray], z: FloatArray) -> FloatArray:
+        blocks = np.array_split(z, max(-(-len(z) * len(self.recording) // NUMBERS), 1))
+        return np.concatenate([function(block) for block in blocks])
+
+    def _log_likelihood_of_block(self, theta: FloatArray) -> FloatArray:
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         nodes, kept = self.noise.nodes, self._kept_node_indices

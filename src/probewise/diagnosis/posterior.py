@@ -22,10 +22,10 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model
-from probewise.diagnosis.hypothesis_problem import log_likelihood_marginal_over_sigma
+from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
-from probewise.diagnosis.simulator_posterior import ProblemInBlocks, draw_by_importance
+from probewise.diagnosis.simulator_posterior import draw_by_importance
 from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.progress import Progress, silent
@@ -274,7 +274,7 @@ def posterior_draws(
         linear = LinearAmplitudes.of(found, laplace.slopes, laplace.residual) or laplace
         return linear.draw(n_samples, rng=rng)
     normal = rng.standard_normal((_N_NEAR, len(found.z)))
-    problem = ProblemInBlocks(found.model, recording, noise.with_likeliest_node_alone)
+    problem = HypothesisProblem(found.model, recording, noise.with_likeliest_node_alone)
 
     def log_posterior(z: FloatArray) -> FloatArray:
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)

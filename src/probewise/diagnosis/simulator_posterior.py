@@ -8,7 +8,7 @@ shape, are a proposal that covers all of it (after Cornuet, Marin, Mira & Robert
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.fit import FARTHEST, Fit, difference_points_and_steps
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem
+from probewise.diagnosis.hypothesis_problem import NUMBERS, HypothesisProblem
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.simulator_fit import log_evidence_of
 from probewise.nested import Weighted
@@ -29,9 +29,6 @@ from probewise.nested.weights import (
     tempering_power,
 )
 from probewise.progress import Progress
-
-NUMBERS = 4_000_000
-"""Readings that are predicted at once."""
 
 # If many predictions cost little, and else: draws of a round, kernels, rounds, effective draws that suffice.
 _SIZES = {True: (2000, 150, 20, 1000.0), False: (400, 20, 4, 250.0)}
@@ -48,23 +45,6 @@ _BELOW = 8.0  # nats, and half a nat for each parameter, below the mode, at whic
 _FIRM = 9.0  # inverse square of how far, in strides, a walker is drawn back along the ridge
 _RETURNS, _PROXIMAL_STEPS = 2, 3  # Gauss-Newton steps to the ridge, of a walker after a stride, and of a kernel
 _ROUNDING = 1e-13
-
-
-@dataclass(frozen=True, eq=False)
-class ProblemInBlocks(HypothesisProblem):
-    """A hypothesis whose predictions of many samples are made in blocks, to fit in memory."""
-
-    def _in_blocks(self, function: Callable[[FloatArray], FloatArray], z: FloatArray) -> FloatArray:
-        blocks = np.array_split(z, -(-len(z) * len(self.recording) // NUMBERS))
-        return np.concatenate([function(block) for block in blocks])
-
-    def predict(self, z: FloatArray) -> FloatArray:
-        """Return the readings of all rows, (n_samples, n_params) -> (n_samples, n_points)."""
-        return self._in_blocks(self.model.predict, z)
-
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Return the log likelihood, (n_samples, n_params) -> (n_samples,)."""
-        return self._in_blocks(super().log_likelihood, theta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +81,7 @@ class _Kernels:
 
 
 def draw_by_importance(
-    problem: ProblemInBlocks,
+    problem: HypothesisProblem,
     fits: Sequence[Fit],
     law: NoiseLaw,
     *,
@@ -160,7 +140,7 @@ def draw_by_importance(
 class _Ridge:
     """The posterior of a problem, linearised at many points at once; white noise of the sd about its best fit."""
 
-    def __init__(self, problem: ProblemInBlocks, best: Fit, law: NoiseLaw) -> None:
+    def __init__(self, problem: HypothesisProblem, best: Fit, law: NoiseLaw) -> None:
         self.problem, self.law, self.best = problem, law, best
         self.free = max(law.n_kept - len(best.z), 1)
         self.degrees_of_freedom = float(np.clip(self.free, _MOST_TAILED, _LEAST_TAILED))

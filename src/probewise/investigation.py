@@ -24,7 +24,7 @@ from probewise._kinds import checked_number, checked_whole, require_accepts_posi
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.effects import VOCABULARY, EffectKind
+from probewise.effects import VOCABULARY, LightEffect
 from probewise.errors import FileError, ParameterError, did_you_mean
 from probewise.progress import Progress, silent
 from probewise.recordings import (
@@ -66,7 +66,7 @@ def investigate(
     plan: Plan,
     *,
     sensor: SensorPrior | None = None,
-    effects: Mapping[str, EffectKind] = VOCABULARY,
+    effects: Mapping[str, LightEffect] = VOCABULARY,
     budget: Budget | None = None,
     rounds: int = MOST_ROUNDS,
     hands: bool = True,

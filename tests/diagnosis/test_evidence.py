@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -20,8 +20,8 @@ from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.refits import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
-from probewise.effects import VOCABULARY, Extent
-from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Outliers, RandomWalk, SignalDependentNoise
+from probewise.effects import VOCABULARY, Extent, NoiseEffect
+from probewise.effects.noise import correlated_noise, drifting_noise, outliers, random_walk, signal_dependent_noise
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.systems import Simulator, table_for
 
@@ -53,29 +53,12 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
 N = 2000
 
 
-@dataclass(frozen=True)
-class _DenseWalk(RandomWalk):
-    n_nodes = 400
-
-
-@dataclass(frozen=True)
-class _DenseCorrelation(CorrelatedNoise):
-    n_nodes = 400
-
-
-@dataclass(frozen=True)
-class _DenseDrift(DriftingNoise):
-    n_nodes = 400
-
-
-@dataclass(frozen=True)
-class _DenseSignal(SignalDependentNoise):
-    n_nodes = 400
-
-
-@dataclass(frozen=True)
-class _DenseOutliers(Outliers):
-    nodes_per_parameter = (30, 30)
+def _dense(effect: NoiseEffect) -> NoiseEffect:
+    """Return the effect with 400 nodes of its one parameter, or 30 of each of two."""
+    n = (400,) if len(effect.prior.names) == 1 else (30, 30)
+    axes = np.meshgrid(*((np.arange(k) + 0.5) / k for k in n))
+    nodes = effect.prior.from_unit_cube(np.stack(axes, axis=-1).reshape(-1, len(n)))
+    return replace(effect, entries=nodes[:, None, :], nodes_per_parameter=n)
 
 
 def _correlated(noise: np.ndarray, rho: float) -> np.ndarray:
@@ -102,20 +85,20 @@ WIDE = np.where(RNG.random(N) < 0.05, 20.0, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("effect", "dense", "noise"),
+    ("effect", "noise"),
     [
-        (RandomWalk(), _DenseWalk(), WHITE + np.cumsum(0.9 * RNG.normal(size=N))),
-        (CorrelatedNoise(), _DenseCorrelation(), _correlated(WHITE, 0.93)),
-        (DriftingNoise(), _DenseDrift(), WHITE * 1.2 ** (np.arange(N) / N)),
-        (SignalDependentNoise(), _DenseSignal(), WHITE * np.sqrt(1 + 4 * np.arange(N) / N)),
-        (Outliers(), _DenseOutliers(), WHITE * WIDE),
+        (random_walk(), WHITE + np.cumsum(0.9 * RNG.normal(size=N))),
+        (correlated_noise(), _correlated(WHITE, 0.93)),
+        (drifting_noise(), WHITE * 1.2 ** (np.arange(N) / N)),
+        (signal_dependent_noise(), WHITE * np.sqrt(1 + 4 * np.arange(N) / N)),
+        (outliers(), WHITE * WIDE),
     ],
     ids=lambda value: value.name if hasattr(value, "name") else "",
 )
-def test_refined_nodes_are_as_good_as_dense_ones(effect, dense, noise):
+def test_refined_nodes_are_as_good_as_dense_ones(effect, noise):
     """Evidence to a tenth of a nat, mean and sd of each parameter to a fifth of the sd, and a node at the peak."""
     found, recording = _found_with(noise)
-    wanted = laplace_evidence(found, NoiseModel((dense,), recording))
+    wanted = laplace_evidence(found, NoiseModel((_dense(effect),), recording))
     own = refined(found, laplace_evidence(found, NoiseModel((effect,), recording)))
     assert own.log_z == pytest.approx(wanted.log_z, abs=0.1)
     means, sds = zip(*(_mean_and_sd(e) for e in (own, wanted)), strict=True)
@@ -133,7 +116,7 @@ def _mean_and_sd(evidence):
 
 def test_nodes_that_are_close_enough_stay_as_they_are():
     found, recording = _found_with(WHITE[:100])
-    for effect in (RandomWalk(), CorrelatedNoise(), DriftingNoise(), SignalDependentNoise(), Outliers()):
+    for effect in (random_walk(), correlated_noise(), drifting_noise(), signal_dependent_noise(), outliers()):
         evidence = laplace_evidence(found, NoiseModel((effect,), recording))
         assert refined(found, evidence) is evidence
 
@@ -142,11 +125,11 @@ def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
     """AR(1) of correlation .75 whose innovations are sometimes wide: every third node of it was 20 nats too low."""
     n = 300
     found, recording = _found_with(_correlated(WHITE[:n] * WIDE[:n], 0.75))
-    effects = {"outliers": Outliers(), "correlated_noise": CorrelatedNoise()}
+    effects = {"outliers": outliers(), "correlated_noise": correlated_noise()}
     noises = NoiseModels(recording, effects, PriorOdds())
     assert noises.add_significant_pairs(found, noises.evidence_by_noise(found))
     own = noises.evidence_by_noise(found)["correlated_noise", "outliers"]
-    every = laplace_evidence(found, NoiseModel((CorrelatedNoise(), Outliers()), recording))
+    every = laplace_evidence(found, NoiseModel((correlated_noise(), outliers()), recording))
     assert own.log_z > every.log_z - 1.0
     assert _mean_and_sd(own)[0][0] == pytest.approx(0.75, abs=0.05)
 
@@ -156,7 +139,7 @@ def test_a_fit_at_the_edge_of_its_formula_is_impossible_under_any_noise():
     found, recording = _found_with(WHITE[:100])
     slopes = found.slopes.copy()
     slopes[7, 0] = np.nan
-    for effects in ((), (RandomWalk(),), (Outliers(),), (Outliers(), RandomWalk())):
+    for effects in ((), (random_walk(),), (outliers(),), (outliers(), random_walk())):
         evidence = laplace_evidence(replace(found, slopes=slopes), NoiseModel(effects, recording))
         assert evidence.log_z == -np.inf
         assert refined(found, evidence) is evidence

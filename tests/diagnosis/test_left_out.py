@@ -19,7 +19,7 @@ from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent
-from probewise.effects.noise import CorrelatedNoise, Dropouts
+from probewise.effects.noise import correlated_noise, dropouts
 from probewise.errors import ParameterError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, table_for
 
@@ -162,8 +162,8 @@ def _coordinates_of(system, theta):
 def test_readings_at_an_end_are_no_lost_readings():
     """Once 7 % of such readings were dropouts of probability .99."""
     prepared, found, law = _fitted(LAMP, _lamp())
-    dropouts = Dropouts.for_extent(Extent.of(prepared.recording))
-    white, lost = (laplace_evidence(found, NoiseModel(own, prepared.recording)) for own in ((), (dropouts,)))
+    effect = dropouts.for_extent(Extent.of(prepared.recording))
+    white, lost = (laplace_evidence(found, NoiseModel(own, prepared.recording)) for own in ((), (effect,)))
     assert law.n_kept < len(found.residuals)
     assert not lost.nodes.laws or lost.log_z < white.log_z
 
@@ -174,8 +174,8 @@ def test_a_lost_reading_that_is_at_an_end_is_still_found_lost():
     lux[far] = HIGH
     prepared, found, _ = _fitted(LAMP, table.with_columns({"lux": lux}))
     found = fit(found.model, prepared.recording, _coordinates_of(prepared.null, TRUE_LIMITED), _without(prepared, far))
-    dropouts = Dropouts.for_extent(Extent.of(prepared.recording))
-    white, lost = (laplace_evidence(found, NoiseModel(own, prepared.recording)) for own in ((), (dropouts,)))
+    effect = dropouts.for_extent(Extent.of(prepared.recording))
+    white, lost = (laplace_evidence(found, NoiseModel(own, prepared.recording)) for own in ((), (effect,)))
     assert lost.log_z > white.log_z + 10
 
 
@@ -233,7 +233,7 @@ def test_a_reading_half_a_step_beyond_an_end_is_at_it_and_a_farther_one_is_an_er
 
 def test_the_noise_of_a_reading_at_an_end_is_correlated_with_none():
     prepared, found, _ = _fitted(LAMP, _lamp())
-    effect = CorrelatedNoise.for_extent(Extent.of(prepared.recording))
+    effect = correlated_noise.for_extent(Extent.of(prepared.recording))
     (law,) = NoiseModel((effect,), prepared.recording).laws_at(np.array([[0.5]]), found.predicted)
     at_end = np.flatnonzero(law.censored)
     assert at_end.size > 5

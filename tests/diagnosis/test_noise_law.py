@@ -18,7 +18,7 @@ from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise
 from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value
 from probewise.effects import Extent
-from probewise.effects.noise import CorrelatedNoise, DriftingNoise, Dropouts, Outliers, SignalDependentNoise
+from probewise.effects.noise import correlated_noise, drifting_noise, dropouts, outliers, signal_dependent_noise
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -101,8 +101,8 @@ def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "effect",
-    [None, CorrelatedNoise(), SignalDependentNoise(), DriftingNoise(), Outliers()],
-    ids=lambda e: type(e).__name__,
+    [None, correlated_noise(), signal_dependent_noise(), drifting_noise(), outliers()],
+    ids=lambda e: e and e.name,
 )
 def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
     """Route two: a grid over both, for each node. A floor of the scale that is below it plays no part."""
@@ -134,12 +134,12 @@ def test_readings_lost_to_one_value_are_no_wide_ones():
     noise[lost] = -MEAN[lost]
     found, recording = found_with(noise)
     log_z = {
-        type(e).__name__: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
-        for e in (Dropouts(), Outliers())
+        e.name: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
+        for e in (dropouts(), outliers())
     }
     plain = laplace_evidence(found, NoiseModel((), recording, least_sd=1e-6)).log_z
-    assert log_z["Dropouts"] > log_z["Outliers"] + 3 > plain + 50
-    law = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6)).likeliest_law
+    assert log_z["dropouts"] > log_z["outliers"] + 3 > plain + 50
+    law = laplace_evidence(found, NoiseModel((dropouts(),), recording, least_sd=1e-6)).likeliest_law
     np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
 
 
@@ -151,15 +151,14 @@ def test_one_reading_at_an_end_of_the_declared_range_is_lost(value, lost):
     at = int(np.argmax(np.abs(MEAN - value)))
     noise[at] = value - MEAN[at]
     found, recording = found_with(noise)
-    dropouts = Dropouts.for_extent(Extent.of(recording))
+    losing = dropouts.for_extent(Extent.of(recording))
     log_z = {
-        type(e).__name__: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
-        for e in (dropouts, Outliers())
+        e.name: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z for e in (losing, outliers())
     }
     if lost:
-        assert log_z["Dropouts"] > log_z["Outliers"] + 3
+        assert log_z["dropouts"] > log_z["outliers"] + 3
     else:
-        assert log_z["Dropouts"] == -math.inf
+        assert log_z["dropouts"] == -math.inf
 
 
 def test_the_prior_of_what_is_lost_to_sums_to_one():
@@ -184,7 +183,7 @@ def test_lost_readings_are_found_where_every_reading_has_a_declared_sd_of_its_ow
     lost = [10, 21, 33, 160, 291]
     readings[lost] = 12.1
     recording = OfDeclaredSds(PLAN, readings)
-    model = NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
+    model = NoiseModel((dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
     nodes = model.nodes_for_predictions(predicted)
     np.testing.assert_array_equal(nodes.settings[:, 1], 12.1)  # to the last digit
     np.testing.assert_array_equal(np.flatnonzero(nodes.laws[0].lost), lost)
@@ -192,7 +191,7 @@ def test_lost_readings_are_found_where_every_reading_has_a_declared_sd_of_its_ow
 
 def test_where_nothing_is_lost_there_is_no_such_law():
     found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
-    evidence = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
+    evidence = laplace_evidence(found, NoiseModel((dropouts(),), recording, least_sd=1e-6))
     assert evidence.log_z == -math.inf
     assert evidence.nodes.laws == ()
 

@@ -20,7 +20,7 @@ from probewise.diagnosis.noise_law import (
 )
 from probewise.diagnosis.noise_models import NoiseModel, rough_sd
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
-from probewise.effects.noise import CorrelatedNoise, NoisePerRun, RandomWalk
+from probewise.effects.noise import correlated_noise, noise_of_runs, random_walk
 from probewise.effects.noise_distribution import FittedReadings, reading_variance
 from probewise.sensor import NoiseParameters
 from probewise.systems import RunTable, Simulator, as_recording
@@ -43,9 +43,7 @@ def test_a_walk_is_whitened_as_the_root_of_its_covariance_does():
 
 def test_draws_of_a_walk_scatter_as_it_says():
     level = replace(
-        RandomWalk(n_before=0).apply(
-            NoiseParameters(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)
-        ),
+        random_walk().apply(NoiseParameters(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)),
     )
     white, steps = np.random.default_rng(3).standard_normal((2, 2000, 50))
     draws = level.sd * (white + level.walk * np.cumsum(steps, axis=1))
@@ -58,7 +56,7 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
     counts = (30, 40, 20)
     run = np.repeat([0, 1, 2], counts)
     residuals = rng.standard_normal(90) * np.array([1.0, 2.0, 0.7])[run]
-    effect = NoisePerRun(("a", "b", "c"), counts)
+    effect = noise_of_runs(("a", "b", "c"), counts)
     nodes, log_weights = effect.weighed_nodes(residuals, FittedReadings(0 * residuals, 1.0, run))
 
     def log_z(values):
@@ -106,7 +104,7 @@ def _recording(rows=None):
 
 
 def _law(recording, node=20):
-    nodes = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(
+    nodes = NoiseModel((correlated_noise(),), recording).nodes_for_predictions(
         np.full(int(recording.usable.sum()), 10.0)
     )
     return nodes.settings[node, 0], nodes.laws[node]

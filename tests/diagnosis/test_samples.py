@@ -18,7 +18,7 @@ from probewise.diagnosis.samples import ModelSamples, sample_model, weights_besi
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.sensors import CalibratedSensor, default_sensor, with_free_form
 from probewise.effects import EFFECTS, Extent
-from probewise.effects.noise import DriftingNoise
+from probewise.effects.noise import drifting_noise
 from probewise.recordings import Recording, Uniform, two_way_plan
 from probewise.systems import RunTable, Simulator
 
@@ -57,7 +57,7 @@ def test_a_model_does_not_hold_noise_that_changes_in_time():
     recording = Recording(PLAN, predicted + 0.3 * 4.0 ** (elapsed - 0.5) * rng.standard_normal(len(PLAN)))
     found = fit(Model(sensor, (), PLAN), recording, z, white_noise(len(PLAN), least=1e-3))
     plain, drifting = (
-        laplace_evidence(found, NoiseModel(effects, recording, least_sd=1e-3)) for effects in ((), (DriftingNoise(),))
+        laplace_evidence(found, NoiseModel(effects, recording, least_sd=1e-3)) for effects in ((), (drifting_noise(),))
     )
     assert drifting.log_z > plain.log_z + 10
     samples = sample_model(found, drifting, recording, weights={}, rng=rng, annealed=False)

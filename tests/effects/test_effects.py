@@ -12,7 +12,7 @@ import pytest
 from probewise.diagnosis.findings import parameters_found
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
-from probewise.effects.noise import Dropouts
+from probewise.effects.noise import dropouts
 from probewise.effects.optics import distinct_scan_lines
 from probewise.effects.reference import Origin, orientation_deg, sign_of_motion
 from probewise.errors import ParameterError
@@ -617,9 +617,11 @@ def test_what_all_samples_have_in_common_is_written_as_it_is():
     mean, sd = mean_and_sd_of_samples(samples)
     assert (mean[1], sd[1]) == (0.1, 0.0)
     assert (mean[0], sd[0]) == (samples.mean(axis=0)[0], samples.std(axis=0)[0])
-    said = sentence_from_samples(Dropouts(unit="V"), samples)
+    in_volts = replace(PLAN, instrumentation=replace(PLAN.instrumentation, unit="V"))
+    lost = dropouts.for_extent(replace(EXTENT, plan=in_volts))
+    said = sentence_from_samples(lost, samples)
     assert said == "readings are lost: 3.00 ± 0.58 % of them read 0.1 V, whatever the true value"
-    (share, value) = parameters_found(Dropouts(unit="V"), samples, "V")
+    (share, value) = parameters_found(lost, samples, "V")
     assert (value.mean, value.sd) == (0.1, 0.0)
     assert share.sd == pytest.approx(sd[0])
 

@@ -10,14 +10,14 @@ from scipy.stats import norm
 
 from probewise.effects import Extent
 from probewise.effects.noise import (
-    CorrelatedNoise,
-    Dropouts,
-    Outliers,
-    Quantisation,
-    RandomWalk,
-    SignalDependentNoise,
+    correlated_noise,
+    dropouts,
     lattice_step,
+    outliers,
+    quantisation,
+    random_walk,
     sd_of_estimated_lattice_step,
+    signal_dependent_noise,
 )
 from probewise.effects.noise_distribution import PredictiveMixture, log_density
 from probewise.recordings import paper_plan
@@ -31,11 +31,11 @@ CHAIN = Chain(
     FixedMixture([1.0], [[0.5, 1.5]], [[[16.0, 1.0], [1.0, 9.0]]]), FixedLevels(10, 60), KnownScene(PLAN.patterns)
 )
 NOISES = {
-    "correlated_noise": (CorrelatedNoise(), [0.5]),
-    "signal_dependent_noise": (SignalDependentNoise(), [4.0]),
-    "outliers": (Outliers(), [0.05, 8.0]),
-    "dropouts": (Dropouts(), [0.03, 12.5]),
-    "quantisation": (Quantisation(), [0.9]),
+    "correlated_noise": (correlated_noise(), [0.5]),
+    "signal_dependent_noise": (signal_dependent_noise(), [4.0]),
+    "outliers": (outliers(), [0.05, 8.0]),
+    "dropouts": (dropouts(), [0.03, 12.5]),
+    "quantisation": (quantisation(), [0.9]),
 }
 
 
@@ -117,7 +117,7 @@ def test_the_error_of_a_step_does_not_depend_on_the_unit(unit):
 
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e9])
 def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
-    lost = Dropouts.for_extent(Extent(10.0 * unit, 60.0 * unit, PLAN))
+    lost = dropouts.for_extent(Extent(10.0 * unit, 60.0 * unit, PLAN))
     values = lost.bank()[:, 0, 1]
     assert np.isfinite(lost.prior.log_prob(lost.bank()[:, 0])).all()
     np.testing.assert_allclose(np.unique(values), [9.50510 * unit, 60.49490 * unit])
@@ -125,11 +125,11 @@ def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
 
 def test_a_declared_lattice_is_no_effect():
     declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))
-    assert Quantisation.for_extent(Extent(10.0, 60.0, declared)) is None
+    assert quantisation.for_extent(Extent(10.0, 60.0, declared)) is None
 
 
 def test_a_random_walk_is_scored_at_the_rows_that_have_a_reading():
-    walk = RandomWalk().apply(
+    walk = random_walk().apply(
         NoiseParameters(np.full((4, 1), SD), np.zeros((1, 1))), np.full((4, 1), 0.5), PLAN.take(slice(3))
     )
     predicted, readings = np.zeros((4, 3)), np.array([0.1, np.nan, -0.2])

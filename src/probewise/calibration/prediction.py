@@ -91,14 +91,14 @@ def predict(
     there = chain.plan_at_calibrated_height(plan)  # once, so that the chain lays out the scene once for all blocks
     for effect in sensor.effects_on_new_scans:
         kind = EFFECTS[effect.name]
-        for column in {*getattr(kind, "reads", ())} - {*plan.covariates}:
+        for column in {*kind.reads} - {*plan.covariates}:
             warnings.warn(
                 f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
                 DoubtfulResultWarning,
                 stacklevel=2,
             )
         from_s = sensor.origins.get(effect.name, Origin()).time_s
-        if getattr(kind, "counts", "") == "time" and (plan.time_s < from_s).all():
+        if kind.counts == "time" and (plan.time_s < from_s).all():
             warnings.warn(
                 f"the plan's times, up to {plan.time_s.max():.12g} s, lie before {from_s:.12g} s, "
                 f"from which {effect.name} counts: is it another clock?",

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from probewise._version import __version__
 from probewise.calibration.fields import QuantitySummary, posterior_mean_ssf_field, ssf_quantities
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
-from probewise.effects import EFFECTS, OTHER_FORMS, Extent, LightEffect, Origin
+from probewise.effects import EFFECTS, OTHER_FORMS, Extent, Origin
 from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
 from probewise.effects.reference import ZERO
 from probewise.errors import FileError, ParameterError, ProbewiseError, printable, shown
@@ -175,7 +175,7 @@ class FittedSensor(NamedSamples):
         if name in self.patterns:
             return edge_shadow_of_patterns(edge_shadow, Extent.usual(ZERO), self.patterns[name])
         kind = OTHER_FORMS[name, self.forms[name]] if name in self.forms else EFFECTS[name]
-        return kind(self.origins.get(name, ZERO)) if isinstance(kind, LightEffect) else kind()
+        return kind(self.origins.get(name, ZERO))
 
     @property
     def samples_for_new_scans(self) -> FloatArray:
@@ -328,7 +328,7 @@ class FittedSensor(NamedSamples):
         return json.dumps(document, allow_nan=False) + "\n"
 
     def _noise_in_words(self) -> str:
-        known = [name.replace("_", " ") for name in self.effects if cast(Stage, EFFECTS[name].stage) == Stage.NOISE]
+        known = [name.replace("_", " ") for name in self.effects if EFFECTS[name].stage is Stage.NOISE]
         plain = "Gaussian, one sd pooled over scans; one value per sample"
         return f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}"
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
@@ -33,7 +33,7 @@ from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit, effects_out_of_vocabulary
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.effects import NamedEffect, name_of_first_copy
+from probewise.effects import Effect, name_of_first_copy
 from probewise.recordings.plan import Plan, Recording
 
 COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_READINGS])
@@ -42,7 +42,7 @@ COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_READINGS])
 _FREE = 1e-6  # prior precision of a rival's amounts, in changes of one noise sd: they are free
 
 
-EffectEntry: TypeAlias = tuple[NamedEffect[Any], FloatArray]
+EffectEntry: TypeAlias = tuple[Effect, FloatArray]
 """An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
 
@@ -186,7 +186,7 @@ def pairs_with_separating_scans(
     further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
     before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
 
-    def columns_of(effect: NamedEffect[Any], settings: FloatArray) -> _Columns:
+    def columns_of(effect: Effect, settings: FloatArray) -> _Columns:
         with_effect = found.model.with_effect(effect)
         values = with_effect.z_of_last_effect(settings)
         points = np.concatenate([np.repeat(found.z[None, :], len(values), axis=0), values], axis=1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.held_out import Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.effects import NamedEffect
+from probewise.effects import Effect
 from probewise.recordings.plan import Plan, Recording
 
 MOST_READINGS = 102
@@ -124,15 +123,15 @@ class Apparatus(ABC):
         return False
 
     @abstractmethod
-    def effects(self, recording: Recording, null: Null | None) -> Mapping[str, NamedEffect[Any]]:
+    def effects(self, recording: Recording, null: Null | None) -> Mapping[str, Effect]:
         """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
 
-    def proposed_formulas(self) -> Mapping[str, NamedEffect[Any]]:
+    def proposed_formulas(self) -> Mapping[str, Effect]:
         """Return formulas for effects out of vocabulary, by name, which begins with `effects.PROPOSAL`."""
         return {}
 
     @abstractmethod
-    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+    def user_effect_names(self, effects: Mapping[str, Effect]) -> frozenset[str]:
         """Return the names of the user's own effects, which are always tried."""
 
     def refit_budget_share_spent(self) -> float:
@@ -143,7 +142,7 @@ class Apparatus(ABC):
         """Return whether at least this share of the budget is spent; if so, record that the search was cut short."""
         return False
 
-    def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
+    def prior_odds(self, effects: Mapping[str, Effect]) -> PriorOdds:
         """Return the prior probabilities of combinations of these effects, of an unknown effect, and of none."""
         return PriorOdds.for_effects(effects)
 
@@ -166,7 +165,7 @@ class Apparatus(ABC):
 
     def covariate_of_effect(
         self,
-        effect: NamedEffect[Any],
+        effect: Effect,
         change: FloatArray,
         without: FloatArray,
         plan: Plan,

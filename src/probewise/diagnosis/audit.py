@@ -46,8 +46,8 @@ from probewise.diagnosis.sensors import (
 from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
 from probewise.diagnosis.templates import templates_of_effect
 from probewise.diagnosis.words import substitute_reading_unit
-from probewise.effects import NUISANCES, VOCABULARY, EffectKind, Extent, NamedEffect, name_of_first_copy
-from probewise.effects.noise import NoisePerRun
+from probewise.effects import NUISANCES, VOCABULARY, Effect, Extent, LightEffect, name_of_first_copy
+from probewise.effects.noise import noise_of_runs, noise_per_run
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
@@ -75,7 +75,7 @@ class PlanTemplates:
     columns: FloatArray
     entry: IntArray
     owner: IntArray
-    built: Mapping[str, NamedEffect[Any]]
+    built: Mapping[str, Effect]
     settings: tuple[FloatArray, ...]
 
     @classmethod
@@ -85,7 +85,7 @@ class PlanTemplates:
         z: FloatArray,
         sd: float,
         plan: Plan,
-        built: Mapping[str, NamedEffect[Any]],
+        built: Mapping[str, Effect],
         *,
         most: int | None = None,
     ) -> Self:
@@ -185,7 +185,7 @@ class ProjectedTemplates:
             out[name] = (shares[name], {other: like[other] for other in visible if other != name})
         return out
 
-    def smallest_detectable_amplitudes(self, effect: NamedEffect[Any]) -> dict[int, float | None]:
+    def smallest_detectable_amplitudes(self, effect: Effect) -> dict[int, float | None]:
         """Return each amplitude's value at which an effect has lambda 8, median over settings; None if it has none."""
         at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
         columns = np.flatnonzero(np.isin(self.laid.entry, at))
@@ -342,7 +342,7 @@ def audit_plan(
     *,
     sensor: SensorPrior | None = None,
     noise_sd: float | None = None,
-    effects: Mapping[str, EffectKind] = VOCABULARY,
+    effects: Mapping[str, LightEffect] = VOCABULARY,
     progress: Progress = silent,
 ) -> PlanAudit:
     """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
@@ -421,7 +421,7 @@ def audit_plan_of_diagnosis(
     diagnosis: Diagnosis,
     *,
     sensor: SensorPrior | None = None,
-    effects: Mapping[str, EffectKind] = VOCABULARY,
+    effects: Mapping[str, LightEffect] = VOCABULARY,
 ) -> PlanAudit:
     """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
 
@@ -455,7 +455,7 @@ def _templates_of_sensor(
     z: FloatArray,
     sd: float,
     levels: tuple[float, float],
-    kinds: Mapping[str, EffectKind],
+    kinds: Mapping[str, LightEffect],
     plan: Plan,
     *,
     most: int | None = None,
@@ -467,7 +467,7 @@ def _templates_of_sensor(
 
 
 def _expected_templates_and_description(
-    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None, effects: Mapping[str, EffectKind]
+    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None, effects: Mapping[str, LightEffect]
 ) -> tuple[Callable[..., PlanTemplates], str]:
     """Return a function of a plan, the templates about the expected sensor, and that in words with its noise sd."""
     if sensor is not None:
@@ -672,13 +672,12 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     system = with_converged_step(system, own, system.theta(z[None, :]), tolerance=STANDS_STILL * sd)
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in bind_forms(about).items() if name_of_first_copy(name) is None}
-    kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
-    on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds}
-    if len(own.scan_names) > 1:
-        on_noise[NoisePerRun.name] = NoisePerRun(own.scan_names)
-    else:
-        del on_noise[NoisePerRun.name]
-    built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
+    on_noise = {
+        kind.name: noise_of_runs(own.scan_names) if kind is noise_per_run else kind()
+        for kind in ON_NOISE
+        if kind not in NUISANCES.values() and (kind is not noise_per_run or len(own.scan_names) > 1)
+    }
+    built = cast(dict[str, Effect], {**forms, **on_noise})
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
     laid = PlanTemplates.of(cast(Null, system), z, sd, cast(Plan, own), built, most=_SETTINGS_OF_TABLE)
@@ -758,7 +757,7 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
         out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
         out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}
         out |= {f"periodic_error:{column}": "the column has too few values"}
-    out |= {"clock_drift": timeless, NoisePerRun.name: one_run}
+    out |= {"clock_drift": timeless, noise_per_run.name: one_run}
     for name in own.parameters:
         out |= {f"drifts:{name}": timeless, f"steps:{name}": nothing}
         if name not in own.per_run:

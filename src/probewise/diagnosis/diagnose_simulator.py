@@ -26,7 +26,7 @@ from probewise.diagnosis.prepared import MOST_READINGS, Prepared, positions_in_s
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.simulator_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
-from probewise.effects import NamedEffect
+from probewise.effects import Effect
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
@@ -416,7 +416,7 @@ def finer_step_for_repair(diagnosis: Diagnosis) -> tuple[float, bool] | None:
     """
     system = cast(SimulatorApparatus, diagnosis.apparatus).system
     model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
-    effects = cast(Sequence[NamedEffect[Any]], model.chain.effects)
+    effects = cast(Sequence[Effect], model.chain.effects)
     if system.simulator.law is None or not effects:
         return None
     tolerance = STANDS_STILL * float(np.median(model.noise_sd))

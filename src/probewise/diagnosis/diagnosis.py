@@ -28,7 +28,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.thorough import Weighing
 from probewise.diagnosis.verdict import N_DRAWS, GlobalTest, Hypothesis, Judged, Verdict
 from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, join_lists, join_names, p_in_words
-from probewise.effects import NamedEffect, is_out_of_vocabulary, name_without_copy_suffix
+from probewise.effects import Effect, is_out_of_vocabulary, name_without_copy_suffix
 from probewise.effects.effect import sentence_from_samples
 from probewise.recordings.patterns import Polygon
 from probewise.recordings.plan import Recording
@@ -125,7 +125,7 @@ class Repair:
     def unstated_effects(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
         """List the repaired model's effects that are not `stated`: name, share of the samples with it, sentence."""
         out = []
-        for effect in cast(Sequence[NamedEffect[Any]], self.model.chain.effects):
+        for effect in cast(Sequence[Effect], self.model.chain.effects):
             values = self.model.effect_samples(effect.name)
             marks = self.model.absent.get(effect.name)
             held = values if marks is None else values[~marks]

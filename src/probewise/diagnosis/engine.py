@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -38,7 +38,7 @@ from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreemen
 from probewise.diagnosis.sensors import SensorPrior
 from probewise.diagnosis.verdict import Judged, judge, run_global_test
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.effects import EFFECTS, VOCABULARY, EffectKind, Extent, NamedEffect
+from probewise.effects import EFFECTS, VOCABULARY, Effect, Extent, LightEffect
 from probewise.effects.effect import require_effect_kinds, sentence_from_samples
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
@@ -55,7 +55,7 @@ def diagnose(
     *,
     sensor: SensorPrior | None = None,
     null: Null | None = None,
-    effects: Mapping[str, EffectKind] = VOCABULARY,
+    effects: Mapping[str, LightEffect] = VOCABULARY,
     thorough: Thorough | None = None,
     hands: bool = True,
     rng: np.random.Generator,
@@ -238,7 +238,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     require_rng(rng)
     names = checked_texts("names", names, "names of effects")
     extent = Extent.of(recording)
-    effects: dict[str, NamedEffect[Any]] = {}
+    effects: dict[str, Effect] = {}
     for name in names:
         require_one_of("names", name, list(EFFECTS))
         effect = EFFECTS[name].for_extent(extent)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.templates import TemplateCache, log_bayes_factors_by_label, log_mean_exp
 from probewise.diagnosis.verdict import N_DRAWS, Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit
-from probewise.effects import NamedEffect, NoiseEffect, is_out_of_vocabulary
+from probewise.effects import Effect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
-from probewise.effects.noise import Dropouts
 
 _LEAST_PROBABILITY = 1e-3
 _IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
@@ -128,8 +127,8 @@ def effects_found(
 
 
 def _samples_of_insignificant(
-    searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
-) -> tuple[NamedEffect[Any], FloatArray, float]:
+    searched: Searched, effect: Effect, *, rng: np.random.Generator
+) -> tuple[Effect, FloatArray, float]:
     """Draw parameters of an effect that no refit contains: amplitudes by the linearised null, others from the prior."""
     null, misfit_templates = searched.null, searched.misfit_templates
     best = max(null.evidence.values(), key=lambda e: e.log_z)
@@ -163,10 +162,10 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     law = holder.evidence[noise].likeliest_law
     found, prepared = holder.found, searched.prepared
     effect = prepared.effects[name]
-    if name in prepared.noise_effect_names and cast(NoiseEffect, effect).changes_the_mean:
+    if isinstance(effect, NoiseEffect) and effect.change_of_readings is not None:
         everywhere = found.model.predict(found.z[None, :])[0]
-        return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
-    if isinstance(effect, Dropouts) and effect.lost:
+        return float(np.linalg.norm(effect.change_of_readings(everywhere))) / found.sd
+    if isinstance(effect, NoiseEffect) and effect.distance:
         return effect.distance
     if name in searched.certain:
         own = holder.evidence[noise]
@@ -222,13 +221,12 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
     return NoiseFound("+".join(best.noise) or "white", p_value, tuple(parameters), tuple(nuisances))
 
 
-def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
+def parameters_found(effect: Effect, values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
     """Summarise an effect's parameter samples, (n_samples, n_params), without fixed ones; `unit` is a reading's."""
-    fixed = getattr(effect, "fixed", ())
     return tuple(
         _parameter_found(name, substitute_reading_unit(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
-        if name not in fixed
+        if name not in effect.fixed
     )
 
 
@@ -344,15 +342,14 @@ def formula_of(searched: Searched, judged: Judged, best: BestRepair, samples: Mo
         return None
     unit, gain = searched.prepared.recording.plan.instrumentation.unit, best.improvement
     for effect in best.fit.found.model.effects:
-        if getattr(effect, "expression", "") and is_out_of_vocabulary(effect.name):
+        if effect.expression and is_out_of_vocabulary(effect.name):
             values = samples.effect_samples(effect.name)
             return _formula_from_samples(effect, values, unit, gain.log_evidence, gain.heldout_log_density_per_reading)
     return None
 
 
 def _formula_from_samples(
-    effect: NamedEffect[Any], values: FloatArray, unit: str, log_evidence: float, per_reading: float
+    effect: Effect, values: FloatArray, unit: str, log_evidence: float, per_reading: float
 ) -> Formula:
     _, side, target, _ = effect.name.split(":", 3)
-    expression = str(getattr(effect, "expression", ""))
-    return Formula(expression, side, target, parameters_found(effect, values, unit), log_evidence, per_reading)
+    return Formula(effect.expression, side, target, parameters_found(effect, values, unit), log_evidence, per_reading)

@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
-from probewise.effects import NamedEffect
+from probewise.effects import Effect
 from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, AnyEffect
@@ -113,7 +113,7 @@ class Null(Protocol):
     def least_readings(self) -> int:
         """Fewest usable readings for a verdict."""
 
-    def admits(self, effect: NamedEffect[Any]) -> bool:
+    def admits(self, effect: Effect) -> bool:
         """Return whether this model has the stage at which an effect acts."""
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -126,7 +126,7 @@ class Null(Protocol):
         """
         return None
 
-    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Predictor:
+    def chain(self, plan: Plan, effects: Sequence[Effect], *, n_nodes: int) -> Predictor:
         """Build the model of a plan's readings, with effects; `n_nodes` for curved edges, as in `sensor.Chain`."""
 
 
@@ -135,12 +135,12 @@ def log_multiplicity(null: Null) -> float:
     return math.lgamma(null.n_gaussians + 1) if null.has_exchangeable_gaussians else 0.0
 
 
-def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
+def effect_values(effect: Effect, z: FloatArray) -> FloatArray:
     """Map standard-normal coordinates to values of the effect's own parameters, (n_samples, n_params) both."""
     return effect.prior.from_unit_cube(ndtr(z))
 
 
-def effect_coordinates(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
+def effect_coordinates(effect: Effect, values: FloatArray) -> FloatArray:
     """Invert `effect_values`, with coordinates clipped to 5.5 on either side of 0."""
     return np.clip(ndtri(effect.prior.to_unit_cube(values)), -FARTHEST + 0.5, FARTHEST - 0.5)
 
@@ -180,7 +180,7 @@ class Model:
     """
 
     sensor: Null
-    effects: tuple[NamedEffect[Any], ...]
+    effects: tuple[Effect, ...]
     plan: Plan
 
     @cached_property
@@ -235,7 +235,7 @@ class Model:
             points, steps = points[[0, *(1 + by)]], steps[by]
         return _prediction_and_slopes(self.predict(points, plan), steps)
 
-    def with_effect(self, effect: NamedEffect[Any]) -> Model:
+    def with_effect(self, effect: Effect) -> Model:
         """Return the model with one more effect, the last."""
         return Model(self.sensor, (*self.effects, effect), self.plan)
 

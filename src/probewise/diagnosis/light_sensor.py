@@ -11,7 +11,6 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -22,7 +21,7 @@ from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prepared import join_plans, last_known_value
-from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, EffectKind, Extent, LightEffect, NamedEffect
+from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Effect, Extent, LightEffect
 from probewise.effects.reference import median_gap_s, orientation_deg, sign_of_motion
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan, Recording
@@ -381,7 +380,7 @@ class LightSensorApparatus(Apparatus):
     `hands`: a person can exchange or turn sheets; otherwise the next scans are over the pattern of the last reading.
     """
 
-    vocabulary: Mapping[str, EffectKind] = field(default_factory=lambda: dict(VOCABULARY))
+    vocabulary: Mapping[str, LightEffect] = field(default_factory=lambda: dict(VOCABULARY))
     hands: bool = True
     words = Words(
         null="the sensor",
@@ -397,18 +396,18 @@ class LightSensorApparatus(Apparatus):
         },
     )
 
-    def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
+    def effects(self, recording: Recording, null: Null | None) -> dict[str, Effect]:
         extent, plan = Extent.of(recording), recording.plan
-        out: dict[str, NamedEffect[Any]] = {}
+        out: dict[str, Effect] = {}
         for name, kind in {**self.vocabulary, **RARE_EFFECTS, **NUISANCES}.items():
-            if null is None and isinstance(kind, LightEffect) and kind.is_absorbed_by_ssf(plan):  # by a free SSF
+            if null is None and kind.is_absorbed_by_ssf(plan):  # by a free SSF
                 continue
             effect = kind.for_extent(extent)
             if effect is not None and (null is None or null.admits(effect)):
                 out[name] = effect
         return out
 
-    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+    def user_effect_names(self, effects: Mapping[str, Effect]) -> frozenset[str]:
         return frozenset(effects.keys() - EFFECTS)
 
     def covariates_and_predicted_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
@@ -422,7 +421,7 @@ class LightSensorApparatus(Apparatus):
 
     def covariate_of_effect(
         self,
-        effect: NamedEffect[Any],
+        effect: Effect,
         change: FloatArray,
         without: FloatArray,
         plan: Plan,

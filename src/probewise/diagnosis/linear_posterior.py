@@ -18,7 +18,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
@@ -26,7 +26,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from probewise._arrays import FloatArray
 from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.effects import HeavyTailedPrior, NamedEffect
+from probewise.effects import Effect, HeavyTailedPrior
 from probewise.priors import Prior, Product, SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -211,7 +211,7 @@ class LinearView:
         return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)
 
 
-def acts_on_readings(effect: NamedEffect[Any]) -> bool:
+def acts_on_readings(effect: Effect) -> bool:
     """Return whether an effect changes readings that are simulated already."""
     return effect.stage >= Stage.SEEN
 

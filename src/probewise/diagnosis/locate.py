@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.templates import TemplateBank
-from probewise.effects import NamedEffect
+from probewise.effects import Effect
 from probewise.recordings.plan import Plan
 from probewise.systems.table import published_covariate
 
@@ -223,7 +223,7 @@ def significant_places(
 
 
 def places_of_effect(
-    effect: NamedEffect[Any],
+    effect: Effect,
     change: FloatArray,
     covariate: Covariate,
     scans: Covariate | None,

@@ -20,7 +20,8 @@ from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
 from probewise.diagnosis.noise_law import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
-from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING, Dropouts
+from probewise.effects import NoiseEffect
+from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING, readings_lost_beyond_doubt
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 
@@ -87,11 +88,11 @@ class LostReadings:
         )
         return replace(recording, left_out=(*recording.left_out, *self.rows.tolist()), notes=(*recording.notes, note))
 
-    def effect(self, recording: Recording) -> Dropouts:
+    def effect(self, recording: Recording) -> NoiseEffect:
         """Return the effect on the noise that lost them."""
         n, unit = int(recording.usable.sum()), recording.plan.instrumentation.unit_after_number
         distance = float(np.linalg.norm(self.in_sds))
-        return Dropouts.of_lost_readings(recording.readings[self.rows], n, distance, unit)
+        return readings_lost_beyond_doubt(recording.readings[self.rows], n, distance, unit)
 
 
 def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) -> IntArray:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from probewise.diagnosis.sensors import (
     sensor_from_samples,
     starts_of_one_gaussian,
 )
-from probewise.effects import Extent, NamedEffect, NoiseEffect
+from probewise.effects import Effect, Extent, NoiseEffect
 from probewise.effects.noise import LARGEST_SIZE
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern, have_same_albedo
@@ -252,7 +251,7 @@ class Prepared:
     """
 
     recording: Recording
-    effects: Mapping[str, NamedEffect[Any]]
+    effects: Mapping[str, Effect]
     null: Null | None
     apparatus: Apparatus
     everything: Recording
@@ -280,7 +279,8 @@ class Prepared:
     @cached_property
     def pure_noise_effect_names(self) -> frozenset[str]:
         """Names of the effects that change the noise alone."""
-        return frozenset(n for n in self.noise_effect_names if not cast(NoiseEffect, self.effects[n]).changes_the_mean)
+        on_noise = [effect for effect in self.effects.values() if isinstance(effect, NoiseEffect)]
+        return frozenset(effect.name for effect in on_noise if effect.change_of_readings is None)
 
     @property
     def least_readings(self) -> int:

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self, TypeAlias
+from typing import Self, TypeAlias
 
-from probewise.effects import RARE_EFFECTS, NamedEffect, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects import RARE_EFFECTS, Effect, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
 
 Names: TypeAlias = tuple[str, ...]
@@ -51,7 +51,7 @@ class PriorOdds:
     unlikely_weight: float = 1.0
 
     @classmethod
-    def for_effects(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
+    def for_effects(cls, effects: Mapping[str, Effect]) -> Self:
         """Divide the default probabilities among these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)

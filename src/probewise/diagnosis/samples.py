@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -29,8 +29,8 @@ from probewise.diagnosis.search.refits import WeighedFit, effects_out_of_vocabul
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_by_label, templates_of_effect
 from probewise.diagnosis.verdict import GlobalTest, Judged
-from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect
-from probewise.effects.noise import Quantisation, sd_of_estimated_lattice_step
+from probewise.effects import NUISANCES, Effect, Extent, NoiseEffect
+from probewise.effects.noise import quantisation, sd_of_estimated_lattice_step
 from probewise.effects.reference import origins_of
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
@@ -94,7 +94,7 @@ class ModelSamples:
 
     def effect_samples(self, effect: str) -> FloatArray:
         """Return the samples of one effect's parameters, (n_samples, n_params of the effect)."""
-        effects = cast(Iterable[NamedEffect[Any]], self.chain.effects)
+        effects = cast(Iterable[Effect], self.chain.effects)
         own = {f"{effect}.{name}" for each in effects if each.name == effect for name in each.prior.names}
         return self.theta[:, [i for i, name in enumerate(self.chain.names) if name in own]]
 
@@ -123,7 +123,7 @@ class ModelSamples:
             field=field,
             instrumentation=cast(Chain, self.chain).plan_at_calibrated_height(recording.plan).instrumentation,
             effects=self.effects,
-            patterns={e.name: e.patterns for e in cast(Iterable[NamedEffect[Any]], self.chain.effects) if e.patterns},
+            patterns={e.name: e.patterns for e in cast(Iterable[Effect], self.chain.effects) if e.patterns},
             absent=self.absent,
             origins=origins_of(self.chain.effects),
             scan_noise=scan_noise,
@@ -175,7 +175,7 @@ def sample_model(
     of_noise = (noise_effect_samples(effect, noise, nodes, rng=rng) for effect in on_noise)
     theta = np.concatenate([theta, *of_noise], axis=1)
     names = tuple(effect.name for effect in chain.effects)
-    of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
+    of_lattice = [i for i, name in enumerate(chain.names) if name == f"{quantisation.name}.step"]
     for i in of_lattice:
         sd = sd_of_estimated_lattice_step(recording.readings[recording.usable], float(theta[0, i]))
         theta[:, i] += sd * rng.standard_normal(n_samples)
@@ -213,9 +213,8 @@ def noise_effect_samples(
     if nodes is None:
         nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
     settings = noise.nodes.settings[:, noise.noise.columns_of_effect(effect.name)]
-    own = effect.draws_about(settings[nodes], rng=rng)
-    if own is not None:
-        return own
+    if effect.draws_about is not None:
+        return effect.draws_about(settings[nodes], rng)
     values, units = settings[nodes], effect.prior.to_unit_cube(settings)
     gaps = np.array([np.diff(np.unique(np.round(column, 9))).min(initial=1.0) for column in units.T])
     spread = np.array([len(np.unique(column)) > 1 for column in settings.T])
@@ -223,7 +222,7 @@ def noise_effect_samples(
     return np.where(spread, effect.prior.from_unit_cube(moved), values)
 
 
-def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
+def can_share_one_model(first: Sequence[Effect], second: Sequence[Effect]) -> bool:
     """Return whether hypotheses of these effects can be combined in one model.
 
     Shared effects must change readings alike, bound to the same scans; all others need parameters at which they change
@@ -231,12 +230,7 @@ def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[Name
     """
     known = {effect.name: effect for effect in first}
     shared = {effect.name for effect in second if effect.name in known}
-
-    def acts_alike(one: NamedEffect[Any], other: NamedEffect[Any]) -> bool:
-        act = getattr(one, "act", None)
-        return one == other or (act is not None and act is getattr(other, "act", None))
-
-    alike = all(acts_alike(known[effect.name], effect) for effect in second if effect.name in shared)
+    alike = all(known[effect.name].act is effect.act for effect in second if effect.name in shared)
     return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
 
 
@@ -252,7 +246,7 @@ def mix(
     each, (n_parts,); `null`: the model without effects, that of the part with the most Gaussians.
     """
     largest = max(parts, key=lambda part: part.n_gaussians)
-    effects = {e.name: e for part in parts for e in cast(Sequence[NamedEffect[Any]], part.chain.effects)}
+    effects = {e.name: e for part in parts for e in cast(Sequence[Effect], part.chain.effects)}
     chain = null.chain(plan, tuple(effects.values()), n_nodes=ACCURATE_NODES)
     n, names = len(largest.theta), [effect.name for effect in chain.effects]
     samples = []

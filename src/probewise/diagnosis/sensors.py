@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 from scipy.special import ndtr
@@ -25,7 +25,7 @@ from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise._kinds import require_like
 from probewise.calibration import FittedSensor, mixture_moments
 from probewise.diagnosis.fit import FARTHEST, Model, Null
-from probewise.effects import Extent, NamedEffect
+from probewise.effects import Effect, Extent
 from probewise.errors import ParameterError
 from probewise.priors import Prior
 from probewise.recordings.plan import Plan, Recording
@@ -97,7 +97,7 @@ class CalibratedSensor:
     def starts(self) -> FloatArray:
         return np.zeros((1, self.n_params))
 
-    def admits(self, effect: NamedEffect[Any]) -> bool:
+    def admits(self, effect: Effect) -> bool:
         return True
 
     def coordinates(self, theta: FloatArray) -> None:
@@ -120,10 +120,10 @@ class CalibratedSensor:
     def _z_from_natural(self, natural: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
-    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+    def chain(self, plan: Plan, effects: Sequence[Effect], *, n_nodes: int) -> Chain:
         return self.chain_over(cached_known_scene(plan), effects, n_nodes=n_nodes)
 
-    def chain_over(self, scene: Scene, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+    def chain_over(self, scene: Scene, effects: Sequence[Effect], *, n_nodes: int) -> Chain:
         """Build the chain (sensor, effects, scene) over any scene; `n_nodes` for curved edges."""
         ssf, effects, height_mm = FreeMixture(self.n_gaussians), tuple(effects), self.calibrated_height_mm
         return Chain(ssf, FreeLevels(), scene, effects, n_nodes=n_nodes, calibrated_height_mm=height_mm)
@@ -346,7 +346,7 @@ class SensorAndShape(CalibratedSensor):
         k = super().n_params
         return np.concatenate([super().theta(z[:, :k]), self.shape.prior.from_unit_cube(ndtr(z[:, k:]))], axis=1)
 
-    def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
+    def chain(self, plan: Plan, effects: Sequence[Effect], *, n_nodes: int) -> Chain:
         return self.chain_over(_ShapeAmongPatterns(self.shape, plan), effects, n_nodes=n_nodes)
 
 

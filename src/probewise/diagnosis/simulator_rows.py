@@ -16,16 +16,16 @@ from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.words import join_names
-from probewise.effects import Extent, NamedEffect
+from probewise.effects import Effect, Extent, LightEffect, NoiseEffect
 from probewise.effects.noise import (
-    CorrelatedNoise,
-    DriftingNoise,
-    Dropouts,
-    NoisePerRun,
-    Outliers,
-    Quantisation,
-    RandomWalk,
-    SignalDependentNoise,
+    correlated_noise,
+    drifting_noise,
+    dropouts,
+    noise_per_run,
+    outliers,
+    quantisation,
+    random_walk,
+    signal_dependent_noise,
 )
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, System
@@ -174,17 +174,17 @@ def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
     return None if table.time is None else _MINUTES.get(time_unit.strip().rstrip(".").lower())
 
 
-ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
-    SignalDependentNoise,
-    CorrelatedNoise,
-    RandomWalk,
-    NoisePerRun,
-    Outliers,
-    Dropouts,
-    Quantisation,
-    DriftingNoise,
+ON_NOISE: tuple[LightEffect, ...] = (
+    signal_dependent_noise,
+    correlated_noise,
+    random_walk,
+    noise_per_run,
+    outliers,
+    dropouts,
+    quantisation,
+    drifting_noise,
 )
-_ALONG_ROWS = (CorrelatedNoise, RandomWalk, DriftingNoise)
+_ALONG_ROWS = (correlated_noise, random_walk, drifting_noise)
 CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 10,000 in a diagnosis
 # Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
 # table as of a short one.
@@ -212,7 +212,7 @@ class SimulatorApparatus(Apparatus):
 
     about: ReferenceFit
     stop: MeterStop | None = None
-    lost: Dropouts | None = None
+    lost: NoiseEffect | None = None
 
     @property
     def system(self) -> System:
@@ -262,19 +262,19 @@ class SimulatorApparatus(Apparatus):
             tells_duration=_minutes_of_time_unit(self.about.table, own.time_unit) is not None,
         )
 
-    def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
+    def effects(self, recording: Recording, null: Null | None) -> dict[str, Effect]:
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
-            kinds.remove(RandomWalk)
-        beside = (*(kind.for_extent(extent) for kind in kinds), self.stop, self.lost)
-        forms = cast(dict[str, NamedEffect[Any]], bind_forms(self.about))
-        return forms | {effect.name: effect for effect in beside if effect is not None}
+            kinds.remove(random_walk)
+        stop = None if self.stop is None else self.stop.effect
+        beside = (*(kind.for_extent(extent) for kind in kinds), stop, self.lost)
+        return bind_forms(self.about) | {effect.name: effect for effect in beside if effect is not None}
 
-    def proposed_formulas(self) -> dict[str, NamedEffect[Any]]:
-        return cast(dict[str, NamedEffect[Any]], {form.name: form for form in formula_forms(self.about)})
+    def proposed_formulas(self) -> dict[str, Effect]:
+        return cast(dict[str, Effect], {form.name: form for form in formula_forms(self.about)})
 
-    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+    def user_effect_names(self, effects: Mapping[str, Effect]) -> frozenset[str]:
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     @property
@@ -296,7 +296,7 @@ class SimulatorApparatus(Apparatus):
         tally.cut_short |= over
         return over
 
-    def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
+    def prior_odds(self, effects: Mapping[str, Effect]) -> PriorOdds:
         curves = {f"curve:{name.removeprefix('input_gain:')}" for name in effects if name.startswith("input_gain:")}
         return replace(
             PriorOdds.for_effects(effects),

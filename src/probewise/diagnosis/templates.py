@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from typing import Any, TypeAlias, cast
+from typing import TypeAlias, cast
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from probewise.diagnosis.evidence import (
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
-from probewise.effects import NamedEffect, name_of_first_copy
+from probewise.effects import Effect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
@@ -208,12 +208,12 @@ class EffectTemplates:
 
     columns: tuple[FloatArray, ...]  # each (n_usable, n_columns)
     settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
-    variants: tuple[NamedEffect[Any], ...]
+    variants: tuple[Effect, ...]
     choice: IntArray  # number of each entry's variant, (n_entries,)
 
-    def variant_of_entry(self, at: int) -> NamedEffect[Any]:
+    def variant_of_entry(self, at: int) -> Effect:
         """Return the variant (discrete choice, such as of scans) of entry number `at`."""
-        variant: NamedEffect[Any] = self.variants[self.choice[at]]
+        variant: Effect = self.variants[self.choice[at]]
         return variant
 
     @cached_property
@@ -232,10 +232,10 @@ class TemplateCache:
     """Cache of the templates of effects about fits, on the rows `usable`."""
 
     usable: IntArray
-    known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
+    known: dict[tuple[Fit, Effect], EffectTemplates] = field(default_factory=dict)
     banks: dict[tuple[Fit, tuple[str, ...]], TemplateBank] = field(default_factory=dict)
 
-    def coarse_bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> TemplateBank:
+    def coarse_bank(self, found: Fit, effects: Sequence[Effect]) -> TemplateBank:
         """Return one bank of the templates of several effects about a fit, of fewer variants, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
@@ -247,7 +247,7 @@ class TemplateCache:
             self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own])
         return self.banks[key]
 
-    def templates_of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
+    def templates_of(self, found: Fit, effect: Effect) -> EffectTemplates:
         """Return the templates of one effect about one fit."""
         key = found, effect
         if key not in self.known:
@@ -255,7 +255,7 @@ class TemplateCache:
             self.known[key] = own or templates_of_effect(found, effect, self.usable)
         return self.known[key]
 
-    def _shared_with_first_copy(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates | None:
+    def _shared_with_first_copy(self, found: Fit, effect: Effect) -> EffectTemplates | None:
         """Return the templates of a second copy of an effect where those of the first are known and hold them all."""
         name = name_of_first_copy(effect.name)
         first = next((own for (fit, e), own in self.known.items() if fit is found and e.name == name), None)
@@ -269,9 +269,7 @@ class TemplateCache:
         return EffectTemplates(columns, settings, effect.variants(), np.zeros(len(at), dtype=np.int64))
 
 
-def templates_of_effect(
-    found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
-) -> EffectTemplates:
+def templates_of_effect(found: Fit, effect: Effect, usable: IntArray, *, most: int | None = None) -> EffectTemplates:
     """Predict the change of the readings by each bank entry of all variants of an effect, about a fit.
 
     Variants are its discrete choices, such as of scans. With `most`, so many entries are predicted, evenly spread.
@@ -297,7 +295,7 @@ def templates_of_effect(
     return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
 
 
-def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
+def _predicted_changes(found: Fit, effect: Effect, bank: FloatArray, usable: IntArray) -> list[FloatArray]:
     """Return the change of the readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans.
 
     A column is 0 too if the model with the effect diverges, or the change is no more than rounding.

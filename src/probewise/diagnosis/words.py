@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, name_without_copy_suffix, spoken_name
-from probewise.effects.noise import NoisePerRun, RandomWalk
+from probewise.effects.noise import noise_per_run, random_walk
 from probewise.systems.forms import WORDS
 
 _LEAST_P = 1e-300  # smallest p-value that floating point represents reliably
@@ -32,7 +32,7 @@ EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 
 
 FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
-    {**WORDS, **{noise.name: noise.words for noise in (RandomWalk, NoisePerRun)}}
+    {**WORDS, **{noise.name: noise.words for noise in (random_walk, noise_per_run)}}
 )
 """A noun phrase for each effect on a user's simulator, with placeholders for its targets."""
 

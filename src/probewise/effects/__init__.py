@@ -12,17 +12,17 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from probewise.effects import noise, optics, pose, reading
-from probewise.effects.effect import AGAIN, Effect, EffectKind, LightEffect, NamedEffect, NoiseEffect, light_effect
+from probewise.effects.effect import AGAIN, Effect, LightEffect, NoiseEffect, light_effect
 from probewise.effects.known import Estimated, Known
 from probewise.effects.reference import Extent, Origin
 from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior
 
 
-def _by_name(*effects: EffectKind) -> Mapping[str, EffectKind]:
-    return MappingProxyType({str(effect.name): effect for effect in effects})
+def _by_name(*effects: LightEffect) -> Mapping[str, LightEffect]:
+    return MappingProxyType({effect.name: effect for effect in effects})
 
 
-VOCABULARY: Mapping[str, EffectKind] = _by_name(
+VOCABULARY: Mapping[str, LightEffect] = _by_name(
     reading.ambient_gradient,
     reading.ambient_step,
     reading.offset_drift,
@@ -49,15 +49,15 @@ VOCABULARY: Mapping[str, EffectKind] = _by_name(
     optics.edge_shadow,
     optics.halo,
     optics.glint,
-    noise.Quantisation,
-    noise.SignalDependentNoise,
-    noise.CorrelatedNoise,
-    noise.Outliers,
-    noise.Dropouts,
+    noise.quantisation,
+    noise.signal_dependent_noise,
+    noise.correlated_noise,
+    noise.outliers,
+    noise.dropouts,
 )
 """Every effect that the diagnosis considers, by name."""
 
-RARE_EFFECTS: Mapping[str, EffectKind] = _by_name(
+RARE_EFFECTS: Mapping[str, LightEffect] = _by_name(
     pose.arm_knock,
     reading.gain_jump,
     pose.bent_rails,
@@ -76,7 +76,7 @@ form of the unknown.
 """
 
 
-EFFECTS: Mapping[str, EffectKind] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
+EFFECTS: Mapping[str, LightEffect] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
 OTHER_FORMS: Mapping[tuple[str, str], LightEffect] = MappingProxyType({("backlash", "of each axis"): pose.play_of_axes})
@@ -107,7 +107,7 @@ def name_of_first_copy(name: str) -> str | None:
     return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
 
 
-NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({noise.DriftingNoise.name: noise.DriftingNoise})
+NUISANCES: Mapping[str, LightEffect] = _by_name(noise.drifting_noise)
 """Departures of the noise that have no name in the vocabulary; they only keep the tests of the mean valid."""
 
 __all__ = [
@@ -119,14 +119,12 @@ __all__ = [
     "RARE_EFFECTS",
     "VOCABULARY",
     "Effect",
-    "EffectKind",
     "Estimated",
     "Extent",
     "HeavyTailedPrior",
     "Known",
     "LightEffect",
     "LogHeavyTailedPrior",
-    "NamedEffect",
     "NoiseEffect",
     "Origin",
     "is_out_of_vocabulary",

@@ -9,20 +9,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeAlias, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, distinct_values
-from probewise._kinds import require_mapping
+from probewise._kinds import require_kind, require_mapping
 from probewise._words import unit_after_number, value_with_sd
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import ZERO, Extent, Origin
 from probewise.errors import ParameterError
 from probewise.priors import HeavyTailedPrior, Marginal, Prior, Product, Uniform
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import NoiseParameters, Stage
+from probewise.sensor.stages import Stage
 
 _BOTH_SIGNS = 0.05  # least share of samples of either sign
 _NEAR_ZERO, _FEW_NEAR_ZERO = 0.1, 0.01  # in medians of their sizes; of a normal distribution about 0, .054 are so near
@@ -36,8 +36,6 @@ PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 
 ROWS_OF_A_SIDE = 5
 """Least number of rows on which an effect rests, on either side where it is switched."""
-
-V = TypeVar("V")
 
 Act: TypeAlias = Callable[[Any, FloatArray, Any], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the plan or table; returns the value with the
@@ -57,93 +55,6 @@ class VariantMasks:
 
     always: FloatArray
     opened: BoolArray
-
-
-class NamedEffect(Generic[V]):
-    """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict."""
-
-    words: ClassVar[str] = ""
-    """A noun phrase that follows "the model leaves out"; without one the name itself is written."""
-
-    if TYPE_CHECKING:  # each effect has these; `Effect` says what they are
-
-        @property
-        def name(self) -> str: ...
-        @property
-        def stage(self) -> Stage: ...
-        @property
-        def prior(self) -> Prior: ...
-        @property
-        def units(self) -> tuple[str, ...]: ...
-        @property
-        def covariates(self) -> tuple[str, ...]: ...
-        @property
-        def counted_from(self) -> str: ...
-        @property
-        def amplitudes(self) -> tuple[int, ...]: ...
-        @property
-        def scans(self) -> tuple[str, ...]: ...
-        @property
-        def patterns(self) -> tuple[str, ...]: ...
-        def apply(self, value: V, theta: FloatArray, plan: Plan) -> V: ...
-        def bank(self) -> FloatArray: ...
-        def sentence(self, mean: FloatArray, sd: FloatArray) -> str: ...
-
-    else:
-        counted_from, amplitudes, scans, patterns = "", (0,), (), ()
-
-    n_peaks: int = 1
-    """Number of equivalent posterior modes within the prior; a fit finds one of them."""
-
-    has_change_point: bool = False
-    """Whether its variants are the intervals of a change point."""
-
-    relative_odds: float = 1.0
-    """Prior odds of this variant against the first one."""
-
-    @property
-    def nothing(self) -> Mapping[int, float] | None:
-        """Values of parameters, by index, at which it has no effect: all amplitudes 0; None without amplitudes."""
-        return dict.fromkeys(self.amplitudes, 0.0) or None
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Build the effect with a prior at the recording's scales; None where the recording cannot show it."""
-        return cls()
-
-    def variants(self) -> tuple[Self, ...]:
-        """List the effect with each of its discrete choices made, of prior odds `relative_odds`.
-
-        A choice is a scan, a mounting or an interval between readings, which no gradient-based fit can find.
-        Variants differ in their `scans` or `patterns`, or only in their priors.
-        """
-        return (self,)
-
-    def variant_masks(self, plan: Plan) -> VariantMasks | None:
-        """Return the masks of variants that differ only in the readings they act on; None, the default, for others."""
-        return None
-
-    def with_fewer_variants(self) -> Self:
-        """Return the effect with fewer variants, as many as detection needs; by default with all of them."""
-        return self
-
-    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the parameter that the variants divide among them: draw a variant for each sample, then its value.
-
-        Returns theta, (n_samples, n_params) as given, with that parameter replaced; by default unchanged. `weights`
-        (n_variants,) are the probabilities of the variants.
-        """
-        return theta
-
-    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Turn a bank entry (n_columns, n_params) and its columns' fitted amounts into a starting point (n_params,).
-
-        Amplitudes scale with the amounts; other parameters (a level, an exponent) keep the entry's values.
-        """
-        setting = entry[0].copy()
-        for k in self.amplitudes:
-            setting[k] = amounts @ entry[:, k]
-        return np.asarray(setting)
 
 
 @dataclass(frozen=True)
@@ -170,7 +81,7 @@ EVERYWHERE = Where()
 
 
 @dataclass(frozen=True, eq=False)
-class Effect(NamedEffect[Any]):
+class Effect:
     """An effect, bound to a recording and perhaps to a target.
 
     Parameters
@@ -221,6 +132,9 @@ class Effect(NamedEffect[Any]):
     form: str = ""
     source: Callable[[], Effect] | None = None
 
+    has_change_point: ClassVar[bool] = False
+    """Whether its variants are the intervals of a change point."""
+
     def __reduce__(self) -> tuple[Callable[..., Effect], tuple[Any, ...]]:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
         if self.source is not None:
@@ -234,14 +148,17 @@ class Effect(NamedEffect[Any]):
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
+        """Values of parameters, by index, at which it has no effect; None without amplitudes."""
         return dict(self.absent) or dict.fromkeys(self.amplitudes, 0.0) or None
 
     @property
     def scans(self) -> tuple[str, ...]:
+        """Names of the scans that it is restricted to; () for all."""
         return self.where.scans
 
     @property
     def patterns(self) -> tuple[str, ...]:
+        """Names of the patterns that it is restricted to; () for all."""
         return self.where.patterns
 
     @property
@@ -250,7 +167,8 @@ class Effect(NamedEffect[Any]):
         return tuple(name for name, prior in self.marginals.items() if isinstance(prior, Fixed))
 
     @property
-    def relative_odds(self) -> float:  # type: ignore[override]
+    def relative_odds(self) -> float:
+        """Prior odds of this variant against the first one."""
         return math.prod((prior.odds for prior in self.marginals.values() if isinstance(prior, Fixed)), start=1.0)
 
     @property
@@ -259,27 +177,62 @@ class Effect(NamedEffect[Any]):
         return self.parameters if isinstance(self.parameters, Mapping) else {}
 
     def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
+        """Return the stage's value with the effect, with parameters theta (n_samples, n_params); see `Act`."""
         return self.act(value, theta, plan)
 
     def bank(self) -> FloatArray:
+        """Return the template bank, (n_entries, n_columns, n_params)."""
         return self.entries
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Describe the effect by the mean and sd of its parameters, (n_params,) each."""
         return self.says(mean, sd)
 
     @property
-    def n_peaks(self) -> int:  # type: ignore[override]
+    def n_peaks(self) -> int:
+        """Number of equivalent posterior modes within the prior; a fit finds one of them."""
         # A phase spans two turns, which doubles it; a second copy or time constant may be exchanged with the first.
         exchangeable = self.name.endswith(AGAIN) or "tau2" in self.prior.names
         return (2 if exchangeable else 1) * (2 if "phase" in self.prior.names else 1)
 
     def variants(self) -> tuple[Effect, ...]:
-        """Return itself and its alternatives: the same objects at each call, so that two fits have equal effects."""
+        """List the effect with each of its discrete choices made, of prior odds `relative_odds`.
+
+        A choice is a scan, a mounting or an interval between readings, which no gradient-based fit can find. Variants
+        differ in their `scans` or `patterns`, or only in their priors. They are the same objects at each call, so that
+        two fits have equal effects.
+        """
         return self._variants
 
     @cached_property
     def _variants(self) -> tuple[Effect, ...]:
         return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
+
+    def variant_masks(self, plan: Any) -> VariantMasks | None:
+        """Return the masks of variants that differ only in the readings they act on; None, the default, for others."""
+        return None
+
+    def with_fewer_variants(self) -> Self:
+        """Return the effect with fewer variants, as many as detection needs; by default with all of them."""
+        return self
+
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw the parameter that the variants divide among them: draw a variant for each sample, then its value.
+
+        Returns theta, (n_samples, n_params) as given, with that parameter replaced; by default unchanged. `weights`
+        (n_variants,) are the probabilities of the variants.
+        """
+        return theta
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        """Turn a bank entry (n_columns, n_params) and its columns' fitted amounts into a starting point (n_params,).
+
+        Amplitudes scale with the amounts; other parameters (a level, an exponent) keep the entry's values.
+        """
+        setting = entry[0].copy()
+        for k in self.amplitudes:
+            setting[k] = amounts @ entry[:, k]
+        return np.asarray(setting)
 
 
 def _restored_effect(kind: type[Effect], state: dict[str, Any]) -> Effect:
@@ -297,7 +250,7 @@ class StepEffect(Effect):
 
     change_points: ChangePoints
     is_thinned: bool = True
-    has_change_point: ClassVar[bool] = True  # type: ignore[misc]
+    has_change_point: ClassVar[bool] = True
 
     @property
     def places(self) -> Sequence[tuple[Uniform, ...]]:
@@ -498,84 +451,58 @@ def one_of(choices: Sequence[Effect]) -> Effect | None:
     return replace(choices[0], alternatives=tuple(choices[1:])) if choices else None
 
 
-EffectKind: TypeAlias = "LightEffect | type[NamedEffect[Any]]"
-"""An effect before it is bound to a recording: `for_extent` binds it."""
-
-
 def require_effect_kinds(effects: object) -> None:
     """Raise ParameterError unless `effects` maps each name to an effect of that name, as `light_effect` makes them."""
     allowed = "effects by name, such as {**VOCABULARY, 'overflow': overflow}, of probewise.effects"
     require_mapping("effects", effects, allowed)
     assert isinstance(effects, Mapping)
     for name, kind in effects.items():
-        if not isinstance(kind, LightEffect) and not (isinstance(kind, type) and issubclass(kind, NoiseEffect)):
-            raise ParameterError(
-                f"effects[{name!r}]", kind, "a function decorated with probewise.effects.light_effect, or a NoiseEffect"
-            )
+        require_kind(
+            f"effects[{name!r}]", kind, LightEffect, "a function decorated with probewise.effects.light_effect"
+        )
         if kind.name != name:
             raise ParameterError("effects", name, f"{kind.name!r}, the name of that effect")
 
 
-@dataclass(frozen=True)
-class NoiseEffect(NamedEffect[NoiseParameters]):
-    """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NoiseEffect(Effect):
+    """An effect on the noise; its entries are equally weighted nodes of its prior, (n_nodes, 1, n_params).
 
-    A class declares name, words and covariates, prior and units of its parameters, `apply`, and `says` or `sentence`.
+    Parameters
+    ----------
+    nodes_per_parameter
+        Numbers of nodes along each parameter, whose product they are; () if the nodes are not of the prior. Where a fit
+        determines a parameter better than its nodes lie apart, they are refined.
+    nodes_about
+        Function of a fit's residuals, (n_points,), in noise sds, and its readings, that returns nodes, (n_nodes,
+        n_params), none where the fit excludes the effect, and their log weights, (n_nodes,).
+    draws_about
+        Function that draws parameters about sampled nodes, (n_samples, n_params) both, where nodes are not dense.
+    known
+        Parameters, (n_params,), if the readings alone determine them, without a fit.
+    change_of_readings
+        If it is physics of the mean, seen in the readings alone: function of readings that were predicted without it,
+        of any shape, that returns their change.
+    distance
+        Norm, in noise sds, of the residuals of the readings that it lost and that the recording leaves out.
     """
 
-    stage = Stage.NOISE
-    says: ClassVar[Say]
-
-    n_nodes: ClassVar[int] = 10
-    """Number of nodes of its prior, for an effect of one parameter."""
-
-    changes_the_mean: ClassVar[bool] = False
-    """Whether it is physics of the mean, seen in the readings alone."""
-
-    @property
-    def parameters_known_before_fit(self) -> FloatArray | None:
-        """Parameters, (n_params,), that the readings alone determine; None, by default, where they need a fit."""
-        return None
-
-    def change_of_readings(self, predicted: FloatArray) -> FloatArray:
-        """Return the change of readings that were predicted without it, same shape; 0 unless it `changes_the_mean`."""
-        return np.zeros_like(predicted)
-
-    @property
-    def nodes_per_parameter(self) -> tuple[int, ...]:
-        """Numbers of nodes along each parameter, whose product is the bank; () if the nodes depend on the fit.
-
-        Where a fit determines a parameter better than its nodes lie apart, they are refined.
-        """
-        return (self.n_nodes,)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return type(self).says(mean, sd)
-
-    def bank(self) -> FloatArray:
-        """Return equally weighted nodes of the prior, (n_nodes, 1, n_params): midpoints along each parameter."""
-        axes = [(np.arange(n) + 0.5) / n for n in self.nodes_per_parameter or (self.n_nodes,)]
-        u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
-        return self.prior.from_unit_cube(u)[:, None, :]
-
-    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
-        """Return equally weighted nodes of the prior given a fit, (n_nodes, n_params); none where the fit excludes it.
-
-        `residuals` (n_points,) are in units of the noise sd.
-        """
-        return self.bank()[:, 0, :]
+    nodes_per_parameter: tuple[int, ...] = ()
+    nodes_about: Callable[[FloatArray, FittedReadings], tuple[FloatArray, FloatArray]] | None = None
+    draws_about: Callable[[FloatArray, np.random.Generator], FloatArray] | None = None
+    known: FloatArray | None = None
+    change_of_readings: Callable[[FloatArray], FloatArray] | None = None
+    distance: float = 0.0
 
     def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
         """Return nodes given a fit, (n_nodes, n_params), and log weights, (n_nodes,): by default those of the prior."""
-        nodes = self.nodes(residuals, rows)
-        return nodes, np.full(len(nodes), -np.log(max(len(nodes), 1)))
-
-    def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
-        """Draw parameters about sampled nodes, both (n_samples, n_params); None, the default, if nodes are dense."""
-        return None
+        if self.nodes_about is not None:
+            return self.nodes_about(residuals, rows)
+        nodes = self.entries[:, 0, :]
+        return nodes, np.full(len(nodes), -np.log(len(nodes)))
 
 
-def sentence_from_samples(effect: NamedEffect[Any], samples: FloatArray) -> str:
+def sentence_from_samples(effect: Effect, samples: FloatArray) -> str:
     """Describe an effect by samples of its parameters, (n_samples, n_params), and its origin, if that is not 0.
 
     Of an amplitude with samples on both sides of 0, but hardly any near it, it says between what values it lies.

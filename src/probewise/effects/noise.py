@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import ClassVar, Self
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.effect import NoiseEffect, in_words
+from probewise.effects.effect import Act, Effect, LightEffect, NoiseEffect, Say, in_words, light_effect
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import Extent
-from probewise.priors import LogHeavyTailedPrior, LogUniform, Product, Uniform
+from probewise.priors import LogHeavyTailedPrior, LogUniform, Marginal, Product, Uniform
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import NoiseParameters
+from probewise.sensor.stages import NoiseParameters, Stage
 
 _SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
 _NEWTON_STEPS = 40
@@ -26,37 +27,60 @@ _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printe
 _DIGITS = 1e-6  # of a step: below this a difference is rounding
 
 
-class CorrelatedNoise(NoiseEffect):
-    """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
+def _on_noise(
+    kind: LightEffect,
+    of: Extent,
+    parameters: Mapping[str, Marginal],
+    units: tuple[str, ...],
+    act: Act,
+    says: Say,
+    n_nodes: tuple[int, ...] = (10,),
+    *,
+    from_prior: bool = True,
+) -> Effect:
+    """Return an effect with nodes of its prior: midpoints of `n_nodes` equal shares along each parameter.
 
-    name, words, covariates = "correlated_noise", "correlated noise", ("scan",)
-    units = ("1",)
-    prior = Product({"rho": Uniform(-0.5, 0.95)})
-    n_nodes = 28  # dense enough to integrate the posterior of a thousand readings
-    says = in_words(
-        "the noise of successive readings has correlation {0}: part of each error returns in the next reading"
+    Unless `from_prior`, the nodes under which evidence is computed are from elsewhere.
+    """
+    axes = [(np.arange(n) + 0.5) / n for n in n_nodes]
+    u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+    entries, nodes = Product(parameters).from_unit_cube(u)[:, None, :], n_nodes if from_prior else ()
+    return kind.bind(of, parameters, units, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes)
+
+
+@light_effect("correlated_noise", Stage.NOISE, "correlated noise", ("scan",))
+def correlated_noise(kind: LightEffect, of: Extent) -> Effect:
+    """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
+    says = "the noise of successive readings has correlation {0}: part of each error returns in the next reading"
+    return _on_noise(
+        kind,
+        of,
+        {"rho": Uniform(-0.5, 0.95)},
+        ("1",),
+        lambda noise, theta, plan: replace(noise, rho=theta[:, :1]),
+        in_words(says),
+        (28,),  # dense enough to integrate the posterior of a thousand readings
     )
 
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(value, rho=theta[:, :1])
 
-
-class SignalDependentNoise(NoiseEffect):
+@light_effect("signal_dependent_noise", Stage.NOISE, "noise that grows with the signal", ("level",))
+def signal_dependent_noise(kind: LightEffect, of: Extent) -> Effect:
     """Noise that grows with the light: variance x (1 + ratio u), u the seen white fraction."""
+    return _on_noise(
+        kind,
+        of,
+        {"ratio": LogUniform(0.05, 50.0)},
+        ("1",),
+        lambda noise, theta, plan: replace(noise, sd=noise.sd * np.sqrt(1 + theta[:, :1] * np.clip(noise.seen, 0, 1))),
+        lambda mean, sd: (
+            "the noise grows with the reading: its variance at the highest level is "
+            f"{value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
+        ),
+    )
 
-    name, words, covariates = "signal_dependent_noise", "noise that grows with the signal", ("level",)
-    units = ("1",)
-    prior = Product({"ratio": LogUniform(0.05, 50.0)})
 
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        times = f"{value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
-        return f"the noise grows with the reading: its variance at the highest level is {times}"
-
-
-class DriftingNoise(NoiseEffect):
+@light_effect("drifting_noise", Stage.NOISE, "noise that changes in time", ("time",))
+def drifting_noise(kind: LightEffect, of: Extent) -> Effect:
     """Noise whose sd grows or shrinks exponentially in time: sd x growth^(time / duration - 1/2).
 
     The effect is outside the vocabulary: a nuisance that keeps the tests of the mean valid. Time counts from the first
@@ -64,109 +88,103 @@ class DriftingNoise(NoiseEffect):
     recording's.
     """
 
-    name, words, covariates = "drifting_noise", "noise that changes in time", ("time",)
-    units = ("1",)
-    prior = Product({"growth": LogUniform(0.2, 5.0)})
-    says = in_words("the sd of the noise at the end is {0} times that at the start")
-
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+    def act(noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
-        return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
+        return replace(noise, sd=noise.sd * theta[:, :1] ** (elapsed - 0.5))
+
+    says = in_words("the sd of the noise at the end is {0} times that at the start")
+    return _on_noise(kind, of, {"growth": LogUniform(0.2, 5.0)}, ("1",), act, says)
 
 
-@dataclass(frozen=True)
-class RandomWalk(NoiseEffect):
-    """A random walk of the offset: a normal step from each row to the next, across runs too.
+@light_effect("random_walk", Stage.NOISE, "a random walk of the zero", ("time", "row", "run"))
+def random_walk(kind: LightEffect, of: Extent) -> Effect:
+    """A random walk of the offset of a table's readings: a normal step from each row to the next, across runs too.
 
-    `n_before` is the number of steps taken before the first row of the plan: the rows of the training data.
+    Of another table than the recorded one, the rows before its first one count.
     """
-
-    n_before: int = 0
-
-    name, words, covariates = "random_walk", "a random walk of the zero", ("time", "row", "run")
-    units = ("noise sd",)
-    prior = Product({"sd_per_row": LogUniform(5e-3, 3.0)})
-    n_nodes = 16
-    says = in_words("the offset is a random walk with steps of sd {0} noise sds from row to row")
-
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(value, walk=theta[:, :1], walked=self.n_before + 1.0 + np.arange(float(len(plan))))
+    return _on_noise(
+        kind,
+        of,
+        {"sd_per_row": LogUniform(5e-3, 3.0)},
+        ("noise sd",),
+        lambda noise, theta, table: replace(noise, walk=theta[:, :1], walked=_rows_walked(table)),
+        in_words("the offset is a random walk with steps of sd {0} noise sds from row to row"),
+        (16,),
+    )
 
 
-@dataclass(frozen=True)
-class NoisePerRun(NoiseEffect):
-    """Noise that differs between runs: sd x the run's value, whose logarithm has a heavy-tailed prior.
+def _rows_walked(table: Any) -> FloatArray:
+    return getattr(table, "first_row", 0) + 1.0 + np.arange(float(len(table)))
 
-    `runs`: names of the runs; `n_rows`: number of readings from which each run's value was estimated; () where it is
-    not needed.
+
+@light_effect("noise_per_run", Stage.NOISE, "noise that differs from run to run", ("run",))
+def noise_per_run(kind: LightEffect, of: Extent) -> Effect | None:
+    """Noise that differs between runs: sd x the run's value, whose logarithm has a heavy-tailed prior."""
+    names, run = tuple(of.plan.scan_names), of.plan.scan
+    return noise_of_runs(names, np.bincount(run, minlength=len(names))) if len(names) > 1 else None
+
+
+def noise_of_runs(runs: tuple[str, ...], n_rows: Any = 1) -> NoiseEffect:
+    """Return the effect of noise that differs between runs of these names.
+
+    `n_rows` (n_runs,) are the numbers of readings from which each run's value was estimated, where that counts.
     """
+    return NoiseEffect(
+        noise_per_run.name,
+        noise_per_run.stage,
+        {f"values[{run}]": LogHeavyTailedPrior(0.3) for run in runs},
+        ("1",) * len(runs),
+        noise_per_run.covariates,
+        partial(_times_run_value, runs),
+        np.ones((1, 1, len(runs))),
+        partial(_runs_in_words, runs),
+        amplitudes=(),
+        absent=dict.fromkeys(range(len(runs)), 1.0),
+        nodes_about=partial(_most_probable_run_values, len(runs)),
+        draws_about=partial(_drawn_run_values, 1 / np.sqrt(2 * np.maximum(n_rows, 1))),
+    )
 
-    runs: tuple[str, ...] = ()
-    n_rows: tuple[int, ...] = ()
 
-    name, words, covariates = "noise_per_run", "noise that differs from run to run", ("run",)
-    amplitudes = ()
-    nodes_per_parameter = ()  # they are most probable values about a fit
+def _times_run_value(runs: tuple[str, ...], noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+    known = {name: k for k, name in enumerate(runs)}
+    at = np.array([known.get(name, len(runs)) for name in plan.scan_names])
+    values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
+    return replace(noise, sd=noise.sd * values[:, at[plan.scan]])
 
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        plan = extent.plan
-        names = tuple(plan.scan_names)
-        return cls(names, tuple(np.bincount(plan.scan, minlength=len(names)).tolist())) if len(names) > 1 else None
 
-    @property
-    def units(self) -> tuple[str, ...]:
-        return ("1",) * len(self.runs)
+def _runs_in_words(runs: tuple[str, ...], mean: FloatArray, sd: FloatArray) -> str:
+    low, high = int(np.argmin(mean)), int(np.argmax(mean))
+    return (
+        f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
+        f"in run {runs[high]} and {value_with_sd(mean[low], sd[low])} times in run {runs[low]}"
+    )
 
-    @property
-    def nothing(self) -> dict[int, float]:
-        return dict.fromkeys(range(len(self.runs)), 1.0)
 
-    @cached_property
-    def prior(self) -> Product:
-        return Product({f"values[{run}]": LogHeavyTailedPrior(0.3) for run in self.runs})
+def _drawn_run_values(widths: FloatArray, nodes: FloatArray, rng: np.random.Generator) -> FloatArray:
+    return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
 
-    def bank(self) -> FloatArray:
-        return np.ones((1, 1, len(self.runs)))
 
-    def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
-        """Return the runs' most probable values, (n_nodes, n_runs), and log Laplace weights, (n_nodes,).
+def _most_probable_run_values(
+    n_runs: int, residuals: FloatArray, rows: FittedReadings
+) -> tuple[FloatArray, FloatArray]:
+    """Return the runs' most probable values, (n_nodes, n_runs), and log Laplace weights, (n_nodes,).
 
-        There is one node for each of five assumed sds, between runs, of the values' logs; none for a single run.
-        """
-        n_runs = len(self.runs)
-        counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
-        squares: FloatArray = np.bincount(rows.run, residuals**2, minlength=n_runs).astype(np.float64)
-        if n_runs < 2 or not (squares > 0).any():
-            return np.zeros((0, n_runs)), np.zeros(0)
-        values, log_weights = [], []
-        for spread in _SPREADS:
-            logs = _most_probable_log_sd_ratios(counts, squares, spread)
-            curvature = 2 * counts + spread**-2
-            # The overall sd is integrated elsewhere, at fixed values: `beside` corrects for its coupling to them.
-            beside = float(np.sum(2 * counts * spread**-2 / curvature)) / float(2 * counts.sum())
-            log_prior = -0.5 * float(np.sum((logs / spread) ** 2)) - n_runs * np.log(spread)
-            log_weights.append(log_prior - 0.5 * float(np.log(curvature).sum() + np.log(beside)))
-            values.append(np.exp(logs))
-        return np.array(values), np.array(log_weights) - np.log(len(_SPREADS))
-
-    def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
-        """Draw each run's value about its node, with relative sd 1 / sqrt(2 n_rows)."""
-        widths = 1 / np.sqrt(2 * np.maximum(np.array(self.n_rows or (1,) * len(self.runs)), 1))
-        return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
-
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        known = {name: k for k, name in enumerate(self.runs)}
-        at = np.array([known.get(name, len(self.runs)) for name in plan.scan_names])
-        values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
-        return replace(value, sd=value.sd * values[:, at[plan.scan]])
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        low, high = int(np.argmin(mean)), int(np.argmax(mean))
-        return (
-            f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
-            f"in run {self.runs[high]} and {value_with_sd(mean[low], sd[low])} times in run {self.runs[low]}"
-        )
+    There is one node for each of five assumed sds, between runs, of the values' logs; none for a single run.
+    """
+    counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
+    squares: FloatArray = np.bincount(rows.run, residuals**2, minlength=n_runs).astype(np.float64)
+    if n_runs < 2 or not (squares > 0).any():
+        return np.zeros((0, n_runs)), np.zeros(0)
+    values, log_weights = [], []
+    for spread in _SPREADS:
+        logs = _most_probable_log_sd_ratios(counts, squares, spread)
+        curvature = 2 * counts + spread**-2
+        # The overall sd is integrated elsewhere, at fixed values: `beside` corrects for its coupling to them.
+        beside = float(np.sum(2 * counts * spread**-2 / curvature)) / float(2 * counts.sum())
+        log_prior = -0.5 * float(np.sum((logs / spread) ** 2)) - n_runs * np.log(spread)
+        log_weights.append(log_prior - 0.5 * float(np.log(curvature).sum() + np.log(beside)))
+        values.append(np.exp(logs))
+    return np.array(values), np.array(log_weights) - np.log(len(_SPREADS))
 
 
 def _most_probable_log_sd_ratios(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
@@ -201,135 +219,123 @@ MOST_OUTLYING = 0.2
 _SHARES = LogUniform(2e-3, MOST_OUTLYING)
 
 
-class Outliers(NoiseEffect):
+@light_effect("outliers", Stage.NOISE, "outlying readings", ("level", "time"))
+def outliers(kind: LightEffect, of: Extent) -> Effect:
     """A heavy tail: with probability `share`, a reading's noise is `size` times as wide (sd)."""
+    return _on_noise(
+        kind,
+        of,
+        {"share": _SHARES, "size": LogUniform(2.5, LARGEST_SIZE)},
+        ("1", "noise sd"),
+        lambda noise, theta, plan: replace(noise, wide_share=theta[:, :1], wide_times=theta[:, 1:2]),
+        in_words("outliers: {0} % of the readings scatter {1} times as widely as the others", factors=(100,)),
+        (4, 4),
+    )
 
-    name, words, covariates = "outliers", "outlying readings", ("level", "time")
-    units = ("1", "noise sd")
-    prior = Product({"share": _SHARES, "size": LogUniform(2.5, LARGEST_SIZE)})
-    nodes_per_parameter = (4, 4)
-    says = in_words("outliers: {0} % of the readings scatter {1} times as widely as the others", factors=(100,))
 
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
+@light_effect("dropouts", Stage.NOISE, "lost readings", ("level", "time"))
+def dropouts(kind: LightEffect, of: Extent) -> Effect:
+    """Lost readings: with probability `share` a reading is `value`, whatever lies under the sensor."""
+    low, high, ends = of.low - 0.01 * of.span, of.high + 0.01 * of.span, of.plan.instrumentation.declared_ends
+    return _dropouts(low, high, of.reading_unit, nodes_about=partial(_commonest_far_value, ends))
 
 
-@dataclass(frozen=True)
-class Dropouts(NoiseEffect):
-    """Lost readings: with probability `share` a reading is `value`, whatever lies under the sensor.
+def readings_lost_beyond_doubt(lost: FloatArray, n_readings: int, distance: float, unit: str) -> NoiseEffect:
+    """Return the effect that lost these of `n_readings` readings; where they differ, `value` is any of theirs.
 
-    `lowest` and `highest` bound that value; `ends` are those of the instrument's declared range, its likeliest values.
-    `lost`: what the readings read that are lost beyond doubt, of `n_readings` in all, and `distance`, the norm of their
-    residuals in noise sds. They are left out of the recording, so that the noise of the others does not change; where
-    they differ, `value` is any of theirs.
+    They are left out of the recording, so that the noise of the others does not change. `distance` is the norm of their
+    residuals in noise sds.
     """
-
-    lowest: float = -50.0
-    highest: float = 150.0
-    ends: tuple[float, ...] = ()
-    unit: str = field(default="", kw_only=True)
-    lost: tuple[float, ...] = field(default=(), kw_only=True)
-    n_readings: int = field(default=0, kw_only=True)
-    distance: float = field(default=0.0, kw_only=True)
-
-    name, words, covariates = "dropouts", "lost readings", ("level", "time")
-    units = ("1", "reading")
-    nodes_per_parameter = ()  # they depend on the readings, and the share's lie close
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
-        return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.reading_unit)
-
-    @classmethod
-    def of_lost_readings(cls, lost: FloatArray, n_readings: int, distance: float, unit: str) -> Self:
-        """Return the effect that lost these of `n_readings` readings; `distance` as above."""
-        wide = 0.01 * max(float(np.ptp(lost)), float(np.abs(lost).max()), 1e-300)
-        low, high = float(lost.min()) - wide, float(lost.max()) + wide
-        return cls(low, high, unit=unit, lost=tuple(lost.tolist()), n_readings=n_readings, distance=distance)
-
-    @property
-    def parameters_known_before_fit(self) -> FloatArray | None:
-        """The share of the readings that are `lost`, and the commonest value; None without them."""
-        if not self.lost:
-            return None
-        return np.array([len(self.lost) / self.n_readings, max(self.lost, key=self.lost.count)])
-
-    def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
-        """Draw the share that the number of `lost` readings tells (Jeffreys prior), and one of their values."""
-        if not self.lost:
-            return None
-        n, n_lost = len(nodes), len(self.lost)
-        share = rng.beta(n_lost + 0.5, self.n_readings - n_lost + 0.5, n)
-        return np.stack([share, rng.choice(self.lost, n)], axis=1)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"share": _SHARES, "value": Uniform(self.lowest, self.highest)})
-
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
-
-    def bank(self) -> FloatArray:
-        near = _NEAR_END * (self.highest - self.lowest)
-        ends = (self.lowest + near, self.highest - near)
-        return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
-
-    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
-        """Return twelve pairs (share, value), (12, 2), with the commonest value of readings beyond four noise sds.
-
-        There is no node, (0, 2), unless an outlying value occurs twice or is an end of the declared range.
-        """
-        far = rows.readings[np.abs(residuals) > _FAR]
-        # Floats differ in their last digits, so the value is one of the readings, not their mean.
-        n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
-        at_end = (np.abs(far[:, None] - np.array(self.ends)) <= 1e-6 * rows.sd).any(axis=1)
-        if not (at_end | (n_alike > 1)).any():
-            return np.zeros((0, 2))
-        value = far[int(np.argmax(n_alike + 0.5 * at_end))]
-        shares = _SHARES.from_unit((np.arange(12) + 0.5) / 12)
-        return np.stack([shares, np.full(12, value)], axis=1)
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        exact = f"{mean[1]:z.12g} {self.unit}".rstrip()  # lost readings have one value, to the last digit
-        value = value_with_sd(mean[1], sd[1], self.unit) if sd[1] > 0 else exact
-        share = value_with_sd(mean[0], sd[0], factor=100)
-        if len({*self.lost}) > 1:
-            values = [f"{each:.12g}" for each in sorted({*self.lost})]
-            value = f"{', '.join(values[:-1])} or {values[-1]} {self.unit}".rstrip()
-        return f"readings are lost: {share} % of them read {value}, whatever the true value"
+    wide = 0.01 * max(float(np.ptp(lost)), float(np.abs(lost).max()), 1e-300)
+    values = tuple(lost.tolist())
+    return _dropouts(
+        float(lost.min()) - wide,
+        float(lost.max()) + wide,
+        unit,
+        values,
+        nodes_about=partial(_commonest_far_value, ()),
+        draws_about=partial(_drawn_share_and_value, values, n_readings),
+        known=np.array([len(values) / n_readings, max(values, key=values.count)]),
+        distance=distance,
+    )
 
 
-@dataclass(frozen=True)
-class Quantisation(NoiseEffect):
+def _dropouts(low: float, high: float, unit: str, lost: tuple[float, ...] = (), **more: Any) -> NoiseEffect:
+    near = _NEAR_END * (high - low)
+    return NoiseEffect(
+        dropouts.name,
+        dropouts.stage,
+        {"share": _SHARES, "value": Uniform(low, high)},
+        ("1", "reading"),
+        dropouts.covariates,
+        _lose_readings,
+        np.array([[[share, end]] for share in (0.01, 0.05) for end in (low + near, high - near)]),
+        partial(_dropouts_in_words, lost, unit),
+        **more,
+    )
+
+
+def _lose_readings(noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+    return replace(noise, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
+
+
+def _commonest_far_value(
+    ends: tuple[float, ...], residuals: FloatArray, rows: FittedReadings
+) -> tuple[FloatArray, FloatArray]:
+    """Return twelve pairs (share, value), (12, 2), with the commonest value of readings beyond four noise sds.
+
+    There is no node, (0, 2), unless an outlying value occurs twice or is one of the `ends` of the declared range, its
+    likeliest values. Log weights are equal.
+    """
+    far = rows.readings[np.abs(residuals) > _FAR]
+    # Floats differ in their last digits, so the value is one of the readings, not their mean.
+    n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
+    at_end = (np.abs(far[:, None] - np.array(ends)) <= 1e-6 * rows.sd).any(axis=1)
+    if not (at_end | (n_alike > 1)).any():
+        return np.zeros((0, 2)), np.zeros(0)
+    value = far[int(np.argmax(n_alike + 0.5 * at_end))]
+    shares = _SHARES.from_unit((np.arange(12) + 0.5) / 12)
+    return np.stack([shares, np.full(12, value)], axis=1), np.full(12, -np.log(12))
+
+
+def _drawn_share_and_value(
+    lost: tuple[float, ...], n_readings: int, nodes: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Draw the share that the number of `lost` readings tells (Jeffreys prior), and one of their values."""
+    n, n_lost = len(nodes), len(lost)
+    share = rng.beta(n_lost + 0.5, n_readings - n_lost + 0.5, n)
+    return np.stack([share, rng.choice(lost, n)], axis=1)
+
+
+def _dropouts_in_words(lost: tuple[float, ...], unit: str, mean: FloatArray, sd: FloatArray) -> str:
+    exact = f"{mean[1]:z.12g} {unit}".rstrip()  # lost readings have one value, to the last digit
+    value = value_with_sd(mean[1], sd[1], unit) if sd[1] > 0 else exact
+    share = value_with_sd(mean[0], sd[0], factor=100)
+    if len({*lost}) > 1:
+        values = [f"{each:.12g}" for each in sorted({*lost})]
+        value = f"{', '.join(values[:-1])} or {values[-1]} {unit}".rstrip()
+    return f"readings are lost: {share} % of them read {value}, whatever the true value"
+
+
+ROUNDING_SEEN_ABOVE = 0.3
+"""Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
+
+
+@light_effect("quantisation", Stage.NOISE, "rounded readings", ("lattice",))
+def quantisation(kind: LightEffect, of: Extent) -> Effect | None:
     """Readings rounded to a step that was not declared: step round(reading / step), after the noise."""
-
-    smallest: float = 0.05
-    largest: float = 20.0
-    unit: str = field(default="", kw_only=True)
-
-    name, words, covariates = "quantisation", "rounded readings", ("lattice",)
-    units = ("reading",)
-    n_nodes = 16
-    nodes_per_parameter = ()  # one node, from the readings
-    seen_above: ClassVar[float] = 0.3
-    """Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        if extent.plan.instrumentation.step is not None:
-            return None
-        return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.reading_unit)
-
-    @cached_property
-    def prior(self) -> Product:
-        return Product({"step": LogUniform(self.smallest, self.largest)})
-
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        return replace(value, step=theta[:, :1])
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return in_words("the readings are rounded to steps of {0}, which were not declared", self.unit)(mean, sd)
+    if of.plan.instrumentation.step is not None:
+        return None
+    return _on_noise(
+        kind,
+        of,
+        {"step": LogUniform(1e-3 * of.span, 0.2 * of.span)},
+        ("reading",),
+        lambda noise, theta, plan: replace(noise, step=theta[:, :1]),
+        in_words("the readings are rounded to steps of {0}, which were not declared", of.reading_unit),
+        (16,),
+        from_prior=False,  # one, from the readings
+    )
 
 
 def lattice_step(readings: FloatArray) -> float:

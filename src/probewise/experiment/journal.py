@@ -29,7 +29,7 @@ import numpy as np
 from probewise._kinds import checked_path
 from probewise._writing import hold_lock, write_and_sync, write_text_atomically
 from probewise.arm.instrument import Pose, Reading
-from probewise.effects import NamedEffect
+from probewise.effects import Effect, NoiseEffect
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.io import parse_json_file_text, read_bytes
 from probewise.recordings.patterns import Pattern
@@ -378,9 +378,9 @@ def value_digest(value: object) -> str:
 
 def _digested(value: object) -> Iterator[bytes]:
     """Yield types, names of fields and bits of a value, to be digested."""
-    if isinstance(value, NamedEffect):
+    if isinstance(value, Effect):
         yield _EFFECT
-        yield from _digested((value.name, getattr(value, "where", None)))
+        yield from _digested((value.name, None if isinstance(value, NoiseEffect) else value.where))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         yield f"<{type(value).__qualname__}>".encode()
         for item in dataclasses.fields(value):

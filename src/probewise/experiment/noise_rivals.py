@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects import HeavyTailedPrior
-from probewise.effects.noise import CorrelatedNoise, Outliers, SignalDependentNoise, lattice_step
+from probewise.effects.noise import correlated_noise, lattice_step, outliers, signal_dependent_noise
 from probewise.effects.noise_distribution import log_gaussian_density, log_rounding_cell_density
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
@@ -122,7 +122,7 @@ def noise_likelihoods(noise: DeclaredNoise, levels: tuple[float, float]) -> dict
     amplitude = HeavyTailedPrior(0.01 * abs(levels[1] - levels[0]), positive=True)
     laws: dict[str, Callable[[FloatArray, FloatArray], FloatArray]] = {
         "noise_sd": partial(_changed_sd, noise),
-        "outliers": partial(_outliers, noise, Outliers().bank()[:, 0]),
+        "outliers": partial(_outliers, noise, outliers().entries[:, 0]),
         "dropouts": partial(_lost_readings, noise, levels),
         "correlated_noise": partial(_correlated, noise),
         "signal_dependent_noise": partial(_signal_dependent, noise, levels),
@@ -180,7 +180,7 @@ def _correlated(noise: DeclaredNoise, readings: FloatArray, predicted: FloatArra
     before[:, 1:] = (readings - predicted)[:, :-1]
     first = noise.log_density(readings[:1], predicted[:, :1])[:, 0]
     nodes = []
-    for rho in CorrelatedNoise().prior.from_unit_cube(_NODES)[:, 0].tolist():
+    for rho in correlated_noise().prior.from_unit_cube(_NODES)[:, 0].tolist():
         sd = noise.sd * math.sqrt(1.0 - rho**2)
         later = noise.log_density(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd=sd)
         nodes.append(first + later.sum(axis=1))
@@ -195,7 +195,7 @@ def _signal_dependent(
     return _log_mean_over_nodes(
         [
             noise.log_density(readings, predicted, sd=noise.sd * np.sqrt(1.0 + ratio * seen)).sum(axis=1)
-            for ratio in SignalDependentNoise().prior.from_unit_cube(_NODES)[:, 0].tolist()
+            for ratio in signal_dependent_noise().prior.from_unit_cube(_NODES)[:, 0].tolist()
         ]
     )
 

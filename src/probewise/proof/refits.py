@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, starts_with_more_gaussians
 from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
-from probewise.effects import AGAIN, VOCABULARY, EffectKind, Extent, NamedEffect
+from probewise.effects import AGAIN, VOCABULARY, Effect, Extent, LightEffect
 from probewise.errors import NotConvergedError
 from probewise.proof.systems.cases import DrawnSystem, SystemCase, SystemEffect
 from probewise.proof.systems.kinds import SystemKind, SystemTable
@@ -114,7 +114,7 @@ class _Rivalry:
         self._usable = np.flatnonzero(readings.usable)
         self._problem = Linearised.of(found, white_noise(len(self._usable)))
 
-    def entries(self, effect: NamedEffect[Any]) -> tuple[EffectTemplates, IntArray, float]:
+    def entries(self, effect: Effect) -> tuple[EffectTemplates, IntArray, float]:
         """Return the template bank of an effect, its entries from the best to the worst, and the cosine of the best."""
         templates = templates_of_effect(self.found, effect, self._usable)
         blocks = OrthonormalBlocks.of(self._problem, templates.columns)
@@ -123,7 +123,7 @@ class _Rivalry:
         whole = float(self._problem.residual @ self._problem.residual)
         return templates, order, float(np.sqrt(min(explained[order[0]] / whole, 1.0)))
 
-    def refits(self, effect: NamedEffect[Any], templates: EffectTemplates, entries: Iterable[int]) -> Iterator[Fit]:
+    def refits(self, effect: Effect, templates: EffectTemplates, entries: Iterable[int]) -> Iterator[Fit]:
         """Yield the fit of the model with an effect from each of these entries of its template bank."""
         found, n = self.found, len(self._usable)
         for at in entries:
@@ -144,7 +144,7 @@ class _Rivalry:
 
 
 def cosines_with_vocabulary(
-    refit: NullRefit, clean: Recording, changed: Recording, *, vocabulary: Mapping[str, EffectKind] = VOCABULARY
+    refit: NullRefit, clean: Recording, changed: Recording, *, vocabulary: Mapping[str, LightEffect] = VOCABULARY
 ) -> dict[str, float]:
     """Return the cosine of an effect's residuals, after a refit of the null model, with every named effect on the mean.
 
@@ -225,7 +225,7 @@ class SystemRefit:
         """Return readings as a recording, with the error of the integration at the truth, which a fit would absorb."""
         return self._recording.with_readings(readings + self._error)
 
-    def forms(self, found: Fit) -> dict[str, NamedEffect[Any]]:
+    def forms(self, found: Fit) -> dict[str, Effect]:
         """Return by name every form of the engine's vocabulary about a fit, of two waves of a kind the first."""
         return {name: form for name, form in bind_forms(self.reference(found)).items() if not name.endswith(AGAIN)}
 
@@ -259,7 +259,7 @@ def run_table(rows: SystemTable, kind: SystemKind, readings: FloatArray) -> RunT
     return RunTable({**runs, **rows.columns, kind.reading: readings}, time=kind.time, run=kind.run)
 
 
-def _best_fit(found: Fit, readings: Recording, forms: Sequence[NamedEffect[Any]]) -> Fit:
+def _best_fit(found: Fit, readings: Recording, forms: Sequence[Effect]) -> Fit:
     """Add forms to a fit, one after the other, from their best starts; return the best fit of all."""
     if not forms:
         return found

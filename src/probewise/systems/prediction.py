@@ -15,8 +15,8 @@ from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
-from probewise.effects import EFFECTS, NamedEffect
-from probewise.effects.noise import NoisePerRun, RandomWalk
+from probewise.effects import EFFECTS, Effect
+from probewise.effects.noise import noise_of_runs, noise_per_run, random_walk
 from probewise.effects.noise_distribution import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
@@ -250,7 +250,7 @@ def _chain_with_converged_step(chain: SystemChain, theta: FloatArray, table: Run
     The step was chosen for the likeliest parameters and the gaps between the rows of the recording. Over longer gaps,
     and at the fastest rates that the samples hold, an integration may run away.
     """
-    effects = cast(Sequence[NamedEffect[Any]], chain.effects)
+    effects = cast(Sequence[Effect], chain.effects)
     extreme = theta[np.unique([theta.argmin(axis=0), theta.argmax(axis=0)])]
     try:
         system = with_converged_step(
@@ -328,7 +328,7 @@ def _incomplete_input_columns(simulator: Simulator, table: RunTable) -> dict[str
     return {k: v for k, v in table.covariates.items() if k not in others and not np.isfinite(v).all()}
 
 
-def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
+def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
     """Bind the effects of a fitted simulator to the runs of a table, in the order of `fitted.effects`.
 
     Raises ParameterError if a column that an effect reads is missing, time falls within a run and an effect depends on
@@ -350,16 +350,16 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
     for name in fitted.effects:
         if name in forms:
             out.append(forms[name])
-        elif name == RandomWalk.name:
-            out.append(RandomWalk(n_before=table.first_row))
-        elif name == NoisePerRun.name:
+        elif name == random_walk.name:
+            out.append(random_walk())
+        elif name == noise_per_run.name:
             seen = () if fitted.known is None else fitted.known.table.scan_names
-            out.append(NoisePerRun(tuple(dict.fromkeys((*seen, *table.scan_names)))))
+            out.append(noise_of_runs(tuple(dict.fromkeys((*seen, *table.scan_names)))))
         elif name in EFFECTS:
             out.append(EFFECTS[name]())
         else:
             raise ParameterError("effects", name, "an effect that this version knows; diagnose again with it")
-    return cast(list[NamedEffect[Any]], out)
+    return cast(list[Effect], out)
 
 
 def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
@@ -421,7 +421,7 @@ def _chain_samples_and_whether_drawn(
             if effect is None:  # its effect, bound to the recording again, has other parameters
                 raise ParameterError("names", fitted.names, f"all parameters of the effects; {name} is missing")
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
-            positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
+            positive = effect == noise_per_run.name  # positive parameters scatter in the logarithm
             drawn = draw_value_for_new_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
     return out, any(name not in at and name not in fixed for name in chain.names)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.effects import NamedEffect
+from probewise.effects import Effect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.recordings.plan import masks_of_readings_at_ends
@@ -234,7 +234,7 @@ class System:
         """Whether predictions are worth sparing: of a law, and of a `simulate` that is called for each sample."""
         return self.caller is None or not self.caller.broadcasts
 
-    def admits(self, effect: NamedEffect[Any]) -> bool:
+    def admits(self, effect: Effect) -> bool:
         """Return whether an effect acts at a stage of this system: False for one on rates without a law."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
 
@@ -246,7 +246,7 @@ class System:
         """Map parameters to standard-normal coordinates, (n_samples, n_params) both."""
         return np.asarray(ndtri(self.prior.to_unit_cube(theta)))
 
-    def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
+    def chain(self, plan: Any, effects: Sequence[Effect], *, n_nodes: int = 0) -> SystemChain:
         """Return the chain of the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
@@ -422,7 +422,7 @@ def with_converged_step(
     system: System,
     table: RunTable,
     theta: FloatArray,
-    effects: Sequence[NamedEffect[Any]] = (),
+    effects: Sequence[Effect] = (),
     *,
     tolerance: float,
     or_finest: bool = False,
@@ -463,7 +463,7 @@ def _halved_until_still(
     system: System,
     table: RunTable,
     theta: FloatArray,
-    effects: Sequence[NamedEffect[Any]],
+    effects: Sequence[Effect],
     *,
     tolerance: float,
     or_finest: bool = False,

@@ -15,7 +15,7 @@ from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, i
 from probewise.diagnosis.search.search import search_with_formulas
 from probewise.diagnosis.search.searched import Evidences, posterior_of
 from probewise.effects import Extent
-from probewise.effects.noise import CorrelatedNoise, RandomWalk
+from probewise.effects.noise import correlated_noise, random_walk
 from probewise.priors import LogUniform, Uniform
 from probewise.systems import Law, RunTable, Simulator
 
@@ -43,7 +43,7 @@ def state(prepared):
 
 def _state(prepared):
     extent = Extent.of(prepared.recording)
-    return state_with_nulls(prepared, {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)})
+    return state_with_nulls(prepared, {kind.name: kind.for_extent(extent) for kind in (correlated_noise, random_walk)})
 
 
 def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):

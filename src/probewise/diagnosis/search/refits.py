@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
@@ -30,8 +30,8 @@ from probewise.diagnosis.templates import (
     log_bayes_factors_by_label,
     log_mean_exp,
 )
-from probewise.effects import NUISANCES, NamedEffect, NoiseEffect, is_out_of_vocabulary
-from probewise.effects.noise import CorrelatedNoise, Quantisation, RandomWalk, lattice_step
+from probewise.effects import NUISANCES, Effect, NoiseEffect, is_out_of_vocabulary
+from probewise.effects.noise import ROUNDING_SEEN_ABOVE, correlated_noise, lattice_step, quantisation, random_walk
 from probewise.errors import NotConvergedError
 from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Recording
@@ -165,7 +165,7 @@ def effects_out_of_vocabulary(mean: Names) -> Names:
     return tuple(name for name in mean if is_out_of_vocabulary(name))
 
 
-WITH_MEMORY = frozenset({CorrelatedNoise.name, RandomWalk.name})
+WITH_MEMORY = frozenset({correlated_noise.name, random_walk.name})
 """Effects on the noise of which a noise distribution can contain only one."""
 
 
@@ -191,14 +191,13 @@ class NoiseModels:
         self._step = lattice_step(self.recording.readings[self.recording.usable])
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
-        seen = Quantisation.seen_above * sd < self._step
-        rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
-        before = {name: effect.parameters_known_before_fit for name, effect in self.effects.items()}
-        shown = {name: values for name, values in before.items() if values is not None}
+        seen = ROUNDING_SEEN_ABOVE * sd < self._step
+        rounded = {quantisation.name: np.array([self._step])} if quantisation.name in self.effects and seen else {}
+        shown = {name: effect.known for name, effect in self.effects.items() if effect.known is not None}
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))
         self._hidden = sd < HIDDEN * self._step
-        others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
+        others = [name for name in self.effects if name not in (quantisation.name, *self.certain)]
         single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in sorted(others)))]
         self.models = {names: self._build_model(names) for names in single}
 
@@ -325,7 +324,7 @@ class Refits:
     sensor: Null | None
     noises: NoiseModels
     templates: TemplateCache
-    known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
+    known: dict[tuple[WeighedFit, Effect, float], Extended] = field(default_factory=dict, repr=False)
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
     scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
     """Log Bayes factors of the templates of a bank, by label."""
@@ -372,7 +371,7 @@ class Refits:
         detectable = log_probability_effects_detectable(found, law, self.templates.usable)
         return WeighedFit.of(found, law, evidence, detectable)
 
-    def refit_with_effect(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
+    def refit_with_effect(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
 
         A refit made before is returned as it was.
@@ -385,7 +384,7 @@ class Refits:
             self.known[key] = self._refit_with_likely_variants(parent, effect, against)
         return self.known[key]
 
-    def _refit_with_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
+    def _refit_with_likely_variants(self, parent: WeighedFit, effect: Effect, against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)
         own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
 
@@ -451,7 +450,7 @@ class Refits:
     def _refit_variant(
         self,
         parent: WeighedFit,
-        effect: NamedEffect[Any],
+        effect: Effect,
         templates: EffectTemplates,
         variant: int,
         seen: Sequence[tuple[Linearised, FloatArray]],
@@ -513,7 +512,7 @@ def _minus_log_likelihood(law: NoiseLaw, residuals: FloatArray) -> float:
     return float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0])
 
 
-def _variant_to_show(log_z: FloatArray, variants: Sequence[NamedEffect[Any]]) -> int:
+def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:
     """Return the index of the refitted variant that stands for all of them: the best, or one with a scale in common.
 
     Values per run that are each of their own size are pulled to zero where readings leave their sum open, so that few

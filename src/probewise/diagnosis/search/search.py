@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -55,8 +55,8 @@ from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unl
 from probewise.effects import (
     AGAIN,
     PROPOSAL,
+    Effect,
     Extent,
-    NamedEffect,
     NoiseEffect,
     is_out_of_vocabulary,
     name_of_first_copy,
@@ -107,7 +107,7 @@ class SearchState:
     this search's budget of refits is spent; `share`: share of the budget that may be spent by now.
     """
 
-    effects: Mapping[str, NamedEffect[Any]]
+    effects: Mapping[str, Effect]
     prior: PriorOdds
     refits: Refits
     tried_always: frozenset[str] = frozenset()
@@ -144,7 +144,7 @@ class SearchState:
         return self.refits.sensor is not None
 
     @property
-    def effects_in_vocabulary(self) -> list[NamedEffect[Any]]:
+    def effects_in_vocabulary(self) -> list[Effect]:
         """The effects that are in the vocabulary."""
         return [effect for name, effect in self.effects.items() if not is_out_of_vocabulary(name)]
 
@@ -924,7 +924,7 @@ def needs_more_than_memoryless_noise(searched: Searched) -> bool:
     return 1.0 - sum(plain) > _LEFT_FROM
 
 
-def _promise_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
+def _promise_by_formula(searched: Searched, proposals: Mapping[str, Effect]) -> dict[str, float]:
     """Return for each formula its largest screened log evidence beside the null, the best single effect or the leader.
 
     The leader is the most probable combination. The log prior of what the formula stands beside is included, that of

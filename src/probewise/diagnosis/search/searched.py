@@ -26,7 +26,7 @@ from probewise.diagnosis.search.refits import (
 from probewise.diagnosis.templates import TemplateBank, TemplateCache
 from probewise.effects import PROPOSAL, is_out_of_vocabulary, name_of_first_copy
 from probewise.effects.effect import ROWS_OF_A_SIDE
-from probewise.effects.noise import Outliers
+from probewise.effects.noise import outliers
 from probewise.sensor import Stage
 
 _BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
@@ -92,13 +92,13 @@ class Evidences:
         first, are many ways to say the same of fewer than five rows; the others differ by less than the three nats that
         tell aliases apart.
         """
-        noise = tuple(sorted({Outliers.name, *certain}))
+        noise = tuple(sorted({outliers.name, *certain}))
         nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
         if not nulls:
             return False
         null = max(nulls, key=lambda fit: fit.evidence[noise].log_z)
         least = null.evidence[noise].log_z
-        odds = prior.log_prior_on_noise((Outliers.name,)) - prior.log_prior_on_noise(())
+        odds = prior.log_prior_on_noise((outliers.name,)) - prior.log_prior_on_noise(())
         rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
         if not rivals or not least - max(fit.evidence[certain].log_z for fit in nulls) + odds > _BEYOND_DOUBT:
             return False

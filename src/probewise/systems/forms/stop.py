@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.effects import Extent, NoiseEffect
+from probewise.effects import NoiseEffect
 from probewise.effects.noise import lattice_step
-from probewise.priors import Product, Uniform
+from probewise.priors import Uniform
 from probewise.recordings.plan import Plan, Recording
-from probewise.sensor.stages import NoiseParameters
+from probewise.sensor.stages import NoiseParameters, Stage
 
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
@@ -27,7 +25,7 @@ _NEARLY_ALL = 0.9  # of the readings at a stop must have a signal near it or bey
 
 
 @dataclass(frozen=True)
-class MeterStop(NoiseEffect):
+class MeterStop:
     """Saturation of a meter at `level`, after the noise: its readings there are exactly equal.
 
     Readings at the stop are left out of the fit, so that the noise model does not change. In the stored model, the stop
@@ -39,42 +37,36 @@ class MeterStop(NoiseEffect):
     reading: str = "the reading"
     unit: str = ""
 
-    name: ClassVar[str] = "saturation"
-    units: ClassVar[tuple[str, ...]] = ("reading",)
-    covariates: ClassVar[tuple[str, ...]] = ("level",)
-    amplitudes: ClassVar[tuple[int, ...]] = ()
-    nodes_per_parameter: ClassVar[tuple[int, ...]] = ()
-    changes_the_mean: ClassVar[bool] = True
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Return None: readings alone show a stop; see `find_meter_stop_and_mask`."""
-        return None
-
     @property
-    def parameters_known_before_fit(self) -> FloatArray:
-        """The level, (1,)."""
-        return np.array([self.level])
-
-    @cached_property
-    def prior(self) -> Product:
-        """Prior of the level: certain to within rounding."""
+    def effect(self) -> NoiseEffect:
+        """The stop as an effect, whose level is certain to within rounding."""
         near = 1e-9 * (1 + abs(self.level))
-        return Product({"level": Uniform(self.level - near, self.level + near)})
+        return NoiseEffect(
+            "saturation",
+            Stage.NOISE,
+            {"level": Uniform(self.level - near, self.level + near)},
+            ("reading",),
+            ("level",),
+            _unchanged,
+            np.array([[[self.level]]]),
+            self._in_words,
+            amplitudes=(),
+            known=np.array([self.level]),
+            change_of_readings=self._change,
+        )
 
-    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-        """Return the noise unchanged."""
-        return value
-
-    def change_of_readings(self, predicted: FloatArray) -> FloatArray:
+    def _change(self, predicted: FloatArray) -> FloatArray:
         """Return the change of predicted readings, of any shape, by the stop: 0 or level - predicted."""
         beyond = np.maximum if self.is_ceiling else np.minimum
         return -beyond(predicted - self.level, 0.0)
 
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Return a sentence on the level at which the readings end; mean and sd are not used."""
+    def _in_words(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if self.is_ceiling else "falls"
         return f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip() + ", where the meter stops"
+
+
+def _unchanged(noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+    return noise
 
 
 def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:

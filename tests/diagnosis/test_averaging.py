@@ -29,7 +29,7 @@ def samples_of(n_gaussians: int, n: int = 500) -> ModelSamples:
     sensor = default_sensor(Extent(10.0, 60.0, PLAN), n_gaussians)
     z = 0.3 * np.random.default_rng(n_gaussians).standard_normal((n, sensor.n_params))
     chain = sensor.chain(PLAN, (), n_nodes=ACCURATE_NODES)
-    return ModelSamples(chain, sensor.theta(z), np.full(n, float(n_gaussians)), (), n_gaussians)
+    return ModelSamples(chain, sensor.theta(z), np.full(n, float(n_gaussians)), n_gaussians)
 
 
 def test_a_gaussian_in_halves_predicts_the_same():
@@ -68,7 +68,7 @@ def with_effect(name: str, n_gaussians: int, mark: float) -> ModelSamples:
     own = effect.prior.from_unit_cube(np.random.default_rng(3).random((500, len(effect.prior.names))))
     chain = default_sensor(EXTENT, n_gaussians).chain(PLAN, (effect,), n_nodes=ACCURATE_NODES)
     theta = np.concatenate([plain.theta, own], axis=1)
-    return ModelSamples(chain, theta, np.full(500, mark), (name,), n_gaussians)
+    return ModelSamples(chain, theta, np.full(500, mark), n_gaussians)
 
 
 def test_hypotheses_are_mixed_by_their_probability_and_predict_what_each_does():

@@ -99,7 +99,7 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     np.testing.assert_array_equal(chain.readings_from_simulated_view(view, tilted, high), expected)
     np.testing.assert_array_equal(chain.poses(tilted, high).x_mm, of_calibration.poses(tilted, commanded).x_mm)
     assert np.abs(expected - of_calibration.predict(tilted, high)).max() > 1.0
-    samples = ModelSamples(chain, np.tile(tilted, (500, 1)), np.full(500, 0.5), ("sensor_tilt",), 1)
+    samples = ModelSamples(chain, np.tile(tilted, (500, 1)), np.full(500, 0.5), 1)
     repaired = samples.fitted_sensor(replace(whole, plan=high), rng=np.random.default_rng(0))
     np.testing.assert_allclose(predict(repaired, high).mean, expected[0])
     over_shape = SensorAndShape.over(prepared.null, Circle(), np.zeros((1, 3))).chain(high, (), n_nodes=16)

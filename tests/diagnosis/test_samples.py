@@ -31,9 +31,7 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     rng = np.random.default_rng(5)
     z = 0.3 * rng.standard_normal(free.n_params) + 0.02 * rng.standard_normal((500, free.n_params))
     chain = free.chain(PLAN, (), n_nodes=16)
-    samples = ModelSamples(
-        chain, free.theta(z), np.full(500, 0.5), (), free.n_gaussians, has_exchangeable_gaussians=False
-    )
+    samples = ModelSamples(chain, free.theta(z), np.full(500, 0.5), free.n_gaussians, has_exchangeable_gaussians=False)
     readings = chain.predict(samples.theta[:1], PLAN)[0]
     sensor = samples.fitted_sensor(Recording(PLAN, readings + 0.5 * rng.standard_normal(len(PLAN))), rng=rng)
     assert sensor.is_free_form
@@ -75,7 +73,7 @@ def test_a_sensors_effects_count_from_where_those_that_were_fitted_do():
     chain = sensor.chain(far, effects, n_nodes=16)
     own = {"ambient_gradient.per_mm_x": 0.01, "gain_drift.frac": 0.2, "gain_drift.tau_s": 30.0}
     theta = np.concatenate([sensor.theta(np.zeros((1, 7)))[0], [own.get(name, 0.0) for name in chain.names[8:]]])
-    samples = ModelSamples(chain, np.tile(theta, (500, 1)), np.full(500, 0.5), ("ambient_gradient", "gain_drift"), 1)
+    samples = ModelSamples(chain, np.tile(theta, (500, 1)), np.full(500, 0.5), 1)
     predicted = chain.predict(theta[None, :], far)[0]
     found = samples.fitted_sensor(Recording(far, predicted + 0.5 * rng.standard_normal(len(far))), rng=rng)
     assert found.origins["gain_drift"].time_s == far.time_s[40]

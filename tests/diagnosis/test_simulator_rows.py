@@ -220,8 +220,8 @@ def test_samples_of_an_effect_are_its_own_beside_a_column_whose_name_goes_on_wit
     prepared = _prepared({"x.1": _RNG.normal(size=_N)})
     table, system = prepared.recording.plan, prepared.apparatus.system
     effects = [prepared.effects[name] for name in ("sensitivity:x", "sensitivity:x.1")]
-    samples = ModelSamples(system.chain(table, effects), np.array([[1.0, 2.0, 3.0]]), np.ones(1), (), 0)
-    alone = ModelSamples(system.chain(table, effects[1:]), np.array([[1.0, 3.0]]), np.ones(1), (), 0)
+    samples = ModelSamples(system.chain(table, effects), np.array([[1.0, 2.0, 3.0]]), np.ones(1), 0)
+    alone = ModelSamples(system.chain(table, effects[1:]), np.array([[1.0, 3.0]]), np.ones(1), 0)
     assert [samples.effect_samples(effect.name).tolist() for effect in effects] == [[[2.0]], [[3.0]]]
     assert alone.effect_samples("sensitivity:x").shape == (1, 0)
 

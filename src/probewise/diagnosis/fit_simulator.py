@@ -226,7 +226,7 @@ def fit_simulator(
         noise_sd = noise_sd_by_node(noise, with_rounding=True)[nodes]
     else:
         noise_sd = draw_noise_sd(likeliest, recording.readings[usable] - predicted[:, usable], rng=rng)
-    samples = ModelSamples(system.chain(recording.plan, ()), system.theta(z), noise_sd, (), 0)
+    samples = ModelSamples(system.chain(recording.plan, ()), system.theta(z), noise_sd, 0)
     said = [*note_on_improbable_rows(fits[0], recording), *notes_on_declared_noise(simulator, noise_sd)]
     said += _doubts(problem, draws, modes[0], n_even, is_settled=is_settled)
     recording = replace(recording, notes=(*recording.notes, *said))

@@ -73,16 +73,15 @@ N_SAMPLES = 500
 class ModelSamples:
     """Equally weighted posterior samples of a model (`chain`) with effects.
 
-    `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading; `effects`
-    names all effects, including noise effects, in the order of their columns; `n_gaussians` is that of the SSF, 0
-    without; `nuisance` names parameters of this recording only; `has_exchangeable_gaussians`: whether permuting the
-    Gaussians changes nothing; `absent` marks, by effect, the samples without it, (n_samples,).
+    `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading;
+    `n_gaussians` is that of the SSF, 0 without; `nuisance` names parameters of this recording only;
+    `has_exchangeable_gaussians`: whether permuting the Gaussians changes nothing; `absent` marks, by effect, the
+    samples without it, (n_samples,).
     """
 
     chain: Predictor
     theta: FloatArray
     noise_sd: FloatArray
-    effects: tuple[str, ...]
     n_gaussians: int
     nuisance: tuple[str, ...] = ()
     has_exchangeable_gaussians: bool = True
@@ -91,6 +90,11 @@ class ModelSamples:
     def __post_init__(self) -> None:
         object.__setattr__(self, "theta", read_only_floats(self.theta))
         object.__setattr__(self, "noise_sd", read_only_floats(self.noise_sd))
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of all effects, noise effects included, in the order of their columns."""
+        return tuple(effect.name for effect in self.chain.effects)
 
     def effect_samples(self, effect: str) -> FloatArray:
         """Return the samples of one effect's parameters, (n_samples, n_params of the effect)."""
@@ -174,7 +178,6 @@ def sample_model(
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
     of_noise = (noise_effect_samples(effect, noise, nodes, rng=rng) for effect in on_noise)
     theta = np.concatenate([theta, *of_noise], axis=1)
-    names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{quantisation.name}.step"]
     for i in of_lattice:
         sd = sd_of_estimated_lattice_step(recording.readings[recording.usable], float(theta[0, i]))
@@ -186,9 +189,7 @@ def sample_model(
         # Without the rounding variance, but no less than the accuracy of the total.
         least = np.where(rounding > 0, math.sqrt(8 / law.n_kept), 1)
         noise_sd = np.sqrt(np.maximum(noise_sd**2 - rounding**2 / 12, noise_sd**2 * least))
-    return ModelSamples(
-        chain, theta, noise_sd, names, null.n_gaussians, null.nuisance_names, null.has_exchangeable_gaussians
-    )
+    return ModelSamples(chain, theta, noise_sd, null.n_gaussians, null.nuisance_names, null.has_exchangeable_gaussians)
 
 
 def draw_noise_sd(law: NoiseLaw, residuals: FloatArray, *, rng: np.random.Generator) -> FloatArray:
@@ -266,7 +267,7 @@ def mix(
     order = rng.permutation(n)
     theta, noise_sd, absent = (np.concatenate(column)[order] for column in zip(*samples, strict=True))
     marks = {name: absent[:, k] for k, name in enumerate(names) if absent[:, k].any()}
-    return replace(largest, chain=chain, theta=theta, noise_sd=noise_sd, effects=tuple(names), absent=marks)
+    return replace(largest, chain=chain, theta=theta, noise_sd=noise_sd, absent=marks)
 
 
 def _with_more_gaussians(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:

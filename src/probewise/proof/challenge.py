@@ -382,7 +382,7 @@ def _right_predictions(
     seen, rows, sd = drawn.diagnosed_row_numbers, drawn.held_out_row_numbers, drawn.kind.sd
     found = refit.refit(drawn, (case.readings - change)[seen])
     z = found.z + rng.standard_normal((_N_SAMPLES, len(found.z))) @ covariance_root(found.slopes, sd**2).T
-    samples = ModelSamples(found.model.chain, found.model.theta(z), np.full(len(z), sd), (), 0)
+    samples = ModelSamples(found.model.chain, found.model.theta(z), np.full(len(z), sd), 0)
     later = run_table(drawn.table.select_rows(rows), drawn.kind, case.readings[rows])
     predicted, sds = predict_runs(samples, refit.reference(found), later, rng=rng)
     return predicted + change[rows], sds

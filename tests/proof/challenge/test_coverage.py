@@ -68,6 +68,6 @@ def test_samples_at_the_truth_have_its_moments():
     (a, c), (_, b) = np.linalg.inv(covariance) / 2
     theta = np.tile([1.0, 0.5, 1.5, a, b, c, 10.0, 60.0], (5, 1))
     chain = Chain(FreeMixture(1), FreeLevels(), KnownScene({}), ())
-    within = sensor_truths_and_intervals(World(gaussian_spot([blob])), ModelSamples(chain, theta, np.ones(5), (), 1))
+    within = sensor_truths_and_intervals(World(gaussian_spot([blob])), ModelSamples(chain, theta, np.ones(5), 1))
     for truth, low, high in within.values():
         assert (low, high) == pytest.approx((truth, truth), rel=1e-3)

@@ -23,8 +23,7 @@ def _samples(per_run, effect=""):
     about = ReferenceFit(system, table, np.zeros(system.n_params), 0.1)
     effects = [bind_forms(about)[effect]] if effect else []
     theta = np.tile([2.0, 1.0, 1.5][: system.n_params] + [0.5, -0.5] * len(effects), (50, 1))
-    own = tuple(form.name for form in effects)
-    return ModelSamples(system.chain(table, effects), theta, np.full(50, 0.1), own, 0), about
+    return ModelSamples(system.chain(table, effects), theta, np.full(50, 0.1), 0), about
 
 
 def _later():

@@ -48,7 +48,7 @@ def weigh_case(task: Task, *, plan: str) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         found = diagnose(case.recording, thorough=partial(weigh_thoroughly, rng=nested), rng=blind)
-    weighings = [{name: getattr(w, name) for name in _FIELDS} for w in found.report.weighings]
+    weighings = [{name: getattr(w, name) for name in _FIELDS} for w in found.weighings]
     return {"weighings": weighings, "cpu_s": round(time.process_time() - begun_s, 2)}
 
 

@@ -29,7 +29,7 @@ fig.tight_layout()
 
 # %%
 # Residuals against the predicted reading, before and after the repair.
-before, after = diagnosis.repair.before, diagnosis.repair.after
+before, after = diagnosis.before, diagnosis.after
 axes = plots.residuals_against_covariates(
     [("predicted reading (LEGO units)", before.readings)],
     [("as calibrated", before.residuals), ("repaired", after.residuals)],

@@ -83,10 +83,10 @@ print(diagnosis.summary())
 fig, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True)
 first = swings["release"] == "first"
 axes[0].plot(TIME_S, swings["angle_deg"][first], "k.", markersize=3, label="recorded")
-axes[0].plot(TIME_S, diagnosis.repair.after.readings[first], color="tab:blue", label="repaired")
+axes[0].plot(TIME_S, diagnosis.after.readings[first], color="tab:blue", label="repaired")
 axes[0].set_ylabel("angle (deg)")
-axes[1].plot(TIME_S, diagnosis.repair.before.residuals[first], ".", color="tab:orange", label="as written down")
-axes[1].plot(TIME_S, diagnosis.repair.after.residuals[first], ".", color="tab:blue", label="repaired")
+axes[1].plot(TIME_S, diagnosis.before.residuals[first], ".", color="tab:orange", label="as written down")
+axes[1].plot(TIME_S, diagnosis.after.residuals[first], ".", color="tab:blue", label="repaired")
 axes[1].set_ylabel("residual (deg)")
 axes[1].set_xlabel("time since the first release (s)")
 for ax in axes:

@@ -127,10 +127,9 @@ for name, diagnosis in found.items():
 
 fig, axes = plt.subplots(len(systems), 1, figsize=(8, 11))
 for ax, (name, (own, _, covariate, label)) in zip(axes, systems.items(), strict=True):
-    repair = found[name].repair
     ax.axhline(0.0, color="0.8", linewidth=1)
-    ax.plot(covariate, repair.before.residuals, "o", markersize=3, color="tab:orange", label="as written down")
-    ax.plot(covariate, repair.after.residuals, "o", markersize=3, color="tab:blue", label="repaired")
+    ax.plot(covariate, found[name].before.residuals, "o", markersize=3, color="tab:orange", label="as written down")
+    ax.plot(covariate, found[name].after.residuals, "o", markersize=3, color="tab:blue", label="repaired")
     ax.set_title(f"{name}: {' or '.join(found[name].judged.credible[:2])}", loc="left", fontsize=10)
     ax.set_xlabel(label)
     ax.set_ylabel(f"residual ({own.unit})")

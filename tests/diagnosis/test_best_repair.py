@@ -40,7 +40,7 @@ def test_two_bumps_in_time_are_both_repaired():
     assert gain.p_value_after > 0.01
     assert gain.heldout_log_density_per_reading > 5 * gain.heldout_sd > 0
     assert all("block" in name for name, _ in gain.heldout_by_scan)
-    change = found.repair.before.residuals - found.repair.after.residuals
+    change = found.before.residuals - found.after.residuals
     assert np.corrcoef(change, bumps)[0, 1] > 0.9
 
 

@@ -81,7 +81,7 @@ def test_a_recording_without_effects_is_clean():
     assert found.p_value > 0.01
     assert found.repaired.theta.shape == (500, 8)
     assert document["next_measurement"] is None  # no other hypothesis has a probability worth a reading
-    assert found.report.noise.parameters[0].interval95[0] < NOISE_SD < found.report.noise.parameters[0].interval95[1]
+    assert found.noise.parameters[0].interval95[0] < NOISE_SD < found.noise.parameters[0].interval95[1]
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_backlash_is_named_measured_located_and_repaired():
     assert gain.rms_after < gain.rms_before
     assert gain.p_value_after > 0.01
     assert found.effects[0].size_lambda > 5
-    np.testing.assert_allclose(found.repair.after.readings + found.repair.after.residuals, found.recording.readings)
+    np.testing.assert_allclose(found.after.readings + found.after.residuals, found.recording.readings)
     sensor = found.repaired.fitted_sensor(found.recording, rng=np.random.default_rng(0))
     assert sensor.effects == ("backlash",)
     assert sensor.names[-1] == "backlash.width_mm"
@@ -209,7 +209,7 @@ def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
     assert found.improvement.rms_after < found.improvement.rms_before
     assert found.improvement.heldout_log_density_per_reading > 0
     assert (found.where[0].covariate, found.where[0].scan) == ("scan", "edge_90_out")
-    assert found.repair.by_rows
+    assert found.by_rows
     assert "sensor.json does not contain it" in found.summary()
 
 
@@ -288,7 +288,7 @@ def test_a_rare_effect_is_named_and_its_repair_predicts():
     assert knock["probability"] > 0.5
     assert document["unknown_probability"] < 0.2
     assert "arm_knock" not in [candidate["name"] for candidate in document["unknown_candidates"]]
-    assert not found.repair.by_rows
+    assert not found.by_rows
     assert found.repaired.effects == ("arm_knock",)
     assert found.improvement.rms_after < 1.1 * NOISE_SD
     assert found.improvement.p_value_after > 0.001

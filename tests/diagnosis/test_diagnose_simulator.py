@@ -73,9 +73,9 @@ def test_the_gain_on_held_out_parts_is_that_of_the_conditional_densities(diagnos
 
 def test_residuals_count_from_the_walk_and_the_lines_contain_it(diagnosis):
     y = _recorded()[1]
-    gain, repair = diagnosis.improvement, diagnosis.repair
+    gain = diagnosis.improvement
     assert 0.7 * _SD < gain.rms_after < 1.1 * _SD < gain.rms_before
-    for shown, rms in ((repair.before, gain.rms_before), (repair.after, gain.rms_after)):
+    for shown, rms in ((diagnosis.before, gain.rms_before), (diagnosis.after, gain.rms_after)):
         assert shown.has_walk
         np.testing.assert_allclose(shown.readings_with_walk + shown.residuals, y)
         assert np.sqrt(np.mean(shown.residuals**2)) == pytest.approx(rms)

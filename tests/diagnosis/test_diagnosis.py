@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis import Diagnosis, Judged, NextMeasurement, VerdictReport
-from probewise.diagnosis.diagnosis import _public_names
+from probewise.diagnosis import Diagnosis, Judged, NextMeasurement
+from probewise.diagnosis.diagnosis import PredictionAndResiduals, _public_names
 from probewise.diagnosis.findings import EffectFound
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.search.thorough import Weighing
@@ -17,7 +17,10 @@ from probewise.recordings import Plan, Uniform
 from probewise.scene import Circle
 
 JUDGED = Judged("clean", (), 0.4, (Hypothesis((), 1.0),))
-FOUND = Diagnosis(None, JUDGED, None, (), None, VerdictReport("All is explained.", (), None), None)
+PREDICTED = PredictionAndResiduals(np.zeros(2), np.zeros(2))
+FOUND = Diagnosis(
+    None, LightSensorApparatus(), JUDGED, "All is explained.", (), None, *[None] * 3, PREDICTED, PREDICTED
+)
 
 
 def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
@@ -26,23 +29,16 @@ def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():
     assert weighing.label == "interference+interference"
     assert _public_names(weighing.effects) == ["interference", "interference"]
     effects = tuple(EffectFound(name, 0.9, 9.0, f"a wave, {k}", ()) for k, name in enumerate(twice))
-    repair = SimpleNamespace(
-        changes_predictions=False,
-        by_rows=False,
-        improvement=None,
-        after_in_words="repaired",
-        combination_shares={twice: 1.0},
-        shares_in_words="two waves in the readings",
-        unstated_effects=lambda stated: (),
+    model = SimpleNamespace(
+        absent=dict.fromkeys(twice, np.zeros(1, dtype=np.bool_)), effects=twice, chain=SimpleNamespace(effects=())
     )
     found = replace(
         FOUND,
         recording=SimpleNamespace(
             plan=SimpleNamespace(instrumentation=SimpleNamespace(unit_after_number="V")), weighting_in_words=""
         ),
-        report=replace(FOUND.report, effects=effects),
-        repair=repair,
-        apparatus=LightSensorApparatus(),
+        effects=effects,
+        repaired=model,
     )
     assert "again" not in found.summary()
 
@@ -54,7 +50,7 @@ def test_the_field_of_a_next_plan_is_described_as_it_is_believed_to_be():
     asked = NextMeasurement(plan, "read again", 1.0, 9.0, ("a", "b"), ((), ("lag",)), np.full(2, 0.5), np.eye(2))
     names = ("sd", "x_mm", "y_mm", "radius_mm")
     model = SimpleNamespace(chain=SimpleNamespace(names=names), theta=np.array([[1.0, 90.0, 40.0, 50.0]] * 3))
-    diagnosis = replace(FOUND, repair=SimpleNamespace(model=model), next_measurement=asked)
+    diagnosis = replace(FOUND, repaired=model, next_measurement=asked)
     described = diagnosis.with_shape_in_next_plan(Circle()).next_measurement.plan.patterns
     assert described["card"] == Uniform(0.5)
     corners = np.array(described["field"].vertices_mm)

@@ -157,7 +157,7 @@ def test_a_diagnosis_of_few_readings_says_that_they_cannot_tell(n):
     rng = np.random.default_rng(1)
     diagnosis = diagnose_system(line(), table, rng=rng, progress=lambda stage, *a, **k: stages.append(stage))
     assert diagnosis.verdict == "cannot_tell"
-    assert diagnosis.report.reason == f"{n} usable readings are too few for a diagnosis; 12 or more are needed."
+    assert diagnosis.reason == f"{n} usable readings are too few for a diagnosis; 12 or more are needed."
     assert not any("formulas" in stage or "pairs" in stage for stage in stages)
 
 

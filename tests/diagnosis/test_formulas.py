@@ -76,7 +76,7 @@ def test_a_product_of_columns_alone_is_unknown_with_its_formula():
     prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))
     found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
     assert found.verdict == "unknown"
-    formula = found.report.formula
+    formula = found.formula
     assert formula is not None
     assert formula.side == "reading"
     assert re.fullmatch(r"a \(temp - [\d.]+\) \(damp - [\d.]+\)", formula.expression)
@@ -90,7 +90,7 @@ def test_a_product_beside_both_of_its_columns_is_what_remains():
     prepared = _prepared_with_climate(lambda temp, damp: 0.001 * temp * damp)
     found = diagnose_prepared(prepared, rng=np.random.default_rng(1))
     assert {name.rpartition(":")[2] for name in found.combination} == {"temp", "damp"}
-    remainder = found.report.remainder
+    remainder = found.remainder
     assert remainder is not None
     assert remainder.formula is not None
     low, high = remainder.formula.parameters[0].interval95

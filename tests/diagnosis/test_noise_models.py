@@ -203,6 +203,6 @@ def test_correlated_noise_of_mixed_runs_is_found():
         for at in (np.arange(300), rows)
     )
     assert mixed.verdict == apart.verdict == "noise"
-    assert "correlated_noise" in mixed.report.noise.model
-    rho = [next(p.mean for p in d.report.noise.parameters if "rho" in p.name) for d in (mixed, apart)]
+    assert "correlated_noise" in mixed.noise.model
+    rho = [next(p.mean for p in d.noise.parameters if "rho" in p.name) for d in (mixed, apart)]
     assert rho[0] == pytest.approx(rho[1], abs=0.02)

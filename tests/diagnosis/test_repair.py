@@ -7,7 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis.diagnosis import PredictionAndResiduals, Repair, _controls_before_time, repair_of
+from probewise.diagnosis.diagnosis import (
+    Diagnosis,
+    PredictionAndResiduals,
+    _controls_before_time,
+    predictions_before_and_after,
+)
+from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
@@ -26,12 +32,13 @@ def repair(absent=None, residuals=(1.0, np.nan)):
         effect_samples=lambda name: np.array([[2.0], [2.0], [0.0], [0.0]]),
     )
     before = PredictionAndResiduals(np.zeros(2), np.array([1.0, np.nan]))
-    return Repair(model, model, None, before, PredictionAndResiduals(np.zeros(2), np.array(residuals)))
+    after = PredictionAndResiduals(np.zeros(2), np.array(residuals))
+    return Diagnosis(None, LightSensorApparatus(), None, "", (), None, model, model, None, before, after)
 
 
 def test_a_repair_that_predicts_the_same_changes_nothing():
-    assert not repair().changes_predictions
-    assert repair(residuals=(0.5, np.nan)).changes_predictions
+    assert not repair().repair_changes_predictions
+    assert repair(residuals=(0.5, np.nan)).repair_changes_predictions
 
 
 def test_what_samples_lack_is_left_open_in_its_share():
@@ -47,13 +54,13 @@ def test_the_samples_are_told_in_words_with_their_shares():
 
 
 def test_a_model_with_a_formula_in_half_of_its_samples_is_not_said_to_lack_the_correction():
-    assert repair().not_in_model("repaired.json") == "repaired.json does not contain it"
+    assert repair().not_in_model == "sensor.json does not contain it"
     formula = "formula:reading:y:x^2"
     marks = {formula: np.array([True, False, True, False])}
     own = repair(marks)
     model = SimpleNamespace(absent=marks, effects=("lag", formula))
-    said = replace(own, model=model).not_in_model("repaired.json")
-    assert said == "of the samples in repaired.json, 50 % contain a formula for it instead"
+    said = replace(own, repaired=model).not_in_model
+    assert said == "of the samples in sensor.json, 50 % contain a formula for it instead"
 
 
 def test_what_is_corrected_row_by_row_is_not_called_repaired():
@@ -63,8 +70,8 @@ def test_what_is_corrected_row_by_row_is_not_called_repaired():
 
 def test_what_is_carried_and_not_stated_is_said_of_the_samples_that_hold_it():
     marks = {"lag": np.array([False, False, True, True])}
-    assert repair(marks).unstated_effects(set()) == (("lag", 0.5, "it lags by 2 s"),)
-    assert repair(marks).unstated_effects({"lag"}) == ()
+    assert repair(marks).unstated_effects == (("lag", 0.5, "it lags by 2 s"),)
+    assert replace(repair(marks), effects=(LAG,)).unstated_effects == ()
 
 
 @dataclass(frozen=True)
@@ -98,14 +105,13 @@ def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_re
         improvement=None,
         problem=SimpleNamespace(law=white_noise(len(rows))),
     )
-    found = repair_of(prepared, best, None, None, np.full(len(rows), 2.0))
-    assert found.by_rows
-    np.testing.assert_array_equal(found.before.readings, 4.0)
+    before, after = predictions_before_and_after(prepared, best, np.full(len(rows), 2.0))
+    np.testing.assert_array_equal(before.readings, 4.0)
     used = np.isin(np.arange(n), rows)
-    np.testing.assert_array_equal(found.after.readings[used], 7.0)
-    np.testing.assert_array_equal(found.after.residuals[used], 0.0)
-    np.testing.assert_array_equal(found.after.readings[~used], 5.0)
-    np.testing.assert_array_equal(found.after.residuals[~used], 2.0)
+    np.testing.assert_array_equal(after.readings[used], 7.0)
+    np.testing.assert_array_equal(after.residuals[used], 0.0)
+    np.testing.assert_array_equal(after.readings[~used], 5.0)
+    np.testing.assert_array_equal(after.residuals[~used], 2.0)
 
 
 def place(covariate, values, start, end):

@@ -251,7 +251,7 @@ def test_no_pseudo_residual_is_farther_than_what_was_read():
 @pytest.mark.parametrize("noise_sd", [0.9, 1.4])
 def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):
     found = diagnose(as_declared(rounded(noise_sd, 1)), rng=np.random.default_rng(0))
-    assert (found.verdict, found.report.noise.model) == ("clean", "white")
+    assert (found.verdict, found.noise.model) == ("clean", "white")
     assert found.p_value > 0.01  # one test each
     sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
     assert sigma == pytest.approx(np.hypot(noise_sd, STEP / np.sqrt(12)), rel=0.15)

@@ -78,10 +78,10 @@ def test_the_band_of_chance_is_as_wide_as_each_readings_own_noise():
     chain = SimpleNamespace(predict=lambda theta, plan: np.zeros((len(theta), len(plan))))
     diagnosis = SimpleNamespace(
         recording=recording,
-        report=SimpleNamespace(noise=SimpleNamespace(parameters=[SimpleNamespace(name="values[b]", mean=2.0)])),
+        noise=SimpleNamespace(parameters=[SimpleNamespace(name="values[b]", mean=2.0)]),
         repaired=SimpleNamespace(noise_sd=np.array([0.5])),
         null=SimpleNamespace(theta=np.zeros((3, 1)), chain=chain, noise_sd=np.array([0.5])),
     )
     np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, [0.5, 0.5, 1.0, 3.0])
-    diagnosis.report.noise.parameters.append(SimpleNamespace(name="step", mean=12**0.5))
+    diagnosis.noise.parameters.append(SimpleNamespace(name="step", mean=12**0.5))
     np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, np.hypot([0.5, 0.5, 1.0, 3.0], 1.0))

@@ -89,8 +89,7 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated, drawn):
     effect = dataclasses.replace(
         saturated.effects[0], probability=0.9, parameters=(bound,), scans=("edge_90_out", "edge_90_back")
     )
-    report = dataclasses.replace(saturated.report, effects=(effect,))
-    found = dataclasses.replace(saturated, report=report)
+    found = dataclasses.replace(saturated, effects=(effect,))
     html = page.page_html(found, drawn, source="some.csv", seed=1)
     assert "edge_90_out, edge_90_back" in html
     assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]

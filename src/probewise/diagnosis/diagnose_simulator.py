@@ -365,7 +365,7 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
-    white = diagnosis.report.noise.model == "white"
+    white = diagnosis.noise.model == "white"
     out = [*notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd)] if white else []
     caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:

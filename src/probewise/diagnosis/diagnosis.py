@@ -63,81 +63,10 @@ class PredictionAndResiduals:
         return np.asarray(self.readings + self.walk)
 
 
-@dataclass(frozen=True, eq=False)
-class Repair:
-    """The calibrated and the repaired model, as posterior samples (`null`, `model`), and the gain of the latter.
-
-    `before`, `after`: predictions and residuals of both, for all rows, under the same noise. `by_rows`: whether an
-    unknown effect is corrected row by row; `improvement` and `after` include that, `model` does not.
-    """
-
-    null: ModelSamples
-    model: ModelSamples
-    improvement: Improvement
-    before: PredictionAndResiduals
-    after: PredictionAndResiduals
-    by_rows: bool = False
-
-    @property
-    def changes_predictions(self) -> bool:
-        """Whether the residuals of the repaired and of the calibrated model differ."""
-        return not np.array_equal(self.before.residuals, self.after.residuals, equal_nan=True)
-
-    @property
-    def after_in_words(self) -> str:
-        """What the later one of the two predictions is: "repaired", or, row by row, "corrected in these readings"."""
-        return "corrected in these readings" if self.by_rows else "repaired"
-
-    def not_in_model(self, model: str) -> str:
-        """Say that the file `model` lacks the correction by rows, or what share of its samples has a formula."""
-        named = [name for name in self.model.effects if is_out_of_vocabulary(name)]
-        marks = [self.model.absent.get(name, np.zeros(1, dtype=np.bool_)) for name in named]
-        share = 1.0 - float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*marks)))) if marks else 0.0
-        if share:
-            return f"of the samples in {model}, {100 * share:.0f} % contain a formula for it instead"
-        return f"{model} does not contain it"
-
-    @property
-    def combination_shares(self) -> dict[tuple[str, ...], float]:
-        """Share of the repaired model's samples with each combination of the effects that not all samples contain.
-
-        Largest share first; {} if all samples contain the same effects.
-        """
-        absent = self.model.absent
-        if not absent:
-            return {}
-        held = Counter(zip(*(np.where(marks, "", name).tolist() for name, marks in absent.items()), strict=True))
-        return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
-
-    @property
-    def shares_in_words(self) -> str:
-        """Which effects all samples of the repaired model contain, and which only a share of them, in words."""
-        everywhere = tuple(name for name in self.model.effects if name not in self.model.absent)
-        opening, nothing = "", "no effect"
-        if everywhere:
-            opening, nothing = f"{join_names(effects_in_words(everywhere))}; beside that ", "nothing more"
-        held = (
-            f"{hypothesis_in_words(names, nothing=nothing)} ({100 * share:.0f} %)"
-            for names, share in self.combination_shares.items()
-        )
-        return opening + join_lists([*held])
-
-    def unstated_effects(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
-        """List the repaired model's effects that are not `stated`: name, share of the samples with it, sentence."""
-        out = []
-        for effect in cast(Sequence[Effect], self.model.chain.effects):
-            values = self.model.effect_samples(effect.name)
-            marks = self.model.absent.get(effect.name)
-            held = values if marks is None else values[~marks]
-            if effect.name not in stated and len(held):
-                out.append((effect.name, len(held) / len(values), sentence_from_samples(effect, held)))
-        return tuple(out)
-
-
-def repair_of(
-    prepared: Prepared, best: BestRepair, null: ModelSamples, repaired: ModelSamples, change: FloatArray
-) -> Repair:
-    """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
+def predictions_before_and_after(
+    prepared: Prepared, best: BestRepair, change: FloatArray
+) -> tuple[PredictionAndResiduals, PredictionAndResiduals]:
+    """Return those of the null and of the repaired model, for every row, including rows not used in the diagnosis.
 
     `change`: correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
     """
@@ -158,8 +87,7 @@ def repair_of(
             return PredictionAndResiduals(predicted, readings - predicted - walk, walk)
         return PredictionAndResiduals(predicted, prepared.expand_usable_to_all_rows(left - walk[used]), walk)
 
-    before, after = shown(best.calibrated, np.zeros(len(everything))), shown(best.repaired, by_rows)
-    return Repair(null, repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
+    return shown(best.calibrated, np.zeros(len(everything))), shown(best.repaired, by_rows)
 
 
 _SAME = 0.8  # overlap from which two places hold the same rows
@@ -232,50 +160,46 @@ def _place_in_everything(place: Place, prepared: Prepared) -> Place:
     return replace(place, values=everywhere, curve_at=at)
 
 
-@dataclass(frozen=True)
-class VerdictReport:
-    """The verdict in words and numbers: reason, effects, noise, log evidences, and what named effects do not explain.
-
-    `weighings` are log evidences by Laplace's approximation and by nested sampling, if they were computed. `remainder`
-    (a misfit after the repair) and `formula` are None if there is none. `is_settled`: whether one hypothesis on the
-    mean has a probability of .95 or more.
-    """
-
-    reason: str
-    effects: tuple[EffectFound, ...]
-    noise: NoiseFound
-    weighings: tuple[Weighing, ...] = ()
-    remainder: Remainder | None = None
-    formula: Formula | None = None
-    is_settled: bool = False
-
-
 @dataclass(frozen=True, eq=False)
 class Diagnosis(ShowsItself):
     """The result of a diagnosis: the content of diagnosis.json, and the arrays for its figures.
 
-    `recording` is what was diagnosed (several are joined). `where`: places (ranges of covariates) of the repair's
-    effects, largest first, then of other significant residuals. `next_measurement`: None if no question is open, or no
-    readings would answer it.
+    `recording` is what was diagnosed (several are joined). `reason`: the verdict and its reason, in a sentence or two.
+    `effects`: findings on those of probability above 0.001, most probable first. `null`, `repaired`: posterior samples
+    of the calibrated model, without effects, and of the repaired one; `improvement`: the gain of the latter; `before`,
+    `after`: predictions and residuals of both, for all rows, under the same noise.
+
+    `by_rows`: whether an unknown effect is corrected row by row; `improvement` and `after` include that, `repaired`
+    does not. `where`: places (ranges of covariates) of the repair's effects, largest first, then of other significant
+    residuals. `next_measurement`: None if no question is open, or no readings would answer it. `is_settled`: whether
+    one hypothesis on the mean has a probability of .95 or more. `weighings` are log evidences by Laplace's
+    approximation and by nested sampling, if they were computed. `remainder` (a misfit after the repair) and `formula`
+    are None if there is none.
     """
 
     recording: Recording
-    judged: Judged
-    repair: Repair
-    where: tuple[Place, ...]
-    next_measurement: NextMeasurement | None
-    report: VerdictReport
     apparatus: Apparatus
+    judged: Judged
+    reason: str
+    effects: tuple[EffectFound, ...]
+    noise: NoiseFound
+    null: ModelSamples
+    repaired: ModelSamples
+    improvement: Improvement
+    before: PredictionAndResiduals
+    after: PredictionAndResiduals
+    by_rows: bool = False
+    where: tuple[Place, ...] = ()
+    next_measurement: NextMeasurement | None = None
+    is_settled: bool = False
+    weighings: tuple[Weighing, ...] = ()
+    remainder: Remainder | None = None
+    formula: Formula | None = None
 
     @property
     def verdict(self) -> Verdict:
         """The verdict: clean, named, cannot_tell, unknown or noise."""
         return self.judged.verdict
-
-    @property
-    def reason(self) -> str:
-        """The verdict and its reason, in a sentence or two."""
-        return self.report.reason
 
     @property
     def p_value(self) -> float:
@@ -293,29 +217,61 @@ class Diagnosis(ShowsItself):
         return self.judged.hypotheses
 
     @property
-    def effects(self) -> tuple[EffectFound, ...]:
-        """Findings on the effects of probability above 0.001, most probable first."""
-        return self.report.effects
+    def repair_changes_predictions(self) -> bool:
+        """Whether the residuals of the repaired and of the calibrated model differ."""
+        return not np.array_equal(self.before.residuals, self.after.residuals, equal_nan=True)
 
     @property
-    def improvement(self) -> Improvement:
-        """Gain of the repaired model over the calibrated one."""
-        return self.repair.improvement
+    def after_in_words(self) -> str:
+        """What the later one of the two predictions is: "repaired", or, row by row, "corrected in these readings"."""
+        return "corrected in these readings" if self.by_rows else "repaired"
 
     @property
-    def null(self) -> ModelSamples:
-        """Posterior samples of the calibrated model, without effects."""
-        return self.repair.null
+    def not_in_model(self) -> str:
+        """That the file of the model lacks the correction by rows, or which share of its samples has a formula."""
+        model, named = self.apparatus.words.model, [n for n in self.repaired.effects if is_out_of_vocabulary(n)]
+        marks = [self.repaired.absent.get(name, np.zeros(1, dtype=np.bool_)) for name in named]
+        share = 1.0 - float(np.mean(np.logical_and.reduce(np.broadcast_arrays(*marks)))) if marks else 0.0
+        if share:
+            return f"of the samples in {model}, {100 * share:.0f} % contain a formula for it instead"
+        return f"{model} does not contain it"
 
     @property
-    def repaired(self) -> ModelSamples:
-        """Posterior samples of the repaired model, with its effects."""
-        return self.repair.model
+    def combination_shares(self) -> dict[tuple[str, ...], float]:
+        """Share of the repaired model's samples with each combination of the effects that not all samples contain.
+
+        Largest share first; {} if all samples contain the same effects.
+        """
+        absent = self.repaired.absent
+        if not absent:
+            return {}
+        held = Counter(zip(*(np.where(marks, "", name).tolist() for name, marks in absent.items()), strict=True))
+        return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
+
+    @property
+    def shares_in_words(self) -> str:
+        """Which effects all samples of the repaired model contain, and which only a share of them, in words."""
+        everywhere = tuple(name for name in self.repaired.effects if name not in self.repaired.absent)
+        opening, nothing = "", "no effect"
+        if everywhere:
+            opening, nothing = f"{join_names(effects_in_words(everywhere))}; beside that ", "nothing more"
+        held = (
+            f"{hypothesis_in_words(names, nothing=nothing)} ({100 * share:.0f} %)"
+            for names, share in self.combination_shares.items()
+        )
+        return opening + join_lists([*held])
 
     @property
     def unstated_effects(self) -> tuple[tuple[str, float, str], ...]:
         """Effects in the repaired model that are not in `effects`: name, share of the samples with it, sentence."""
-        return self.repair.unstated_effects({effect.name for effect in self.effects})
+        stated, out = {effect.name for effect in self.effects}, []
+        for effect in cast(Sequence[Effect], self.repaired.chain.effects):
+            values = self.repaired.effect_samples(effect.name)
+            marks = self.repaired.absent.get(effect.name)
+            held = values if marks is None else values[~marks]
+            if effect.name not in stated and len(held):
+                out.append((effect.name, len(held) / len(values), sentence_from_samples(effect, held)))
+        return tuple(out)
 
     def with_shape_in_next_plan(self, shape: Shape) -> Diagnosis:
         """Return the diagnosis with undescribed patterns of its next plan described, so that the plan can be written.
@@ -351,22 +307,22 @@ class Diagnosis(ShowsItself):
         ]
         gain, unit = self.improvement, self.recording.plan.instrumentation.unit_after_number
         unit = f"{unit}{self.recording.weighting_in_words}"
-        after, model = self.repair.after_in_words, self.apparatus.words.model
-        if self.repair.changes_predictions:
+        if self.repair_changes_predictions:
             held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats per held-out reading"
             tested = held if gain.heldout_by_scan else "no reading could be held out"
             rms = f"{gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
-            lines.append(f"{after}: log evidence {gain.log_evidence:+.1f} nats, {tested}, rms of the residuals {rms}")
+            gained = f"log evidence {gain.log_evidence:+.1f} nats, {tested}, rms of the residuals {rms}"
+            lines.append(f"{self.after_in_words}: {gained}")
         elif self.verdict == "noise":
             lines.append(f"repaired noise model: log evidence {gain.log_evidence:+.1f} nats")
-        if self.repair.by_rows:
-            lines.append(f"the unknown effect is corrected in these readings only: {self.repair.not_in_model(model)}")
+        if self.by_rows:
+            lines.append(f"the unknown effect is corrected in these readings only: {self.not_in_model}")
         lines += [
             f"in {share:.0%} of the repaired model's samples: {sentence}"
             for _, share, sentence in self.unstated_effects
         ]
-        if self.repair.combination_shares:
-            lines.append(f"samples of the repaired model contain {self.repair.shares_in_words}")
+        if self.combination_shares:
+            lines.append(f"samples of the repaired model contain {self.shares_in_words}")
         return "\n".join(lines)
 
 
@@ -386,8 +342,8 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     Figures of places (`where`) and the next plan are given by file name; the report and the command line write them.
     """
     require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")
-    judged, report, plan = diagnosis.judged, diagnosis.report, diagnosis.next_measurement
-    remainder, formula = report.remainder, report.formula
+    judged, plan = diagnosis.judged, diagnosis.next_measurement
+    remainder, formula = diagnosis.remainder, diagnosis.formula
     document: dict[str, Any] = {
         "format": "diagnosis/1",
         "verdict": diagnosis.verdict,
@@ -417,7 +373,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         ],
         "improvement": _as_dict(diagnosis.improvement, "heldout_by_scan", "comes_next"),
         "aliases": [asdict(a) for a in judged.aliases],
-        "noise": _as_dict(report.noise, "nuisances"),
+        "noise": _as_dict(diagnosis.noise, "nuisances"),
         "next_measurement": None
         if plan is None
         else {
@@ -431,7 +387,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         document["remainder"] = _without_empty_formula(remainder)
     if formula is not None:
         document["formula"] = asdict(formula)
-    if report.weighings:
+    if diagnosis.weighings:
         document["thorough"] = [
             {
                 "effects": _public_names(twice.effects),
@@ -442,7 +398,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "agree": twice.agree,
                 "doubts": twice.doubts,
             }
-            for twice in report.weighings
+            for twice in diagnosis.weighings
         ]
     plain: dict[str, Any] = json.loads(json.dumps(document))  # with lists for tuples
     return plain

@@ -16,7 +16,7 @@ from probewise._arrays import own_arithmetic
 from probewise._kinds import checked_texts, require_like, require_one_of, require_progress, require_rng
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
 from probewise.diagnosis.best_repair import improvement_and_correction, judged_and_best_repair
-from probewise.diagnosis.diagnosis import Diagnosis, VerdictReport, locate_effects_and_residuals, repair_of
+from probewise.diagnosis.diagnosis import Diagnosis, locate_effects_and_residuals, predictions_before_and_after
 from probewise.diagnosis.findings import effects_found, formula_of, noise_found, remainder_of
 from probewise.diagnosis.fit import Null
 from probewise.diagnosis.light_sensor import LightSensorApparatus
@@ -169,14 +169,26 @@ def diagnosis_of_search(
     if prepared.is_thinned:
         n_usable = int(prepared.everything.usable.sum())
         reason += f" (From {len(prepared.usable_rows)} of {n_usable} readings, evenly spread.)"
+    before, after = predictions_before_and_after(prepared, best, change)
     return Diagnosis(
         recording=prepared.everything,
+        apparatus=prepared.apparatus,
         judged=judged,
-        repair=repair_of(prepared, best, null_samples, repaired, change),
+        reason=reason,
+        effects=found,
+        noise=noise,
+        null=null_samples,
+        repaired=repaired,
+        improvement=best.improvement,
+        before=before,
+        after=after,
+        by_rows=bool(np.any(change)),
         where=where,
         next_measurement=asked,
-        report=VerdictReport(reason, found, noise, weighings, remainder, formula, is_settled=is_settled(searched)),
-        apparatus=prepared.apparatus,
+        is_settled=is_settled(searched),
+        weighings=weighings,
+        remainder=remainder,
+        formula=formula,
     )
 
 

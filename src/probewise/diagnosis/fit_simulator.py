@@ -59,7 +59,7 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     apparatus, model = diagnosis.apparatus, getattr(diagnosis, which)
     if not isinstance(apparatus, SimulatorApparatus):
         raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
-    before = diagnosis.repair.before.readings
+    before = diagnosis.before.readings
     return fitted_system_from_samples(apparatus.about, model, diagnosis.recording, before)
 
 

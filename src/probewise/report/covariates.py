@@ -125,12 +125,12 @@ class ResidualNoise:
     @classmethod
     def of_diagnosis(cls, diagnosis: Diagnosis) -> ResidualNoise:
         """Take the repaired model's noise sds and correlation, and posterior predictions of the calibrated model."""
-        noise = {p.name: p.mean for p in diagnosis.report.noise.parameters}
+        noise = {p.name: p.mean for p in diagnosis.noise.parameters}
         plan = diagnosis.recording.plan
         sd = float(diagnosis.repaired.noise_sd.mean()) * diagnosis.recording.relative_sd
         sd = sd * np.array([noise.get(f"values[{name}]", 1.0) for name in plan.scan_names])[plan.scan]
         if "ratio" in noise:
-            level = diagnosis.repair.after.readings
+            level = diagnosis.after.readings
             share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
             sd = sd * np.sqrt(1 + noise["ratio"] * share)
         sd = np.hypot(sd, noise.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
@@ -144,11 +144,10 @@ class ResidualNoise:
 
     def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
         """Average the calibrated model's residuals in bins of a view; with `after`, also the repaired model's."""
-        repair = diagnosis.repair
         return mean_residuals(
             view.at,
-            repair.before.residuals,
-            repair.after.residuals if after and repair.changes_predictions else None,
+            diagnosis.before.residuals,
+            diagnosis.after.residuals if after and diagnosis.repair_changes_predictions else None,
             sd=self.sd,
             rho=self.rho,
             scan=diagnosis.recording.plan.scan,
@@ -173,8 +172,8 @@ def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> Cov
     candidates = _views_at_period(diagnosis)
     for place in sorted(alarming, key=lambda place: -_probability_unknown_depends_on(diagnosis, place)):
         candidates += views_of_place(diagnosis, place)
-    before, after = diagnosis.repair.before, diagnosis.repair.after
-    if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
+    before, after = diagnosis.before, diagnosis.after
+    if diagnosis.repair_changes_predictions and diagnosis.verdict != "clean":
         change = after.readings_with_walk - before.readings_with_walk
         unit = diagnosis.recording.plan.instrumentation.unit_after_number
         candidates.append(CovariateView(change, f"change that the repair makes ({unit})"))

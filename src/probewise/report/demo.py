@@ -99,7 +99,7 @@ def figure_drawers(run: DemoRun) -> dict[str, Callable[[], bytes]]:
     hidden = started_alike[0].truth_mm
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
     names = [hypothesis_in_words(h.effects) for h in diagnosis.hypotheses]
-    before, after = diagnosis.repair.before.readings, diagnosis.repair.after.readings
+    before, after = diagnosis.before.readings, diagnosis.after.readings
     drawings: dict[str, Callable[[], Any]] = {
         "arm.png": lambda: arm_and_sensor(run.geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden),
         "orientations.png": lambda: sensor_orientations(recording),
@@ -240,7 +240,7 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
     more = fragment("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
     repair = (
         figure(drawn["before_after.png"], diagnosis_report.before_and_after_caption(diagnosis)),
-        *((held,) if diagnosis.repair.changes_predictions and gain.heldout_by_scan else ()),
+        *((held,) if diagnosis.repair_changes_predictions and gain.heldout_by_scan else ()),
         figure(drawn["scans.png"], scans),
         paragraph(more),
     )

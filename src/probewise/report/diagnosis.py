@@ -73,8 +73,9 @@ _NOISE_CAPTIONS = {
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Section]:
     """Build the sections of a diagnosis's page, below the first screen; `drawn` is from `figure_drawers`."""
-    repair, before = diagnosis.repair, diagnosis.apparatus.words.before_in_words
-    changed = f"Before and after: {before}, {repair.after_in_words}" if repair.changes_predictions else "The model"
+    before, changed = diagnosis.apparatus.words.before_in_words, "The model"
+    if diagnosis.repair_changes_predictions:
+        changed = f"Before and after: {before}, {diagnosis.after_in_words}"
     return [
         html.Section("What it could be", _explanation_elements(diagnosis)),
         html.Section("Where it shows", _place_elements(diagnosis, drawn)),
@@ -118,7 +119,7 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
         return "The readings in the order of time. Below: prior probabilities; these readings do not change them."
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
-    after = f", blue squares: {diagnosis.repair.after_in_words}" if diagnosis.repair.changes_predictions else ""
+    after = f", blue squares: {diagnosis.after_in_words}" if diagnosis.repair_changes_predictions else ""
     where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: {diagnosis.apparatus.words.before_in_words}{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
@@ -127,23 +128,23 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
 
 def _walk_note(diagnosis: Diagnosis) -> str:
     """Return the sentence, after a space, that residuals do not contain the noise's random walk; "" without one."""
-    if not diagnosis.repair.after.has_walk:
+    if not diagnosis.after.has_walk:
         return ""
     return " Residuals count from the random walk of the zero that all readings show: what it explains is not in them."
 
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
-    gain, repair, report = diagnosis.improvement, diagnosis.repair, diagnosis.report
-    changes, found = repair.changes_predictions, diagnosis.reason.partition(TO_SEPARATE)[0]
+    gain, changes = diagnosis.improvement, diagnosis.repair_changes_predictions
+    found = diagnosis.reason.partition(TO_SEPARATE)[0]
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
         ("What was found", _as_sentence(diagnosis, found)),
     ]
-    if report.formula is not None:
-        facts.append(("As a formula", _formula_in_words(report.formula)))
-    if report.remainder is not None:
-        facts.append(("Beside that", _as_sentence(diagnosis, report.remainder.sentence)))
+    if diagnosis.formula is not None:
+        facts.append(("As a formula", _formula_in_words(diagnosis.formula)))
+    if diagnosis.remainder is not None:
+        facts.append(("Beside that", _as_sentence(diagnosis, diagnosis.remainder.sentence)))
     if not diagnosis.judged.too_little:
         facts.append(("Could it be chance?", _could_be_chance_in_words(diagnosis)))
     if gain.heldout_by_scan and changes:
@@ -154,14 +155,13 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         run = diagnosis.apparatus.words.run
         facts.append(("Does it predict what comes next?", f"{told} Held out was the last fifth of each {run}."))
     if changes:
-        beside = " (beside the random walk of the zero)" if repair.after.has_walk else ""
+        beside = " (beside the random walk of the zero)" if diagnosis.after.has_walk else ""
         left = f"{_rms_in_words(diagnosis)}{diagnosis.recording.weighting_in_words}{beside}"
-        if repair.by_rows:
-            lacking = repair.not_in_model(diagnosis.apparatus.words.model)
-            left += f". The unknown part is corrected in these readings only: {lacking}"
+        if diagnosis.by_rows:
+            left += f". The unknown part is corrected in these readings only: {diagnosis.not_in_model}"
         facts.append(("Residuals", f"rms {left}."))
-    if repair.combination_shares:
-        samples = f"Posterior samples in {diagnosis.apparatus.words.model} contain {repair.shares_in_words}."
+    if diagnosis.combination_shares:
+        samples = f"Posterior samples in {diagnosis.apparatus.words.model} contain {diagnosis.shares_in_words}."
         facts.append(("In the repaired model", samples))
     return facts
 
@@ -170,10 +170,10 @@ def _rms_in_words(diagnosis: Diagnosis, weighting: str = "") -> str:
     """Write the rms of the residuals as calibrated, and after a repair that changes them."""
     gain, unit = diagnosis.improvement, f"{diagnosis.recording.plan.instrumentation.unit_after_number}{weighting}"
     before = f"{gain.rms_before:.3g} {unit}"
-    if not diagnosis.repair.changes_predictions:
+    if not diagnosis.repair_changes_predictions:
         return before
     before += f" {diagnosis.apparatus.words.before_in_words}"
-    return f"{before}, {gain.rms_after:.3g} {unit} {diagnosis.repair.after_in_words}"
+    return f"{before}, {gain.rms_after:.3g} {unit} {diagnosis.after_in_words}"
 
 
 def _formula_in_words(formula: Formula) -> str:
@@ -222,7 +222,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None and diagnosis.judged.too_little:
         cure = diagnosis.apparatus.words.find_signal
         return f"{cure[:1].upper()}{cure[1:]}, and take more readings."
-    if plan is None and diagnosis.report.is_settled:
+    if plan is None and diagnosis.is_settled:
         return "Nothing more is needed."
     if plan is None:
         return "No readings that can be taken here would settle what is open."
@@ -286,7 +286,7 @@ def _laplace_and_nested_table(diagnosis: Diagnosis) -> Sequence[str]:
             typeset_numbers(value_with_sd(w.nested, w.error)),
             ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
         )
-        for w in diagnosis.report.weighings
+        for w in diagnosis.weighings
     ]
     header = ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat plus the error")
     caption = "Log evidence ln Z (nats) by the Laplace approximation and by nested sampling."
@@ -311,13 +311,13 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
 
 
 def before_and_after_caption(diagnosis: Diagnosis) -> str:
-    """Return the caption of the figure of one scan: readings and predictions before and after the repair."""
+    """Return the caption of the figure of one scan: readings and predictions before and after the diagnosis."""
     run = diagnosis.apparatus.words.run
     which, colours = f"One {run}", "orange"
-    if diagnosis.repair.changes_predictions:
+    if diagnosis.repair_changes_predictions:
         which = f"The {run} that changes most"
-        colours = f"orange {diagnosis.apparatus.words.before_in_words}, blue {diagnosis.repair.after_in_words}"
-    walk = ", each with the random walk of the zero that all readings show" if diagnosis.repair.after.has_walk else ""
+        colours = f"orange {diagnosis.apparatus.words.before_in_words}, blue {diagnosis.after_in_words}"
+    walk = ", each with the random walk of the zero that all readings show" if diagnosis.after.has_walk else ""
     shown = f"readings (black) and predictions ({colours}{walk})"
     return f"{which}: {shown}, and below the residuals with their running means."
 
@@ -336,7 +336,7 @@ def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes])
 
 
 def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str | Mapping[str, str]]:
-    gain, changes = diagnosis.improvement, diagnosis.repair.changes_predictions
+    gain, changes = diagnosis.improvement, diagnosis.repair_changes_predictions
     words = diagnosis.apparatus.words
     unchanged = f"The predicted mean is {words.before_in_words}: there is no repair to test on held-out readings."
     shown = words.nothing_held_out if changes else unchanged
@@ -359,14 +359,14 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
 
 
 def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
-    noise = diagnosis.report.noise
+    noise = diagnosis.noise
     names = [] if noise.model == "white" else noise.model.split("+")
     model = join_names([effect_in_words(name) for name in names]) if names else "white: independent, with one sd"
     test = f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}."
     rows = [
         (p.name.replace("_", " "), unit_after_number(p.unit), *_value_and_interval_texts(p)) for p in noise.parameters
     ]
-    beside = ", the random walk aside" if diagnosis.repair.after.has_walk else ""
+    beside = ", the random walk aside" if diagnosis.after.has_walk else ""
     caption = (
         f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
         f"Middle: scatter by predicted reading{beside}. Below: histogram on a logarithmic scale{beside}."

@@ -136,11 +136,11 @@ def _draw_means_along(
         chance.mean_residuals(diagnosis, view, after=after),
         label=view.label,
         unit=diagnosis.recording.plan.instrumentation.unit_after_number,
-        each=(at, diagnosis.repair.before.residuals) if each else None,
+        each=(at, diagnosis.before.residuals) if each else None,
         window=view.window,
         names=names,
         before=diagnosis.apparatus.words.before_in_words,
-        after=diagnosis.repair.after_in_words,
+        after=diagnosis.after_in_words,
         ax=ax,
     )
 
@@ -160,16 +160,16 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
     A random walk of the noise, as all readings show it, is part of both models' lines.
     """
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    before, after = diagnosis.repair.before, diagnosis.repair.after
+    before, after = diagnosis.before, diagnosis.after
     rows = rows_of_scan_changed_most(plan, after.readings_with_walk - before.readings_with_walk)
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     walking = ", with the walk" if after.has_walk else ""
-    named = ((diagnosis.apparatus.words.before_in_words, before), (diagnosis.repair.after_in_words, after))
+    named = ((diagnosis.apparatus.words.before_in_words, before), (diagnosis.after_in_words, after))
     models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in named]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
-    models = models if diagnosis.repair.changes_predictions else models[:1]
+    models = models if diagnosis.repair_changes_predictions else models[:1]
     return plots.scan_with_residuals(
         shown.at[rows], readings, models, joined=is_scan_along_line(plan, rows), label=shown.label, unit=unit
     )
@@ -187,12 +187,12 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
 
 def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
-    plan, repair = diagnosis.recording.plan, diagnosis.repair
+    plan = diagnosis.recording.plan
     unrepaired = diagnosis.apparatus.words.before_in_words
-    models = [(unrepaired, repair.before.residuals), (repair.after_in_words, repair.after.residuals)]
-    models = models if repair.changes_predictions else models[:1]
+    models = [(unrepaired, diagnosis.before.residuals), (diagnosis.after_in_words, diagnosis.after.residuals)]
+    models = models if diagnosis.repair_changes_predictions else models[:1]
     time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
-    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), repair.before.readings))
+    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.before.readings))
     unit = unit_after_number(plan.instrumentation.unit)
     return svg(plots.residuals_against_covariates(covariates, models, unit=unit))
 
@@ -207,9 +207,9 @@ def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 
 def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
     """Return a function that draws a noise effect's panel on axes; for other names, spread by predicted reading."""
-    recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
+    recording, residuals = diagnosis.recording, np.array(diagnosis.after.residuals)
     unit = recording.plan.instrumentation.unit_after_number
-    found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
+    found = {p.name: p.mean for p in diagnosis.noise.parameters}
     if "share" in found and "value" in found:  # lost readings carry no information on the noise of the others
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * float(chance.sd.mean()))
         lost &= np.abs(residuals) > _LOST * float(chance.sd.mean())
@@ -217,16 +217,14 @@ def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) 
         lost[list(recording.left_out)] = True
         if name == "dropouts":
             return lambda ax: plots.lost_readings_against_predicted(
-                diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax
+                diagnosis.after.readings, recording.readings, lost, unit=unit, ax=ax
             )
     if name == "quantisation" and "step" in found:
         return lambda ax: plots.readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
     if name in ("correlated_noise", "random_walk"):
-        walking = residuals + diagnosis.repair.after.walk
+        walking = residuals + diagnosis.after.walk
         return lambda ax: plots.residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
         return lambda ax: plots.residual_histogram(residuals / chance.sd, 1.0, ax=ax)
     model_sd = chance.sd if np.ptp(chance.sd) > 0 else None
-    return lambda ax: plots.spread_by_level(
-        diagnosis.repair.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax
-    )
+    return lambda ax: plots.spread_by_level(diagnosis.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax)

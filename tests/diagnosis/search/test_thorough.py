@@ -225,11 +225,11 @@ def test_a_recording_is_weighed_alike_both_ways():
     samples = truth + spread * np.random.default_rng(0).standard_normal((500, 8))
     known = SimpleNamespace(names=names, samples=samples)
     found = diagnose(recording, sensor=known, thorough=again, rng=np.random.default_rng(1))
-    assert "ambient_step" in {w.label for w in found.report.weighings}
-    assert {w.label for w in found.report.weighings} == {
+    assert "ambient_step" in {w.label for w in found.weighings}
+    assert {w.label for w in found.weighings} == {
         note for stage, _, _, note in seen if note and stage.startswith("weighing hypotheses again")
     }
-    assert all(w.agree for w in found.report.weighings)
+    assert all(w.agree for w in found.weighings)
     assert found.reason.endswith("nested sampling agrees to within a nat plus its standard error.")
-    assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.report.weighings)
-    assert "thorough" not in diagnosis_json(replace(found, report=replace(found.report, weighings=())))
+    assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.weighings)
+    assert "thorough" not in diagnosis_json(replace(found, weighings=()))

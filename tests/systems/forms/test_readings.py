@@ -124,7 +124,7 @@ def test_a_thermometer_that_is_read_once_in_its_time_constant_is_told_from_one_t
     found = diagnose_system(*_cups(0.8, tau, delay), rng=np.random.default_rng(0))
     name = "lag" if tau else "delay"
     assert found.combination == (name,)
-    (stated,) = next(effect.parameters for effect in found.report.effects if effect.name == name)
+    (stated,) = next(effect.parameters for effect in found.effects if effect.name == name)
     low, high = stated.interval95
     assert low < tau + delay < high
     assert high - low < 0.2

@@ -37,8 +37,8 @@ from probewise.recordings import (
     write_text_atomically,
 )
 from probewise.recordings.plan import Plan, Recording, require_plan
-from probewise.world import World, concealed, unlisted
-from probewise.world.stages import Concealed
+from probewise.world import World
+from probewise.world.stages import KINDS, Concealed
 
 __all__ = [
     "MOST_ROUNDS",
@@ -356,8 +356,7 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
 
 def _parse_one_effect(text: str) -> Concealed:
     name, _, numbers = text.partition(":")
-    every = {**vars(concealed), **vars(unlisted)}
-    kinds = {own: kind for own, kind in every.items() if hasattr(kind, "__wrapped__") and _is_of_numbers(kind)}
+    kinds = {own: kind for own, kind in KINDS.items() if _is_of_numbers(kind)}
     if name not in kinds:
         meant = did_you_mean(name, kinds)
         raise ParameterError(

@@ -4,6 +4,7 @@ It shares only the file formats with the rest of the package: data simulated by 
 the model. The summed integral is the paper's eq. RwithSSF.
 """
 
+from probewise.world import unlisted
 from probewise.world.concealed import ambient_gradient, backlash, correlated_noise, gain_drift, nonlinearity, saturation
 from probewise.world.rays import seen_white_fraction
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
@@ -35,4 +36,5 @@ __all__ = [
     "seen_white_fraction",
     "simulate",
     "tailed_spot",
+    "unlisted",
 ]

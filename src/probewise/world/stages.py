@@ -121,6 +121,8 @@ class Concealed:
 
 
 P = ParamSpec("P")
+KINDS: dict[str, Callable[..., Concealed]] = {}
+"""Every kind of effect by name, as `acts_at` made it."""
 
 
 def acts_at(stage: Stage) -> Callable[[Callable[P, Act]], Callable[P, Concealed]]:
@@ -133,6 +135,7 @@ def acts_at(stage: Stage) -> Callable[[Callable[P, Act]], Callable[P, Concealed]
             bound.apply_defaults()
             return Concealed(act_with.__name__, stage, bound.arguments, act_with(*values, **named), effect)
 
+        KINDS[act_with.__name__] = effect
         return effect
 
     return kind_of_effect

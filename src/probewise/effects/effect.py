@@ -41,6 +41,15 @@ Act: TypeAlias = Callable[[Any, FloatArray, Any], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the plan or table; returns the value with the
 effect."""
 
+Declared: TypeAlias = Mapping[str, tuple[Marginal, str]]
+"""Prior and unit of each parameter, by name."""
+
+
+def acting(formula: Callable[..., Any]) -> Act:
+    """Return the act of a formula: a function of the value, the plan or table, and each parameter, (n_samples, 1)."""
+    return lambda value, theta, plan: formula(value, plan, *(theta[:, k : k + 1] for k in range(theta.shape[1])))
+
+
 Say: TypeAlias = Callable[[FloatArray, FloatArray], str]
 """Function of the parameters' mean and sd, (n_params,) each; returns a sentence."""
 
@@ -548,7 +557,7 @@ def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of one column from the parameters' values, numbers or (n_bank,): (n_bank, 1, n_params)."""
-    return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
+    return np.stack(np.broadcast_arrays(*map(np.atleast_1d, parameters)), axis=-1)[:, None, :].astype(np.float64)
 
 
 def scans_in_words(scans: tuple[str, ...]) -> str:

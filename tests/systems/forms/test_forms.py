@@ -12,7 +12,7 @@ from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
-from probewise.systems.forms.reference import clipping_levels, switch_points
+from probewise.systems.forms.reference import clipping_between, switch_points
 from probewise.systems.law import LawWithEffects
 
 SD = 0.01
@@ -258,8 +258,8 @@ def test_a_wild_cell_of_an_input_moves_no_ceiling(wild):
     ],
 )
 def test_levels_are_between_the_values_that_are_not_wild(values, ends):
-    found = clipping_levels(np.array(values))
-    assert (found and (found.low, found.high, found.top)) == ends
+    found = clipping_between(np.array(values))
+    assert (found and (found.prior.low, found.prior.high, found.nowhere - np.ptp(ends[:2]))) == ends
 
 
 def _names_in_units(of_law, time, column, reading):

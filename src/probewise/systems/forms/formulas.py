@@ -18,13 +18,15 @@ from probewise._words import value_with_sd
 from probewise.effects.effect import (
     PHASE,
     ChangePoints,
+    Declared,
     StepEffect,
     WaveEffect,
+    acting,
     sine_and_cosine_entries,
     single_column_bank,
     thinned,
 )
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
     frequency_prior,
@@ -35,7 +37,7 @@ from probewise.systems.forms.modulations import (
 )
 from probewise.systems.forms.rates import trial_rate
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
-from probewise.systems.forms.reference import AMPLITUDE, POSITIVE, Form, ReferenceFit, switch_points
+from probewise.systems.forms.reference import AMPLITUDE, ONE_AMPLITUDE, POSITIVE, Form, ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
@@ -49,9 +51,6 @@ _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the record
 _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
-
-_Parameters = Mapping[str, tuple[Marginal, str]]
-"""Prior and unit of each parameter, by name."""
 
 
 @dataclass(frozen=True)
@@ -110,49 +109,37 @@ def formula_forms(about: ReferenceFit) -> Iterator[Form]:
 def _proposal(
     about: ReferenceFit,
     text: str,
-    parameters: _Parameters,
-    entries: FloatArray,
-    change: Callable[[list[Any], Any, RunTable], Any],
+    parameters: Declared,
+    change: Callable[..., Any],
     covariates: tuple[str, ...],
-    guess: float,
+    entries: FloatArray = ONE_AMPLITUDE,
     *,
+    guess: float | None = None,
     state: str = "",
     expression: str = "",
-    kind: type[Form] = Form,
     **more: Any,
 ) -> Iterator[Form]:
     """Yield a formula of a name that ends in `text`; none if without effect.
 
-    `change` is a function of the parameters, (n_samples, 1) each, and of the readings and the table: what is added to
-    the readings. Of the rate of a `state` it is a function of the parameters, the states and the columns. `expression`
-    is by default `text` times the amplitude.
+    `change` is a function of the readings, the table and the parameters, (n_samples, 1) each: what is added to the
+    readings. Of the rate of a `state` it is a function of the states, the columns and the parameters. `expression` is
+    by default `text` times the amplitude.
     """
     side, target = ("rate", state) if state else ("reading", about.system.simulator.reading)
     what, expression = f"the rate of {state}" if state else target, expression or f"a {text}"
 
-    def act(value: Any, theta: FloatArray, table: RunTable) -> Any:
-        v = [theta[:, k : k + 1] for k in range(theta.shape[1])]
-        return value.with_term(state, lambda s, p, u: change(v, s, u)) if state else value + change(v, value, table)
+    @acting
+    def act(value: Any, rows: RunTable, *v: FloatArray) -> Any:
+        return value.with_term(state, lambda s, p, u: change(s, u, *v)) if state else value + change(value, rows, *v)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         each = zip(parameters.items(), mean, sd, strict=True)
         sizes = ", ".join(f"{name} = {value_with_sd(m, s, unit)}" for (name, (_, unit)), m, s in each)
         return f"{what} lacks the term {expression} with {sizes}: a proposal, not a known effect"
 
-    form = kind(
-        f"formula:{side}:{target}:{text}",
-        Stage.RATE if state else Stage.OFFSET,
-        {name: prior for name, (prior, _) in parameters.items()},
-        tuple(unit for _, unit in parameters.values()),
-        covariates,
-        act,
-        entries,
-        says,
-        amplitudes=tuple(k for k, (prior, _) in enumerate(parameters.values()) if prior in (AMPLITUDE, POSITIVE)),
-        expression=expression,
-        **more,
-    )
-    yield from about.scaled(form, guess)
+    stage, name = Stage.RATE if state else Stage.OFFSET, f"formula:{side}:{target}:{text}"
+    own = (name, stage, parameters, covariates, act, says, entries)
+    return about.form(*own, guess=guess, expression=expression, **more)
 
 
 _OF_ONE: Mapping[str, tuple[Callable[[Any], Any], float]] = {
@@ -235,15 +222,15 @@ def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
     known: list[FloatArray] = []
     for term in [*_terms_of_variables([*variables, level]), *shapes]:
 
-        def change(v: list[Any], value: FloatArray, table: RunTable, term: _Term = term) -> Any:
+        def change(value: FloatArray, table: RunTable, a: Any, term: _Term = term) -> Any:
             def look_up(name: str) -> Any:
                 return value if name == own.reading else table.time_s if name == table.time else table.covariates[name]
 
-            return v[0] * term.evaluate(look_up)
+            return a * term.evaluate(look_up)
 
-        if _add_if_new(change([np.ones(())], about.predicted, about.table), known):
+        if _add_if_new(change(about.predicted, about.table, np.ones(())), known):
             along = _covariates_of_term(about, "reading", term)
-            yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, np.ones((1, 1, 1)), change, along, about.sd)
+            yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, change, along)
 
 
 def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -252,14 +239,16 @@ def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     if len(points) < 2:
         return
     at = thinned(points, _MOST_SWITCHES)
-
-    def change(v: list[Any], value: Any, rows: RunTable) -> Any:
-        return v[0] * (rows.covariates[name] > v[1])
-
-    priors: _Parameters = {"a": (AMPLITUDE, about.reading_unit), "at": (Uniform(at[0], at[-1]), name)}
-    bank, along = np.array([[[1.0, 0.5 * (at[0] + at[-1])]]]), (covariate_of_column(name),)
-    own = (f"(1 + sign({name} - at)) / 2", priors, bank, change, along, about.sd)
-    yield from _proposal(about, *own, kind=StepEffect, change_points=ChangePoints(at, column=name))
+    yield from _proposal(
+        about,
+        f"(1 + sign({name} - at)) / 2",
+        {"a": (AMPLITUDE, about.reading_unit), "at": (Uniform(at[0], at[-1]), name)},
+        lambda value, rows, a, at: a * (rows.covariates[name] > at),
+        (covariate_of_column(name),),
+        single_column_bank(1.0, 0.5 * (at[0] + at[-1])),
+        kind=StepEffect,
+        change_points=ChangePoints(at, column=name),
+    )
 
 
 def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
@@ -268,13 +257,13 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     points = switch_points(values)
     for sign, text in ((1.0, f"max({state} - at, 0)"), (-1.0, f"max(at - {state}, 0)")) if len(points) > 1 else ():
 
-        def change(v: list[Any], s: Any, u: Any, sign: float = sign) -> Any:
-            return v[0] * np.maximum(sign * (s[state] - v[1]), 0.0)
+        def change(s: Any, u: Any, a: Any, at: Any, sign: float = sign) -> Any:
+            return a * np.maximum(sign * (s[state] - at), 0.0)
 
-        priors: _Parameters = {"a": (AMPLITUDE, ""), "at": (Uniform(points[0], points[-1]), state)}
+        parameters: Declared = {"a": (AMPLITUDE, ""), "at": (Uniform(points[0], points[-1]), state)}
         bank = single_column_bank(1.0, np.clip(np.quantile(values, _THRESHOLDS), points[0], points[-1]))
-        guess, along = trial_rate(about, state) / float(np.ptp(values)), (f"state:{state}", "time")
-        yield from _proposal(about, text, priors, bank, change, along, guess, state=state)
+        own, guess = (text, parameters, change, (f"state:{state}", "time"), bank), trial_rate(about, state)
+        yield from _proposal(about, *own, guess=guess / float(np.ptp(values)), state=state)
 
 
 def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
@@ -288,14 +277,13 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
         if term.text == f"sign({state})":
             continue  # dry friction, which has a name
 
-        def change(v: list[Any], s: Any, u: Any, term: _Term = term) -> Any:
-            return v[0] * term.evaluate(lambda name: s[name] if name in s else u[name])
+        def change(s: Any, u: Any, a: Any, term: _Term = term) -> Any:
+            return a * term.evaluate(lambda name: s[name] if name in s else u[name])
 
         shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
         if _add_if_new(shape, known):
-            guess = rate / float(np.sqrt(np.mean(shape**2)))
-            own = (term.text, {"a": (AMPLITUDE, "")}, np.ones((1, 1, 1)), change)
-            yield from _proposal(about, *own, _covariates_of_term(about, "rate", term), guess, state=state)
+            guess, along = rate / float(np.sqrt(np.mean(shape**2))), _covariates_of_term(about, "rate", term)
+            yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, change, along, guess=guess, state=state)
 
 
 def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
@@ -327,25 +315,28 @@ def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
     table, origin = about.table, origin_of_column(about.table.time_s)
     frequencies = trial_frequencies_in_time(about, _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
-    def change(v: list[Any], value: Any, rows: RunTable) -> Any:
-        a, hz, phase, share, edge = v
+    def change(value: Any, rows: RunTable, a: Any, hz: Any, phase: Any, share: Any, edge: Any) -> Any:
         inside = np.cos(2 * np.pi * (hz * (rows.time_s - origin) + phase)) - np.cos(np.pi * share)
         return 0.5 * a * (1 + np.tanh(inside / edge))
 
     phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
     grid = np.meshgrid(1.0, frequencies, phases, shares, _SOFT, indexing="ij")
-    bank = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
     since = f"({table.time} - {origin:.12g})" if origin else table.time
-    priors: _Parameters = {
-        "a": (AMPLITUDE, about.reading_unit),
-        "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
-        "phase": (Uniform(-1.0, 1.0), "1"),
-        "share": (Uniform(0.03, 0.97), "1"),
-        "edge": (LogUniform(0.03, 1.0), "1"),
-    }
-    text = f"while |({since} / period + phase) mod 1| < share / 2"
-    counted = origin_in_words(table.time, origin, about.time_unit)
-    yield from _proposal(about, text, priors, bank, change, ("time",), about.sd, counted_from=counted)
+    yield from _proposal(
+        about,
+        f"while |({since} / period + phase) mod 1| < share / 2",
+        {
+            "a": (AMPLITUDE, about.reading_unit),
+            "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
+            "phase": (Uniform(-1.0, 1.0), "1"),
+            "share": (Uniform(0.03, 0.97), "1"),
+            "edge": (LogUniform(0.03, 1.0), "1"),
+        },
+        change,
+        ("time",),
+        single_column_bank(*(each.ravel() for each in grid)),
+        counted_from=origin_in_words(table.time, origin, about.time_unit),
+    )
 
 
 def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
@@ -355,8 +346,7 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
     frequencies = trial_frequencies_in_time(about, 2 * _MOST_SWEPT, _ROWS_OF_A_WAVE, most_waves=_MOST_SWEPT)
     middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
 
-    def change(v: list[Any], value: Any, rows: RunTable) -> Any:
-        a, hz, sweep, phase = v
+    def change(value: Any, rows: RunTable, a: Any, hz: Any, sweep: Any, phase: Any) -> Any:
         u = (rows.time_s - middle) / half
         return a * np.sin(2 * np.pi * hz * half * (u + 0.5 * sweep * u**2) + phase)
 
@@ -365,32 +355,37 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
         settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
     turned = f"2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase"
-    priors: _Parameters = {
-        "a": (POSITIVE, about.reading_unit),
-        "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
-        "sweep": (Uniform(-1.2, 1.2), "1"),
-        "phase": (PHASE, "rad"),
-    }
-    text = f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}"
-    bank = sine_and_cosine_entries(1.0, *np.transpose(settings))
-    yield from _proposal(about, text, priors, bank, change, ("time",), about.sd, kind=WaveEffect)
+    yield from _proposal(
+        about,
+        f"sin({turned}), u = {table.time} - {text_rounded_to_spread(middle, half)}",
+        {
+            "a": (POSITIVE, about.reading_unit),
+            "hz": (frequency_prior(frequencies), f"1/{about.time_unit}"),
+            "sweep": (Uniform(-1.2, 1.2), "1"),
+            "phase": (PHASE, "rad"),
+        },
+        change,
+        ("time",),
+        sine_and_cosine_entries(1.0, *np.transpose(settings)),
+        kind=WaveEffect,
+    )
 
 
 def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     """Yield a settling of the reading with two time constants from the start of each run."""
 
-    def change(v: list[Any], value: Any, rows: RunTable) -> Any:
+    def change(value: Any, rows: RunTable, a: Any, b: Any, tau1: Any, tau2: Any) -> Any:
         since = time_since_start_of_run(rows)
-        return v[0] * np.exp(-since / v[2]) + v[1] * np.exp(-since / v[3])
+        return a * np.exp(-since / tau1) + b * np.exp(-since / tau2)
 
     between, unit = settling_time_prior(about), about.reading_unit
     taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
     pairs = [(taus[i], taus[j]) for i in range(_N_SETTLING) for j in range(i + _APART, _N_SETTLING)]
     bank = np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs])
     size, tau = (AMPLITUDE, unit), (between, about.time_unit)
-    priors: _Parameters = {"a": size, "b": size, "tau1": tau, "tau2": tau}
     text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
-    yield from _proposal(about, text, priors, bank, change, ("time", "run"), 1.0, expression=text)
+    own = (text, {"a": size, "b": size, "tau1": tau, "tau2": tau}, change, ("time", "run"), bank)
+    yield from _proposal(about, *own, guess=1.0, expression=text)
 
 
 def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
@@ -401,33 +396,31 @@ def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) 
     if half <= 0:
         return
 
-    def change(v: list[Any], value: Any, rows: RunTable) -> Any:
+    def change(value: Any, rows: RunTable, a: Any, b: Any, c: Any) -> Any:
         z = (value - middle) / half
-        return (v[0] + v[1] * z + v[2] * z**2) * (rows.covariates[name] - centre) / spread
+        return (a + b * z + c * z**2) * (rows.covariates[name] - centre) / spread
 
     scaled = f"({name} - {text_rounded_to_spread(centre, spread)}) / {spread:.4g}"
     text = f"(a + b z + c z^2) {scaled}, z = ({own.reading} - {text_rounded_to_spread(middle, half)}) / {half:.4g}"
-    along, priors = (covariate_of_column(name), "level"), dict.fromkeys("abc", (AMPLITUDE, own.unit))
-    yield from _proposal(about, text, priors, np.eye(3)[None, :, :], change, along, about.sd, expression=text)
+    given = (text, dict.fromkeys("abc", (AMPLITUDE, own.unit)), change, (covariate_of_column(name), "level"))
+    yield from _proposal(about, *given, np.eye(3)[None, :, :], expression=text)
 
 
 def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Yield changes of the reading that saturate with a dose: the integral of |column - mean|, or |column|."""
-    table, spread = about.table, float(np.std(values))
-    centre = _rounded_mean(values)
-    origins = {f"|{name} - {text_rounded_to_spread(centre, spread)}|": centre}
-    if values.min() >= 0 or values.max() <= 0:
-        origins[f"|{name}|"] = 0.0
-    in_time = table.has_varying_time
+    table, centre, in_time = about.table, _rounded_mean(values), about.table.has_varying_time
     if not in_time and not about.rows_are_in_order:
         return
+    origins = {f"|{name} - {text_rounded_to_spread(centre, float(np.std(values)))}|": centre}
+    if values.min() >= 0 or values.max() <= 0:
+        origins[f"|{name}|"] = 0.0
     for what, origin in origins.items():
 
         def dose(rows: RunTable, origin: float = origin) -> FloatArray:
             return _integral_since_start_of_run(np.abs(rows.covariates[name] - origin), rows, in_time=in_time)
 
-        def change(v: list[Any], value: Any, rows: RunTable, dose: Callable[[RunTable], FloatArray] = dose) -> Any:
-            return -v[0] * np.expm1(-dose(rows) / v[1])
+        def change(value: Any, rows: RunTable, a: Any, d: Any, dose: Callable[[RunTable], FloatArray] = dose) -> Any:
+            return -a * np.expm1(-dose(rows) / d)
 
         largest = float(dose(table).max())
         if not largest > 0:
@@ -435,11 +428,16 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
         saturating = LogUniform(_LEAST_DOSE * largest, _MOST_DOSE * largest)
         summed = f"integral over {table.time}" if in_time else "sum over rows"
         grown = f"D the {summed} of {what} since the start of the run"
-        priors: _Parameters = {"a": (AMPLITUDE, about.reading_unit), "d": (saturating, "")}
-        bank = single_column_bank(1.0, np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES))
-        own = (f"1 - exp(-D / d), {grown}", priors, bank, change, (covariate_of_column(name), "time", "run"), about.sd)
-        said = f"a (1 - exp(-D / d)), {grown}"
-        yield from _proposal(about, *own, expression=said, needs_rising_time=in_time)
+        yield from _proposal(
+            about,
+            f"1 - exp(-D / d), {grown}",
+            {"a": (AMPLITUDE, about.reading_unit), "d": (saturating, "")},
+            change,
+            (covariate_of_column(name), "time", "run"),
+            single_column_bank(1.0, np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES)),
+            expression=f"a (1 - exp(-D / d)), {grown}",
+            needs_rising_time=in_time,
+        )
 
 
 def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time: bool) -> FloatArray:

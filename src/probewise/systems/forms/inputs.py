@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error
-from probewise.effects.effect import PHASE, Act, WaveEffect, in_words, sine_and_cosine_entries
-from probewise.priors import LogUniform, Marginal
+from probewise.effects.effect import PHASE, Act, WaveEffect, acting, in_words, sine_and_cosine_entries
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
     max_n_trial_frequencies,
@@ -24,9 +24,7 @@ from probewise.systems.forms.reference import (
     ActInTime,
     Form,
     ReferenceFit,
-    clipped,
-    clipping_levels,
-    says_of_limit,
+    clipping_between,
 )
 from probewise.systems.law_inputs import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
@@ -39,15 +37,12 @@ _LEAST_WAVES = 1.5  # in a column's range: half a period is seen again; any bend
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
 
-Change = Callable[[FloatArray, FloatArray, RunTable], FloatArray]
-"""Function of a column (n_points,) or (n_samples, n_points), parameters and the table; returns the true column."""
-
 
 def driving_columns(about: ReferenceFit) -> list[str]:
     """Return the names of the columns, except time, that the simulated readings depend on."""
     out = []
     for name, values in about.varying_columns.items():
-        nudges = (_column_with_offset, _NUDGE * float(np.nanstd(values))), (_scaled_column, _NUDGE)
+        nudges = (_with_offset, _NUDGE * float(np.nanstd(values))), (_with_gain, _NUDGE)
         acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
         if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
             out.append(name)
@@ -58,55 +53,57 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
     for name in driving_columns(about):
         yield from _forms_on_column(about, name)
-    table = about.table
-    if table.time is not None:
-        origin = origin_of_column(table.time_s)
-
-        def scaled_clock(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-            return np.asarray(origin + (c - origin) * (1 + theta[:, :1]))
-
-        act = _column_changer(table.time, scaled_clock)
-        says = "the true time is the recorded time times (1 + a), a = {0}"
-        for form in _amplitude_form(about, "clock_drift", act, 1e-5, "1", says, "time"):
-            yield replace(form, counted_from=origin_in_words(table.time, origin, about.time_unit))
+    time = about.table.time
+    if time is not None:
+        origin = origin_of_column(about.table.time_s)
+        act = _column_changer(time, acting(lambda c, rows, a: origin + (c - origin) * (1 + a)))
+        says = in_words("the true time is the recorded time times (1 + a), a = {0}")
+        own = ("clock_drift", Stage.INPUT, {"a": (AMPLITUDE, "1")}, ("time",), act, says)
+        yield from about.form(*own, guess=1e-5, counted_from=origin_in_words(time, origin, about.time_unit))
 
 
 def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
-    values, unit, along = about.table.covariates[name], about.time_unit, covariate_of_column(name)
+    values, unit, column = about.table.covariates[name], about.time_unit, covariate_of_column(name)
     spread, span = float(np.nanstd(values)), float(np.nanmax(values)) - float(np.nanmin(values))
-    true = f"the true {name} is the recorded {name}"
+    true, late = f"the true {name} is the recorded {name}", ("previous", column)
 
-    def of(kind: str, change: Change) -> tuple[ReferenceFit, str, Act]:
-        return about, f"{kind}:{name}", _column_changer(name, change)
+    def amplitude(kind: str, change: Act, guess: float, unit: str, says: str) -> Iterator[Form]:
+        own = (f"{kind}:{name}", Stage.INPUT, {"a": (AMPLITUDE, unit)}, (column,), _column_changer(name, change))
+        return about.form(*own, in_words(says), guess=guess)
 
-    offset, gain = f"{true} plus {{0}}", f"{true} times (1 + a), a = {{0}}"
-    yield from _amplitude_form(*of("input_offset", _column_with_offset), 1e-4 * spread, name, offset, along)
-    yield from _amplitude_form(*of("input_gain", _scaled_column), 1e-4, "1", gain, along)
-    yield from _clipped_column_form(about, name)
+    def size(
+        kind: str, act: Act, own: tuple[str, str], along: tuple[str, ...], says: str, **more: Any
+    ) -> Iterator[Form]:
+        tried = (about.duration if kind == "input_delay" else span) * np.geomspace(1e-7, 0.5, 40)
+        return about.sized(f"{kind}:{name}", Stage.INPUT, own, along, act, in_words(says), tried, **more)
+
+    yield from amplitude("input_offset", _with_offset, 1e-4 * spread, name, f"{true} plus {{0}}")
+    yield from amplitude("input_gain", _with_gain, 1e-4, "1", f"{true} times (1 + a), a = {{0}}")
+    ends = clipping_between(values)
+    if ends is not None:
+        act = _column_changer(name, ends.act)
+        if np.nanmax(about.rms_change_in_sds(Stage.INPUT, act, ends.tried[:, None]), initial=0.0) > 0.05:
+            own = (f"input_saturation:{name}", Stage.INPUT, ends, name, (column,), act, ends.says(name))
+            yield from about.clipped(*own)
     if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * span:  # if larger, it is an offset
+        zone = acting(lambda c, rows, width: np.sign(c) * np.maximum(np.abs(c) - width, 0.0))
         within = f"{name} has no effect within {{0}} of 0"
-        with_zone = of("dead_zone", lambda c, theta, rows: np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
-        yield from _size_form(*with_zone, span, name, within, along)
+        yield from size("dead_zone", _column_changer(name, zone), ("width", name), (column,), within)
     if _moves_both_ways(values, about.table):
-        play = f"{name} has {{0}} of play"
-        yield from _size_form(*of("backlash", column_with_play), span, name, play, "previous", along)
+        play = _column_changer(name, column_with_play)
+        yield from size("backlash", play, ("width", name), late, f"{name} has {{0}} of play")
     yield from _periodic_error_form(about, name)
     if about.table.has_varying_time:
-        own = (about, f"input_delay:{name}", _column_delayer(about, name), about.duration, unit)
-        for form in _size_form(*own, f"{name} acts with a delay of {{0}} {unit}", "previous", along):
-            yield replace(form, needs_rising_time=True)
+        delay, says = _column_delayer(about, name), f"{name} acts with a delay of {{0}} {unit}"
+        yield from size("input_delay", delay, ("tau_s", unit), late, says, needs_rising_time=True)
 
 
-def _column_with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    return np.asarray(c + theta[:, :1])
+_with_offset = acting(lambda c, rows, a: c + a)
+_with_gain = acting(lambda c, rows, a: c * (1 + a))
 
 
-def _scaled_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    return np.asarray(c * (1 + theta[:, :1]))
-
-
-def _column_changer(name: str, change: Change) -> Act:
-    """Return the function that applies `change` to the column `name` of the inputs."""
+def _column_changer(name: str, change: Act) -> Act:
+    """Return the act on the inputs that applies `change` to the column `name`, (n_points,) or (n_samples, n_points)."""
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
 
 
@@ -119,68 +116,32 @@ def _column_delayer(about: ReferenceFit, name: str) -> Act:
     return ActInTime(at_rows, lambda between, theta: between.with_dead_time(name, theta[:, :1]))
 
 
-def _amplitude_form(
-    about: ReferenceFit, name: str, act: Act, guess: float, unit: str, says: str, *along: str
-) -> Iterator[Form]:
-    own = (name, Stage.INPUT, {"a": AMPLITUDE}, (unit,), along, act, np.ones((1, 1, 1)))
-    yield from about.scaled(Form(*own, in_words(says)), guess)
-
-
-def _size_form(
-    about: ReferenceFit, name: str, act: Act, most: float, unit: str, says: str, *along: str
-) -> Iterator[Form]:
-    """Yield a form of one size without a sign, log-uniform up to half of `most`; none if no size is plausible."""
-    parameter = "tau_s" if name.startswith("input_delay:") else "width"
-    tried = most * np.geomspace(1e-7, 0.5, 40)
-    return about.sized(name, Stage.INPUT, parameter, unit, along, act, tried, in_words(says))
-
-
-def _clipped_column_form(about: ReferenceFit, name: str) -> Iterator[Form]:
-    ends = clipping_levels(about.table.covariates[name])
-    if ends is None:
-        return
-
-    act = _column_changer(name, lambda c, theta, table: clipped(c, theta[:, :1], ends.least_ceiling))
-    if np.nanmax(about.rms_change_in_sds(Stage.INPUT, act, ends.trial_levels[:, None]), initial=0.0) > 0.05:
-        says = says_of_limit(name, ends.least_ceiling)
-        along, bank = (covariate_of_column(name),), ends.trial_levels[:, None, None]
-        own = (
-            f"input_saturation:{name}",
-            Stage.INPUT,
-            {"level": ends.prior},
-            (name,),
-            along,
-            act,
-            bank,
-            says,
-        )
-        yield Form(*own, amplitudes=(), absent=ends.absent)
-
-
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     column = about.table.covariates[name]
     values = column[np.isfinite(column) & about.has_reading]  # others resolve no wave: it would fit any readings
     if len(distinct_values(values)) < 3 * _ROWS_OF_A_WAVE:
         return
     origin = origin_of_column(column[np.isfinite(column)])
-
-    def add_wave(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * (c - origin) / theta[:, 1:2] + theta[:, 2:3]))
-
-    act = _column_changer(name, add_wave)
+    wave = acting(lambda c, rows, a, period, phase: c + a * np.sin(2 * np.pi * (c - origin) / period + phase))
     most = _MOST_FREQUENCIES if about.system.predicts_in_bulk else _MOST_FREQUENCIES_CALLED
     if about.system.caller is None:
         most = max_n_trial_frequencies(len(about.table))
     frequencies = trial_frequencies(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE, _LEAST_WAVES)
     longest, shortest = (float(1 / frequencies[k]) for k in (0, -1))
-
-    size = "an amplitude of {0} and a period of {1}, both in units of"
-    says = in_words(f"{name} has a periodic error with {size} {name}")
-    priors: dict[str, Marginal] = {"a": POSITIVE, "period": LogUniform(shortest * 0.98, longest / 0.9), "phase": PHASE}
-    bank, along = sine_and_cosine_entries(1.0, 1 / frequencies), (covariate_of_column(name),)
-    own = (f"periodic_error:{name}", Stage.INPUT, priors, (name, name, "rad"), along, act, bank, says)
-    form = WaveEffect(*own, counted_from=origin_in_words(name, origin))
-    yield from about.scaled(form, 1e-4 * float(np.std(values)))
+    yield from about.form(
+        f"periodic_error:{name}",
+        Stage.INPUT,
+        {"a": (POSITIVE, name), "period": (LogUniform(shortest * 0.98, longest / 0.9), name), "phase": (PHASE, "rad")},
+        (covariate_of_column(name),),
+        _column_changer(name, wave),
+        in_words(
+            f"{name} has a periodic error with an amplitude of {{0}} and a period of {{1}}, both in units of {name}"
+        ),
+        sine_and_cosine_entries(1.0, 1 / frequencies),
+        guess=1e-4 * float(np.std(values)),
+        kind=WaveEffect,
+        counted_from=origin_in_words(name, origin),
+    )
 
 
 def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import PHASE, Act, ChangePoints, Fixed, StepEffect, WaveEffect, sine_and_cosine_entries
 from probewise.effects.reference import is_far_from_zero
-from probewise.priors import LogUniform, Marginal, SharedScalePrior, Uniform
+from probewise.priors import LogUniform, SharedScalePrior, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.reference import (
     AMPLITUDE,
@@ -158,12 +158,13 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `form` returns its form, of amplitude 1, from the quantity's name and unit, with the form's name, stage and act;
-    `between_rows` what a parameter of some name does between the rows of a law, where that is not as its `hold` says.
+    `declared` returns, from the quantity's name and unit, what `ReferenceFit.form` takes of it: parameters, covariates,
+    words and more; `between_rows` what a parameter of some name does between the rows of a law, where that is not as
+    its `hold` says.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
-    form: Callable[..., Form]
+    declared: Callable[[str, str], dict[str, Any]]
     between_rows: Callable[[str], ActBetween] | None = None
 
 
@@ -171,17 +172,14 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
     """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0."""
     origin = origin_of_column(table.time_s)
     return Modulation(
-        at_rows=lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
-        form=lambda what, unit, **own: Form(
-            parameters={"a": AMPLITUDE},
-            units=(f"{unit or '1'}/{time_unit}",),
-            covariates=("time",),
-            entries=np.ones((1, 1, 1)),
-            says=lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {time_unit}",
-            counted_from=origin_in_words(table.time, origin, time_unit),
-            **own,
-        ),
-        between_rows=lambda name: lambda between, theta: between.with_drift(name, theta[:, :1]),
+        lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
+        lambda what, unit: {
+            "parameters": {"a": (AMPLITUDE, f"{unit or '1'}/{time_unit}")},
+            "covariates": ("time",),
+            "says": lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {time_unit}",
+            "counted_from": origin_in_words(table.time, origin, time_unit),
+        },
+        lambda name: lambda between, theta: between.with_drift(name, theta[:, :1]),
     )
 
 
@@ -189,15 +187,12 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     middle, per = float(np.nanmean(table.covariates[name])), unit_of_name(name) or "unit"
     return Modulation(
-        at_rows=lambda theta, rows: np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle)),
-        form=lambda what, unit, **own: Form(
-            parameters={"a": AMPLITUDE},
-            units=(f"{unit or '1'} per {name}",),
-            covariates=(covariate_of_column(name),),
-            entries=np.ones((1, 1, 1)),
-            says=lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
-            **own,
-        ),
+        lambda theta, rows: np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle)),
+        lambda what, unit: {
+            "parameters": {"a": (AMPLITUDE, f"{unit or '1'} per {name}")},
+            "covariates": (covariate_of_column(name),),
+            "says": lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
+        },
     )
 
 
@@ -210,26 +205,27 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
     if len(ends) == 2 and ends[0][0] < ends[1][1] and len(change_points.at) > 5:
         change_points = replace(change_points, border=float(ends[0][0]))
     first, last = change_points.at[0], change_points.at[-1]
+    place, of_place = ("row", "row") if by_row else ("s", time_unit)
+    never, begin = Fixed(first - 2.0, first - 1.0), {f"at_{place}": (Uniform(first, last), of_place)}
 
-    def form(what: str, unit: str, **own: Any) -> Form:
+    def at_in_words(mean: float, sd: float) -> str:  # of rows, a point between two, counted from 0
+        row = f"row {int(mean) + 3} of the table (the header is row 1)"
+        return row if by_row else value_with_sd(mean, sd, time_unit)
+
+    def declared(what: str, unit: str) -> dict[str, Any]:
         def says(mean: FloatArray, sd: FloatArray) -> str:
-            def at(k: int) -> str:  # of rows, a point between two, counted from 0
-                row = f"row {int(mean[k]) + 3} of the table (the header is row 1)"
-                return row if by_row else value_with_sd(mean[k], sd[k], time_unit)
+            goes_back = may_end and mean[1] > mean[2]
+            then = f"goes back at {at_in_words(mean[1], sd[1])}" if goes_back else "stays there"
+            size = value_with_sd(mean[0], sd[0], unit)
+            return f"{what} jumps by {size} at {at_in_words(mean[-1], sd[-1])} and {then}"
 
-            then = f"goes back at {at(1)}" if may_end and mean[1] > mean[2] else "stays there"
-            return f"{what} jumps by {value_with_sd(mean[0], sd[0], unit)} at {at(-1)} and {then}"
-
-        place, of_place = ("row", "row") if by_row else ("s", time_unit)
-        own |= {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
-        never, middle = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last)
-        size: dict[str, Marginal] = {"a": AMPLITUDE}
-        begin: dict[str, Marginal] = {f"at_{place}": Uniform(first, last)}
+        own = {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
+        size, middle = {"a": (AMPLITUDE, unit)}, 0.5 * (first + last)
         if not may_end:
-            entries = np.array([[[1.0, middle]]])
-            return StepEffect(parameters=size | begin, units=(unit, of_place), entries=entries, **own)
-        priors, entries = size | {f"until_{place}": never} | begin, np.array([[[1.0, first - 1.5, middle]]])
-        return BlockForm(parameters=priors, units=(unit, of_place, of_place), entries=entries, never=never, **own)
+            return own | {"parameters": size | begin, "entries": np.array([[[1.0, middle]]]), "kind": StepEffect}
+        entries = np.array([[[1.0, first - 1.5, middle]]])
+        until = {f"until_{place}": (never, of_place)}
+        return own | {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
 
     def jump_in_time(parameter: str) -> ActBetween:
         return lambda between, theta: between.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
@@ -238,36 +234,29 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
         at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
         return np.asarray(theta[:, :1] * ((at > begin) & ((at <= end) | (end <= begin))))
 
-    return Modulation(at_rows, form, None if by_row else jump_in_time)
+    return Modulation(at_rows, declared, None if by_row else jump_in_time)
 
 
 def value_per_run_modulation(table: RunTable) -> Modulation:
     """Return a variation by one value per run: a_run; 0 for runs outside the recording that are like none of it."""
     names = table.scan_names
+    known = {name: k for k, name in enumerate(names)}
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
-        known = {name: k for k, name in enumerate(names)}
         at = np.array([known.get(rows.like.get(name, name), len(names)) for name in rows.scan_names])
         values = np.concatenate([theta, np.zeros((len(theta), 1))], axis=1)
         return np.asarray(values[:, at[rows.scan]])
 
-    def form(what: str, unit: str, **own: Any) -> Form:
+    def declared(what: str, unit: str) -> dict[str, Any]:
         def says(mean: FloatArray, sd: FloatArray) -> str:
             far = int(np.argmax(np.abs(mean)))
             by = value_with_sd(mean[far], sd[far], unit)
             return f"{what} differs from run to run, most in run {names[far]}: by {by}"
 
-        return Form(
-            parameters={f"values[{name}]": AMPLITUDE for name in names},
-            units=(unit,) * len(names),
-            covariates=("run",),
-            entries=np.eye(len(names))[None, :, :],
-            says=says,
-            amplitudes=tuple(range(len(names))),
-            **own,
-        )
+        parameters = {f"values[{name}]": (AMPLITUDE, unit) for name in names}
+        return dict(parameters=parameters, covariates=("run",), says=says, entries=np.eye(len(names))[None])
 
-    return Modulation(at_rows, form)
+    return Modulation(at_rows, declared)
 
 
 def modulations_over_rows(about: ReferenceFit) -> dict[str, Modulation]:
@@ -286,25 +275,23 @@ def sinusoid_modulation(about: ReferenceFit) -> Modulation:
     table, time_unit = about.table, about.time_unit
     origin, frequencies = origin_of_column(table.time_s), trial_frequencies_in_time(about)
     suggested, highest = residual_peaks(about, frequencies)
-
-    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
-
+    prior = frequency_prior(np.append(frequencies, highest))
     return Modulation(
-        at_rows,
-        lambda what, unit, **own: WaveEffect(
-            parameters={"a": POSITIVE, "hz": frequency_prior(np.append(frequencies, highest)), "phase": PHASE},
-            units=(unit, f"1/{time_unit}", "rad"),
-            covariates=("time",),
-            entries=sine_and_cosine_entries(1.0, frequencies),
-            says=lambda mean, sd: (
+        lambda theta, rows: np.asarray(
+            theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3])
+        ),
+        lambda what, unit: {
+            "parameters": {"a": (POSITIVE, unit), "hz": (prior, f"1/{time_unit}"), "phase": (PHASE, "rad")},
+            "covariates": ("time",),
+            "says": lambda mean, sd: (
                 f"{what} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], unit)} and a period of "
                 f"{period_with_sd(mean[1], sd[1], time_unit)}"
             ),
-            counted_from=origin_in_words(table.time, origin, time_unit),
-            suggested=suggested,
-            **own,
-        ),
+            "entries": sine_and_cosine_entries(1.0, frequencies),
+            "kind": WaveEffect,
+            "counted_from": origin_in_words(table.time, origin, time_unit),
+            "suggested": suggested,
+        },
     )
 
 
@@ -324,8 +311,9 @@ def modulated_form(
     Several values have one scale in common, unless they are so many that a single one could not differ much more than
     the others within the bounds of a coordinate.
     """
-    bound = how.form(what, unit, name=name, stage=stage, act=act)
-    for form in about.scaled(replace(bound, covariates=(*bound.covariates, *covariates)), guess):
+    declared = how.declared(what, unit)
+    declared["covariates"] += covariates
+    for form in about.form(name, stage, act=act, guess=guess, **declared):
         if not 1 < len(form.amplitudes) <= _MOST_OF_ONE_SCALE:
             yield form
             continue

@@ -35,30 +35,26 @@ _QUARTILES = np.array([0.25, 0.75])
 
 def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each way in which a parameter may vary: drift, step, one value per run, with a column."""
-    system, table = about.system, about.table
-    simulator = system.simulator
-    values = system.parameters(about.theta, table)
+    simulator, table = about.system.simulator, about.table
+    values = about.system.parameters(about.theta, table)
     over = {_KINDS[kind]: how for kind, how in modulations_over_rows(about).items()}
-    for name in simulator.parameters:
-        guess = 1e-4 * (
-            float(np.abs(values[name]).max()) or float(np.ptp(simulator.parameters[name].from_unit(_QUARTILES)))
-        )
-        for kind, how in over.items():
-            if kind == "differs" and name in simulator.per_run:
-                continue
-            size = guess / (about.duration if kind == "drifts" else 1.0)
+    for name, prior in simulator.parameters.items():
+        guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(prior.from_unit(_QUARTILES))))
+
+        def varied(form: str, how: Modulation, size: float, name: str = name) -> Iterator[Form]:
             act = _parameter_shifter(name, how)
             if how.between_rows is not None:
                 act = ActInTime(act, how.between_rows(name))
-            own = (Stage.PARAMETER, how, act, size, name, unit_of_name(name))
-            yield from modulated_form(about, f"{kind}:{name}", *own)
+            own = (form, Stage.PARAMETER, how, act, size, name, unit_of_name(name))
+            return modulated_form(about, *own)
+
+        for kind, how in over.items():
+            if kind != "differs" or name not in simulator.per_run:
+                yield from varied(f"{kind}:{name}", how, guess / (about.duration if kind == "drifts" else 1.0))
         for column in about.varying_columns:
             how = column_proportional_modulation(column, table)
-            size, act = guess / float(np.nanstd(table.covariates[column])), _parameter_shifter(name, how)
-            is_scale = isinstance(simulator.parameters[name], LogUniform)
-            own = (Stage.PARAMETER, how, act, size, name, unit_of_name(name))
-            for form in modulated_form(about, f"depends:{name}:{column}", *own):
-                yield _linear_or_by_factor(about, form, name, how) if is_scale else form
+            for form in varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column]))):
+                yield _linear_or_by_factor(about, form, name, how) if isinstance(prior, LogUniform) else form
 
 
 def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modulation) -> Form:
@@ -118,16 +114,6 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
         rms = about.rms_change_in_sds(Stage.PARAMETER, act, values[:, None])
         seen = np.isfinite(rms) & (rms > _UNSEEN)
         if seen.any():
-            priors, along = {"value": extra.prior}, ("level", "time", "row")
-            entries, absent = values[seen][:, None, None], {0: extra.null}
-            own = (
-                name,
-                Stage.PARAMETER,
-                priors,
-                ("",),
-                along,
-                act,
-                entries,
-                in_words(extra.says.replace("{value}", "{0}")),
-            )
-            yield Form(*own, amplitudes=(), absent=absent)
+            says, along = in_words(extra.says.replace("{value}", "{0}")), ("level", "time", "row")
+            own = (name, Stage.PARAMETER, {"value": (extra.prior, "")}, along, act, says, values[seen][:, None, None])
+            yield from about.form(*own, absent={0: extra.null})

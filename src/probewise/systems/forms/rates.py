@@ -11,8 +11,17 @@ import numpy as np
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects import name_without_copy_suffix
-from probewise.effects.effect import PHASE, Fixed, WaveEffect, in_words, sine_and_cosine_entries, single_column_bank
-from probewise.priors import Marginal, Uniform
+from probewise.effects.effect import (
+    PHASE,
+    Declared,
+    Fixed,
+    WaveEffect,
+    acting,
+    in_words,
+    sine_and_cosine_entries,
+    single_column_bank,
+)
+from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
     frequency_prior,
@@ -26,9 +35,8 @@ from probewise.systems.forms.reference import (
     POSITIVE,
     Form,
     ReferenceFit,
-    clipping_levels,
+    clipping_between,
     period_with_sd,
-    says_of_limit,
 )
 from probewise.systems.law import LawWithEffects, Limit
 
@@ -39,13 +47,12 @@ def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each term that may be missing from the rate of a state, for friction and for bounds."""
     if not about.table.has_varying_time:  # nothing moves
         return
-    for state, values in about.states.items():
-        unit = f"{state} per {about.time_unit}"
+    for state in about.states:
         for kind in ("damping", "drag", "forcing"):
             yield from _rate_term_form(about, f"{kind}:{state}", state, state)
-        yield from _friction_form(about, state, unit)
-        yield from _periodic_forcing_form(about, state, unit)
-        yield from _limit_form(about, state, values)
+        yield from _friction_form(about, state)
+        yield from _periodic_forcing_form(about, state)
+        yield from _limit_form(about, state)
         for other in about.states:
             for kind in ("cubic", "quadratic", *(("coupling",) if other != state else ())):
                 yield from _rate_term_form(about, f"{kind}:{state}:{other}", state, other)
@@ -81,62 +88,63 @@ def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> I
     kind = name.split(":")[0]
     term, degree, what = _TERMS[kind]
 
-    def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
-        a = theta[:, :1]
-        return value.with_term(state, lambda s, p, u: a * term(s[other]))
-
     def says(mean: FloatArray, sd: FloatArray) -> str:
         said, minus, of = what.format(other).partition(" -a ")
         if minus and mean[0] < 0:  # a term that adds to the rate, without a double negative
             return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], '')}"
         return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], '')}"
 
-    unit = f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}"
-    along, entries = (f"state:{other}", "time"), np.ones((1, 1, 1))
-    form = Form(name, Stage.RATE, {"a": AMPLITUDE}, (unit,), along, act, entries, says)
+    act = acting(lambda motion, rows, a: motion.with_term(state, lambda s, p, u: a * term(s[other])))
+    size = {"a": (AMPLITUDE, f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}")}
     largest = float(np.nanmax(np.abs(about.states[other]))) or 1.0
-    yield from about.scaled(form, trial_rate(about, state) / largest**degree)
+    own = (name, Stage.RATE, size, (f"state:{other}", "time"), act, says)
+    yield from about.form(*own, guess=trial_rate(about, state) / largest**degree)
 
 
-def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
-    def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
-        return value.with_friction(state, theta[:, :1])
-
+def _friction_form(about: ReferenceFit, state: str) -> Iterator[Form]:
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
     tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
-    along = f"state:{state}", "level"
+    act = acting(lambda motion, rows, a: motion.with_friction(state, a))
     says = in_words(f"dry friction slows {state} by {{0}} per {about.time_unit}, and holds it at rest")
-    return about.sized(f"friction:{state}", Stage.RATE, "a", unit, along, act, tried, says)
+    size = ("a", f"{state} per {about.time_unit}")
+    return about.sized(f"friction:{state}", Stage.RATE, size, (f"state:{state}", "level"), act, says, tried)
 
 
-def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
-    table = about.table
-    time, origin = table.time, origin_of_column(table.time_s)
-    frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(table)))
+def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+    time, origin, per = str(about.table.time), origin_of_column(about.table.time_s), about.time_unit
+    frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(about.table)))
 
-    def act(value: LawWithEffects, theta: FloatArray, rows: Any) -> LawWithEffects:
-        a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
-        return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[str(time)] - origin) + phase))
+    @acting
+    def act(motion: LawWithEffects, rows: Any, a: FloatArray, hz: FloatArray, phase: FloatArray) -> LawWithEffects:
+        return motion.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[time] - origin) + phase))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, per = value_with_sd(mean[0], sd[0], ""), about.time_unit
-        period = period_with_sd(mean[1], sd[1], per)
-        lacks = f"the rate of {state} lacks a sinusoidal term"
-        return f"{lacks} with an amplitude of {size} per {per} and a period of {period}"
+        size, period = value_with_sd(mean[0], sd[0]), period_with_sd(mean[1], sd[1], per)
+        of = f"an amplitude of {size} per {per} and a period of {period}"
+        return f"the rate of {state} lacks a sinusoidal term with {of}"
 
-    priors: dict[str, Marginal] = {"a": POSITIVE, "hz": frequency_prior(frequencies), "phase": PHASE}
-    units, bank = (unit, f"1/{about.time_unit}", "rad"), sine_and_cosine_entries(1.0, frequencies)
-    own = (f"periodic_forcing:{state}", Stage.RATE, priors, units, ("time",), act, bank, says)
-    form = WaveEffect(*own, counted_from=origin_in_words(time, origin, about.time_unit))
-    yield from about.scaled(form, trial_rate(about, state))
+    prior = frequency_prior(frequencies)
+    yield from about.form(
+        f"periodic_forcing:{state}",
+        Stage.RATE,
+        {"a": (POSITIVE, f"{state} per {per}"), "hz": (prior, f"1/{per}"), "phase": (PHASE, "rad")},
+        ("time",),
+        act,
+        says,
+        sine_and_cosine_entries(1.0, frequencies),
+        guess=trial_rate(about, state),
+        kind=WaveEffect,
+        counted_from=origin_in_words(about.table.time, origin, per),
+    )
 
 
-def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator[Form]:
+def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:
     """Yield a bound of a state: the rate beyond it is lost, or a state that it drives takes up a share (overflow)."""
-    ends = clipping_levels(values)
+    ends = clipping_between(about.states[state])
     if ends is None:
         return
     others = [other for other in about.states if other != state]
+    says_where = ends.says(state)
 
     def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
         level = theta[:, :1]
@@ -147,23 +155,16 @@ def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator
         return value.with_limit(ceiling).with_limit(floor)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        taken = (
-            f"; {other} takes up {value_with_sd(mean[k], sd[k])} of the rest"
-            for k, other in enumerate(others, 1)
-            if mean[k] > _NO_SHARE
-        )
-        return says_of_limit(state, ends.least_ceiling)(mean, sd) + "".join(taken)
+        shares = {other: value_with_sd(mean[k], sd[k]) for k, other in enumerate(others, 1) if mean[k] > _NO_SHARE}
+        taken = (f"; {other} takes up {share} of the rest" for other, share in shares.items())
+        return says_where(mean, sd) + "".join(taken)
 
     def variant(taking: str | None) -> Form:
         shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
-        tried = [0.5 * (other == taking) for other in others]
-        priors = {
-            "level": ends.prior,
-            **{f"share[{other}]": prior for other, prior in shares.items()},
-        }
-        units, bank = (state, *("1" for _ in others)), single_column_bank(ends.trial_levels, *tried)
-        own = (f"limit:{state}", Stage.RATE, priors, units, (f"state:{state}", "level"), act, bank, says)
-        return Form(*own, amplitudes=(), absent=ends.absent)
+        own: Declared = {"level": (ends.prior, state)} | {f"share[{name}]": (p, "1") for name, p in shares.items()}
+        bank = single_column_bank(ends.tried, *(0.5 * (other == taking) for other in others))
+        given = (f"limit:{state}", Stage.RATE, own, (f"state:{state}", "level"), act, says, bank)
+        return next(about.form(*given, absent={0: ends.nowhere}))
 
     alone = variant(None)
     if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:

@@ -11,9 +11,9 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
-from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Fixed, in_words, single_column_bank
+from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Fixed, acting, in_words, single_column_bank
 from probewise.effects.reading import decaying_sum
-from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
     Modulation,
@@ -26,11 +26,11 @@ from probewise.systems.forms.modulations import (
 from probewise.systems.forms.reference import (
     AMPLITUDE,
     N_SIZES,
+    Clipping,
     Form,
     ReferenceFit,
-    clipped,
     flag,
-    says_of_limit,
+    prior_sizes,
     switch_points,
 )
 from probewise.systems.table import RunTable, covariate_of_column
@@ -74,13 +74,12 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
         prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.median_gap * tried)
         if prior is None:
             continue
-        sizes, variants = np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES), []
+        variants: list[Form] = []
         for is_smooth in (False, True):
             value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
-            priors: dict[str, Marginal] = {"tau_s": prior, _SMOOTH: of_flag}
-            bank = np.stack([sizes, np.full(N_SIZES, value)], axis=1)
-            own = (name, Stage.LAG, priors, (unit, "1"), ("previous",), act, bank[:, None, :], in_words(says, unit))
-            variants.append(Form(*own, amplitudes=(), absent={0: 0.0}, needs_rising_time=True))
+            own, bank = {"tau_s": (prior, unit), _SMOOTH: (of_flag, "1")}, single_column_bank(prior_sizes(prior), value)
+            given = (name, Stage.LAG, own, ("previous",), act, in_words(says, unit), bank)
+            variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
         first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
         apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
         yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
@@ -184,15 +183,11 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     span = float(np.ptp(about.predicted)) or about.sd
 
     def added(name: str, how: Modulation) -> Iterator[Form]:
-        def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-            return value + how.at_rows(theta, rows)
-
+        act: Act = lambda value, theta, rows: value + how.at_rows(theta, rows)  # noqa: E731
         return modulated_form(about, name, Stage.OFFSET, how, act, about.sd, reading, unit)
 
     def scaled(name: str, how: Modulation) -> Iterator[Form]:
-        def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-            return zero + (value - zero) * (1 + how.at_rows(theta, rows))
-
+        act: Act = lambda value, theta, rows: zero + (value - zero) * (1 + how.at_rows(theta, rows))  # noqa: E731
         gain = f"the gain of {reading}"
         return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, gain, "1", ("level",))
 
@@ -218,22 +213,22 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
 def _curve_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     """Yield a polynomial in a column scaled to [-1, 1]; its order, less than the number of values, is a variant."""
     column, reading, unit = about.table.covariates[name], about.system.simulator.reading, about.reading_unit
-    low, high, every = float(np.nanmin(column)), float(np.nanmax(column)), tuple(range(len(_COEFFICIENTS)))
+    low, high, n = float(np.nanmin(column)), float(np.nanmax(column)), len(_COEFFICIENTS)
+    last = min(len(distinct_values(column[about.has_reading])) - 1, n)
+    if last < 2:
+        return
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         z = np.nan_to_num((2 * rows.covariates[name] - low - high) / (high - low))
-        return np.asarray(value + theta @ z ** (1 + np.array(every))[:, None])
+        return np.asarray(value + theta @ z ** np.arange(1, n + 1)[:, None])
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        sizes = [value_with_sd(mean[k], sd[k], unit) for k in every if sd[k] > _HARDLY * sd.max()]
+        sizes = [value_with_sd(mean[k], sd[k], unit) for k in range(n) if sd[k] > _HARDLY * sd.max()]
         said = " + ".join(f"({size}) z^{k}" if k > 1 else f"({size}) z" for k, size in enumerate(sizes, 1))
         return f"{reading} follows a curve of {name}: {said}, z from -1 at {name} = {low:.4g} to 1 at {high:.4g}"
 
-    along, any_size = (covariate_of_column(name),), dict.fromkeys(_COEFFICIENTS, AMPLITUDE)
-    bank = np.eye(len(every))[None]
-    form = Form(f"curve:{name}", Stage.OFFSET, any_size, (unit,) * len(every), along, act, bank, says, every)
-    last = min(len(distinct_values(column[about.has_reading])) - 1, len(every))
-    for whole in about.scaled(form, about.sd) if last > 1 else ():
+    own = (dict.fromkeys(_COEFFICIENTS, (AMPLITUDE, unit)), (covariate_of_column(name),), act, says, np.eye(n)[None])
+    for whole in about.form(f"curve:{name}", Stage.OFFSET, *own):
         first, *others = (_up_to_order(whole, order, int(about.has_reading.sum())) for order in range(2, last + 1))
         yield replace(first, alternatives=tuple(others))
 
@@ -261,22 +256,21 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         return
     low, high = float(speeds[ROWS_OF_A_SIDE - 1]), 0.5 * float(np.nanmax(speeds))
 
-    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-        width = np.maximum(theta[:, 1:2], 0.1 * _NONE * low)
-        return np.asarray(value + theta[:, :1] * np.tanh(np.nan_to_num(rows.covariates[name]) / width))
+    @acting
+    def act(value: FloatArray, rows: RunTable, a: FloatArray, width: FloatArray) -> FloatArray:
+        return value + a * np.tanh(np.nan_to_num(rows.covariates[name]) / np.maximum(width, 0.1 * _NONE * low))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         by = f"tanh({name} / width), width {value_with_sd(mean[1], sd[1])}" if mean[1] > _NONE * low else "its sign"
         size = value_with_sd(mean[0], sd[0], unit)
         return f"{about.system.simulator.reading} has dry friction of {name}: {size} times {by}"
 
-    priors: dict[str, Marginal] = {"a": AMPLITUDE, "width": Fixed(0.0, _NONE * low)}
-    along, bank = (covariate_of_column(name),), np.array([[[1.0, 0.5 * _NONE * low]]])
-    form = Form(f"friction:{name}", Stage.OFFSET, priors, (unit, name), along, act, bank, says)
-    for sign in about.scaled(form, about.sd):
+    parameters, bank = {"a": (AMPLITUDE, unit), "width": (Fixed(0.0, _NONE * low), name)}, [[[1.0, 0.5 * _NONE * low]]]
+    own = (parameters, (covariate_of_column(name),), act, says, np.array(bank))
+    for sign in about.form(f"friction:{name}", Stage.OFFSET, *own):
         if low < high:
-            bank = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, N_SIZES))
-            smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=bank)
+            widths = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, N_SIZES))
+            smooth = replace(sign, parameters={**sign.marginals, "width": LogUniform(low, high)}, entries=widths)
             sign = replace(sign, alternatives=(smooth,))
         yield sign
 
@@ -297,16 +291,18 @@ def settling_time_prior(about: ReferenceFit) -> LogUniform:
 
 
 def _settling_form(about: ReferenceFit) -> Iterator[Form]:
-    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * np.exp(-time_since_start_of_run(table) / theta[:, 1:2]))
-
-    prior = settling_time_prior(about)
-    bank = single_column_bank(1.0, np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES))
-    units, reading = (about.reading_unit, about.time_unit), about.system.simulator.reading
-    says = f"{reading} is off by {{0}} at the start of each run, and settles with a time constant of {{1}}"
-    priors: dict[str, Marginal] = {"a": AMPLITUDE, "tau_s": prior}
-    own = ("settling", Stage.OFFSET, priors, units, ("time", "run"), act, bank, in_words(says, *units))
-    yield from about.scaled(Form(*own), 1.0)
+    prior, units = settling_time_prior(about), (about.reading_unit, about.time_unit)
+    says = "is off by {0} at the start of each run, and settles with a time constant of {1}"
+    yield from about.form(
+        "settling",
+        Stage.OFFSET,
+        {"a": (AMPLITUDE, units[0]), "tau_s": (prior, units[1])},
+        ("time", "run"),
+        acting(lambda value, rows, a, tau_s: value + a * np.exp(-time_since_start_of_run(rows) / tau_s)),
+        in_words(f"{about.system.simulator.reading} {says}", *units),
+        single_column_bank(1.0, np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES)),
+        guess=1.0,
+    )
 
 
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
@@ -331,15 +327,13 @@ def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
 
 
 def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
-    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * sign_of_change(value, table))
-
     if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
     unit, way = about.reading_unit, "{more/less} while it rises than while it falls"
     says = in_words(f"{about.system.simulator.reading} reads {{|0|}} {way}", unit, factors=(2,))
-    priors, bank = {"a": about.amplitude_prior(about.sd)}, np.full((1, 1, 1), about.sd)
-    yield Form("hysteresis", Stage.HYSTERESIS, priors, (unit,), ("previous",), act, bank, says)
+    act = acting(lambda value, rows, a: value + a * sign_of_change(value, rows))
+    size, bank = {"a": (about.amplitude_prior(about.sd), unit)}, single_column_bank(about.sd)
+    yield from about.form("hysteresis", Stage.HYSTERESIS, size, ("previous",), act, says, bank, amplitudes=(0,))
 
 
 def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, BoolArray]:
@@ -364,23 +358,22 @@ def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, Boo
 
 
 def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
-    bent = _expected_readings_and_inliers(about)[0]
-    low, high = float(bent.min()), float(bent.max())
+    expected = _expected_readings_and_inliers(about)[0]
+    low, high = float(expected.min()), float(expected.max())
     if not low < high:
         return
 
-    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    @acting
+    def act(value: FloatArray, rows: RunTable, a: FloatArray, power: FloatArray) -> FloatArray:
         share = (value - low) / (high - low)
-        bent = np.sign(share) * np.abs(share) ** theta[:, 1:2]
-        return np.asarray(value + theta[:, :1] * (high - low) * (bent - share))
+        return value + a * (high - low) * (np.sign(share) * np.abs(share) ** power - share)
 
     z = f"z from 0 at {low:.4g} to 1 at {high:.4g} {about.reading_unit}"
     bend = f"y + a (hi - lo) (z^power - z) with {z}, a = {{0}}, power = {{1}}"
     says = in_words(f"{about.system.simulator.reading} has a bent response, {bend}")
-    priors: dict[str, Marginal] = {"a": AMPLITUDE, "power": LogUniform(0.4, 5.0)}
-    bank = single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0]))
-    own = ("nonlinearity", Stage.BEND, priors, ("1", "1"), ("level",), act, bank, says)
-    yield from about.scaled(Form(*own), about.sd / (high - low))
+    parameters = {"a": (AMPLITUDE, "1"), "power": (LogUniform(0.4, 5.0), "1")}
+    own = (parameters, ("level",), act, says, single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0])))
+    yield from about.form("nonlinearity", Stage.BEND, *own, guess=about.sd / (high - low))
 
 
 def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
@@ -399,17 +392,11 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     span, depths = top - bottom, np.geomspace(0.005, 0.9, 16)
     ceilings, floors = top - span * depths, bottom + span * depths
     levels = np.concatenate([ceilings[ceilings > middle], floors[floors < middle]])
-    if not levels.size:
-        return
-    unit = about.reading_unit
-    says = says_of_limit(about.system.simulator.reading, middle, unit)
-
-    def clip(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return clipped(value, theta[:, :1], middle)
-
-    priors, absent = {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)}, {0: float(top + 1e3 * span)}
-    own = ("saturation", Stage.SATURATION, priors, (unit,), ("level",), clip, levels[:, None, None], says)
-    yield Form(*own, amplitudes=(), absent=absent)
+    if levels.size:
+        prior = Uniform(bottom - 0.02 * span, top + 0.02 * span)
+        ends = Clipping(prior, middle, levels, float(top + 1e3 * span))
+        says = ends.says(about.system.simulator.reading, about.reading_unit)
+        yield from about.clipped("saturation", Stage.SATURATION, ends, about.reading_unit, ("level",), ends.act, says)
 
 
 READING_WORDS = {

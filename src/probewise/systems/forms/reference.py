@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any, Self, TypeAlias, cast
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,17 @@ from probewise._words import value_with_sd
 from probewise.effects.effect import (
     ROWS_OF_A_SIDE,
     Act,
+    Declared,
     Effect,
     Fixed,
     Say,
     StepEffect,
     VariantMasks,
     in_words,
+    single_column_bank,
     thinned,
 )
-from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.law import integrate_states
@@ -116,12 +118,6 @@ class BlockForm(StepEffect):
         return np.concatenate([theta[:, :1], drawn], axis=1)
 
 
-def says_of_limit(what: str, least_ceiling: float, unit: str = "") -> Say:
-    """Return the sentence of a quantity with a level: a ceiling above `least_ceiling`, otherwise a floor."""
-    ceiling, floor = (in_words(f"{what} {way} no further than {{0}}", unit) for way in ("rises", "falls"))
-    return lambda mean, sd: (ceiling if mean[0] > least_ceiling else floor)(mean, sd)
-
-
 def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
     """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
     value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH
@@ -185,46 +181,30 @@ def note_on_row_order(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class ClippingLevels:
-    """Clipping levels between `low` and `high`: a ceiling above `least_ceiling`, otherwise a floor.
+class Clipping:
+    """A quantity that ends at a level, of this prior: a ceiling above `least_ceiling`, otherwise a floor.
 
-    `top` is the largest value, which may be wild, far above `high`.
+    `tried` are the levels of the template bank, (n_levels,); at `nowhere` it is a ceiling without effect.
     """
 
-    low: float
-    high: float
-    top: float
+    prior: Uniform
+    least_ceiling: float
+    tried: FloatArray
+    nowhere: float
 
-    @property
-    def least_ceiling(self) -> float:
-        """Level at 40 % of the range: a clipping level above it is a ceiling, otherwise a floor."""
-        return self.low + _LOWER_PART * (self.high - self.low)
+    def act(self, values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        """Return values, (n_points,) or (n_samples, n_points), clipped at the level theta[:, :1]."""
+        level = theta[:, :1]
+        return np.where(level > self.least_ceiling, np.minimum(values, level), np.maximum(values, level))
 
-    @property
-    def trial_levels(self) -> FloatArray:
-        """Trial levels for the template bank, (n_levels,): ceilings, then floors, densest at the ends of the range."""
-        range_ = self.high - self.low
-        ceilings = self.high - range_ * np.geomspace(_LEAST_CUT, 0.97 * (1 - _LOWER_PART), _N_LEVELS)
-        return np.append(ceilings, self.low + range_ * np.geomspace(_LEAST_CUT, 0.97 * _LOWER_PART, _N_LEVELS))
-
-    @property
-    def prior(self) -> Uniform:
-        """Uniform prior of the level, from `low` to `high`."""
-        return Uniform(self.low, self.high)
-
-    @property
-    def absent(self) -> dict[int, float]:
-        """A level far above all values, a ceiling without effect, by the index of the parameter."""
-        return {0: self.top + (self.high - self.low)}
+    def says(self, what: str, unit: str = "") -> Say:
+        """Return the sentence of a quantity."""
+        ceiling, floor = (in_words(f"{what} {way} no further than {{0}}", unit) for way in ("rises", "falls"))
+        return lambda mean, sd: (ceiling if mean[0] > self.least_ceiling else floor)(mean, sd)
 
 
-def clipped(values: FloatArray, level: FloatArray, least_ceiling: float) -> FloatArray:
-    """Return values clipped at levels, which broadcast: a ceiling above `least_ceiling`, otherwise a floor."""
-    return np.where(level > least_ceiling, np.minimum(values, level), np.maximum(values, level))
-
-
-def clipping_levels(values: FloatArray) -> ClippingLevels | None:
-    """Return the clipping levels within the range of some values, NaN aside; None if it is empty.
+def clipping_between(values: FloatArray) -> Clipping | None:
+    """Return the clipping of some values at a level within their range, NaN aside; None if that is empty.
 
     A wild value, as 9999 in one cell, is left out: it would move the level that tells a ceiling from a floor.
     """
@@ -236,7 +216,11 @@ def clipping_levels(values: FloatArray) -> ClippingLevels | None:
     range_ = np.ptp(others) if others.size else 0.0
     if 0 < _WILD * range_ < np.ptp(ordered):
         inner = ordered[(ordered >= others[0] - range_) & (ordered <= others[-1] + range_)]
-    return ClippingLevels(float(inner[0]), float(inner[-1]), float(ordered[-1]))
+    low, high = float(inner[0]), float(inner[-1])
+    span = high - low
+    ceilings = high - span * np.geomspace(_LEAST_CUT, 0.97 * (1 - _LOWER_PART), _N_LEVELS)  # densest at the ends
+    tried = np.append(ceilings, low + span * np.geomspace(_LEAST_CUT, 0.97 * _LOWER_PART, _N_LEVELS))
+    return Clipping(Uniform(low, high), low + _LOWER_PART * span, tried, float(ordered[-1]) + span)
 
 
 _VALUES_OF_A_SIDE = 3  # at least, on either side of a switch
@@ -254,6 +238,7 @@ def switch_points(values: FloatArray) -> FloatArray:
 
 
 _ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
+ONE_AMPLITUDE = np.ones((1, 1, 1))  # template bank
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,38 +418,64 @@ class ReferenceFit:
                 return times * guess / float(np.median(rms[rms > _UNSEEN]))
         return 0.0
 
-    def scaled(self, form: Form, guess: float) -> Iterator[Form]:
-        """Yield a form, declared with amplitudes of 1, with typical ones and their priors; none if without effect.
-
-        `guess` is an amplitude so small that the readings change in proportion.
-        """
-        typical = self._typical_amplitude(form, guess)
-        if np.isfinite(typical) and typical > 0:
-            entries = form.entries.copy()
-            entries[..., list(form.amplitudes)] *= typical
-            priors = dict(cast(Mapping[str, Marginal], form.parameters))
-            for k in form.amplitudes:
-                name = form.prior.names[k]
-                priors[name] = self.amplitude_prior(typical, positive=priors[name] is POSITIVE)
-            yield replace(form, parameters=priors, entries=entries)
-
-    def sized(
+    def form(
         self,
         name: str,
         stage: Stage,
-        parameter: str,
-        unit: str,
+        parameters: Declared,
         covariates: tuple[str, ...],
         act: Act,
-        tried: FloatArray,
         says: Say,
+        entries: FloatArray = ONE_AMPLITUDE,
+        *,
+        guess: float | None = None,
+        kind: type[Form] = Form,
+        **more: Any,
     ) -> Iterator[Form]:
-        """Yield a form of one size without a sign, log-uniform over those `tried` that are plausible; none without."""
+        """Yield the form of these parameters, by name; none if it is without effect.
+
+        Those declared as AMPLITUDE or POSITIVE, of 1 in the `entries`, get their typical size. For it `guess`, by
+        default a noise sd, is an amplitude so small that the readings change in proportion.
+        """
+        priors = {own: prior for own, (prior, _) in parameters.items()}
+        amplitudes = tuple(k for k, prior in enumerate(priors.values()) if prior is AMPLITUDE or prior is POSITIVE)
+        given = (name, stage, priors, tuple(unit for _, unit in parameters.values()), covariates, act, entries, says)
+        form = kind(*given, **{"amplitudes": amplitudes, **more})
+        if not amplitudes:
+            yield form
+            return
+        typical = self._typical_amplitude(form, self.sd if guess is None else guess)
+        if np.isfinite(typical) and typical > 0:
+            scaled = entries.copy()
+            scaled[..., list(amplitudes)] *= typical
+            sizes = {
+                own: self.amplitude_prior(typical, positive=prior is POSITIVE)
+                for own, prior in priors.items()
+                if prior is AMPLITUDE or prior is POSITIVE
+            }
+            yield replace(form, parameters=priors | sizes, entries=scaled)
+
+    def sized(
+        self, name: str, stage: Stage, size: tuple[str, str], covariates: tuple[str, ...], act: Act, says: Say,
+        tried: FloatArray, **more: Any,
+    ) -> Iterator[Form]:  # fmt: skip
+        """Yield a form of one size, of this name and unit, without a sign; none if none of those `tried` is plausible.
+
+        Its prior is log-uniform over those that change the readings by 0.05 to 10,000 sds (rms), the latter times a
+        misfit above 1; if one alone does, up to the next.
+        """
         prior = self.log_uniform_size_prior(stage, act, tried)
         if prior is not None:
-            entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES)[:, None, None]
-            own = (name, stage, {parameter: prior}, (unit,), covariates, act, entries, says)
-            yield Form(*own, amplitudes=(), absent={0: 0.0})
+            entries, (parameter, unit) = prior_sizes(prior)[:, None, None], size
+            own = (name, stage, {parameter: (prior, unit)}, covariates, act, says, entries)
+            yield from self.form(*own, absent={0: 0.0}, **more)
+
+    def clipped(
+        self, name: str, stage: Stage, ends: Clipping, unit: str, covariates: tuple[str, ...], act: Act, says: Say
+    ) -> Iterator[Form]:
+        """Yield the form of a quantity, of this unit, that ends at a level."""
+        own = ({"level": (ends.prior, unit)}, covariates, act, says, single_column_bank(ends.tried))
+        return self.form(name, stage, *own, absent={0: ends.nowhere})
 
     def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
         """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""
@@ -472,10 +483,7 @@ class ReferenceFit:
         return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
     def log_uniform_size_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
-        """Return a log-uniform prior over those sizes `tried` that change the readings by 0.05 to 10,000 sds (rms).
-
-        A misfit above 1 raises the upper limit. If one size alone qualifies, the range ends at the next; None without.
-        """
+        """Return the prior of `sized`; None if no size is plausible."""
         rms = self.rms_change_in_sds(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
@@ -483,3 +491,8 @@ class ReferenceFit:
         first, last = int(there[0]), int(there[-1])
         low, high = float(tried[first]), float(tried[last if last > first else min(last + 1, len(tried) - 1)])
         return LogUniform(low, high) if low < high else None
+
+
+def prior_sizes(prior: LogUniform) -> FloatArray:
+    """Return the trial sizes of a prior for the template bank, (9,)."""
+    return np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES)

@@ -47,14 +47,6 @@ def test_without_a_directory_nothing_is_written(recording_file, tmp_path, capsys
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.slow
-def test_a_calibrated_sensor_makes_a_common_rotation_visible(recording_file, sensor_file, tmp_path):
-    out = tmp_path / "audit"
-    assert run("audit", recording_file, "--sensor", sensor_file, "--out", out, "--quiet") == 0
-    effects = {effect["name"]: effect for effect in json.loads((out / "audit.json").read_text())["effects"]}
-    assert effects["orientation_error"]["sight"] != "invisible"
-
-
 HEATER = """import numpy as np
 reading, unit, time = "temp_c", "degC", "t_s"
 parameters = {"gain": (0, 10), "start_c": ("normal", 20, 5)}

@@ -11,19 +11,12 @@ from probewise.cli import main
 from probewise.recordings import paper_plan, write_plan
 
 TEXTS = {
-    "an integer of 400 digits": b'{"format": ' + b"9" * 400 + b"}",
     "an integer of 5000 digits": b'{"format": ' + b"9" * 5000 + b"}",
     "a number beyond floats": b'{"format": 1e999}',
     "lists a million deep": b"[" * 1_000_000,
-    "objects a million deep": b'{"a":' * 1_000_000,
     "NaN": b'{"format": NaN}',
-    "Infinity": b'{"format": -Infinity}',
-    "a long text": b'{"format": "' + b"a" * 100_000 + b'"}',
     "a long name twice": b'{"' + b"k" * 100_000 + b'": 1, "' + b"k" * 100_000 + b'": 2}',
-    "half a character": b'{"format": "\\ud800"}',
     "an escape sequence": b'{"format": "\x1b[31m"}',
-    "UTF-16": '{"format": "sensor/1"}'.encode("utf-16"),
-    "NUL bytes": bytes(1000),
     "random bytes": np.random.default_rng(0).bytes(4000),
     "a list": b"[1]",
     "nothing": b"",
@@ -32,18 +25,12 @@ SOME_TEXTS = ("an integer of 5000 digits", "lists a million deep", "NaN", "rando
 TABLES = {
     "a million cells in one line": b",".join([b"a"] * 1_000_000),
     "ten thousand columns": b",".join(b"c%d" % k for k in range(10_000)) + b"\n" + b",".join([b"1"] * 10_000),
-    "a name twice": b"x_mm,y_mm,reading,x_mm\n1,2,3,4\n",
     "a name to obey twice": b"\x1b[31m,\x1b[31m,x_mm,y_mm,reading\n",
-    "a name of two lines twice": b'"x\nmm","x\nmm"\n',
     "nothing": b"",
-    "blanks": b" \n \n",
-    "a header alone": b"x_mm,y_mm,reading\n",
     "CR line ends, a bad cell": b"x_mm,y_mm,reading\r1,2,abc\r",
     "a quote that never closes": b'x_mm,y_mm,reading\n1,2,"3\n' + b"1,2,3\n" * 30_000,
-    "UTF-16": "x_mm,y_mm,reading\n1,2,3\n".encode("utf-16"),
     "a cell of NUL": b"x_mm,y_mm,reading\n1,2,\0\n",
     "a number of 100,000 digits": b"x_mm,y_mm,reading\n1,2," + b"9" * 100_000 + b"\n",
-    "a text of 100,000 letters": b"x_mm,y_mm,reading\n1,2," + b"a" * 100_000 + b"\n",
     "random bytes": np.random.default_rng(1).bytes(4000),
 }
 
@@ -59,16 +46,10 @@ def described(shape: str, kind: str = "|u1") -> str:
 
 ARRAYS = {
     "a picture of 100,000 x 100,000": npy(described("(100000, 100000)")),
-    "a picture of 10^22 pixels": npy(described(f"({10**11}, {10**11})")),
     "a negative shape": npy(described("(-1, -4)"), bytes(4)),
     "two thousand brackets": npy("(" * 2000 + ")" * 2000),
-    "no dictionary": npy("[1, 2]\n"),
     "Python objects": npy(described("(2, 2)", "|O"), bytes(32)),
-    "a record": npy("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1, 1), }\n", bytes(8)),
     "cut short": npy(described("(4, 4)"), bytes(15)),
-    "too long": npy(described("(4, 4)"), bytes(17)),
-    "version 3": npy(described("(1, 1)"), bytes(1), b"\x03\x00"),
-    "version 9": npy(described("(1, 1)"), bytes(1), b"\x09\x00"),
     "another file's first bytes": b"\x89PNG\r\n\x1a\n" + bytes(100),
     "a header that is cut short": b"\x93NUMPY\x01\x00\xff\xff{",
     "a header of a gigabyte": b"\x93NUMPY\x02\x00\xff\xff\xff\x3f{",
@@ -152,15 +133,10 @@ def test_an_array_that_is_no_picture_is_refused_by_its_header(what, refused, rec
     ("place", "value"),
     [
         (("n_gaussians",), 10**300),
-        (("n_gaussians",), -1),
         (("samples",), [[]]),
-        (("samples",), "x" * 100_000),
-        (("samples", 0, 3), -(10**300)),
         (("field", "pixel_mm"), 0),
-        (("field", "origin_mm"), [10**300]),
         (("noise", "sd", 0), 0),
         (("effects",), ["x" * 100_000]),
-        (("parameters", 0, "name"), "x" * 100_000),
         (("instrumentation", "min"), "low"),
         (("absent",), {"lag": [10**300]}),
     ],
@@ -174,25 +150,6 @@ def test_a_sensor_with_one_value_out_of_bounds_is_refused(place, value, refused,
     holder[place[-1]] = value
     sensor_file.write_text(json.dumps(document))
     refused("predict", sensor_file, recording_file, "--out", tmp_path / "p.csv")
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        {"index": 1, "pose": {"x_mm": "1e999", "y_mm": 0, "orientation_rad": 0}},
-        {"index": 1, "pose": {"x_mm": "nan", "y_mm": 0, "orientation_rad": 0}},
-        {"index": "1"},
-        {"index": 10**300},
-        {"index": 1, "pose": []},
-    ],
-    ids=lambda line: json.dumps(line)[:45],
-)
-def test_a_journal_line_whose_numbers_are_texts_is_refused(line, refused, sensor_file, tmp_path):
-    whole = {"time_s": 0.0, "reading": 30.0, "covariates": {}, "index": 1}
-    whole["pose"] = {"x_mm": 0.0, "y_mm": 0.0, "orientation_rad": 0.0}
-    path = tmp_path / "bad.jsonl"
-    path.write_text('{"format": "journal/1"}\n' + json.dumps(whole | line) + "\n")
-    assert "line 2" in refused("diagnose", path, "--sensor", sensor_file, "--out", tmp_path / "out")
 
 
 def test_a_byte_order_mark_is_taken_wherever_text_is_read(sensor_file, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """Input that cannot be used: exit status 2, one line that says what, where and what is allowed, nothing written."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -25,62 +24,6 @@ def refused(capsys, out, *arguments):
     return captured.err
 
 
-def spoil(path, column, text, row=3):
-    """Write another text into one cell."""
-    lines = path.read_text().splitlines()
-    cells = lines[row - 1].split(",")
-    cells[lines[0].split(",").index(column)] = text
-    lines[row - 1] = ",".join(cells)
-    path.write_text("\n".join(lines) + "\n")
-
-
-@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
-@pytest.mark.parametrize(
-    ("column", "text"),
-    [("x_mm", "ten"), ("y_mm", "nan"), ("x_mm", "inf"), ("pattern", "nobody"), ("reading", "bright"), ("x_mm", "")],
-)
-def test_a_cell_that_cannot_be_used_is_named_with_its_row_and_column(
-    verb, column, text, recording_file, tmp_path, capsys
-):
-    spoil(recording_file, column, text)
-    said = refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
-    assert recording_file.name in said
-    assert "row 3" in said
-    assert column in said
-
-
-@pytest.mark.parametrize(
-    ("verb", "harm"),
-    [
-        *(("diagnose", harm) for harm in ("no file", "no json", "torn json", "unknown kind", "no rows", "binary")),
-        ("calibrate", "no x_mm"),
-        ("audit", "empty"),
-    ],
-)
-def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, tmp_path, capsys):
-    description = recording_file.with_suffix(".json")
-    match harm:
-        case "no file":
-            recording_file.unlink()
-        case "no json":
-            description.unlink()
-        case "torn json":
-            description.write_text(description.read_text()[:40])
-        case "unknown kind":
-            content = json.loads(description.read_text())
-            content["patterns"]["boundary"]["kind"] = "spiral"
-            description.write_text(json.dumps(content))
-        case "no x_mm":
-            recording_file.write_text(recording_file.read_text().replace("x_mm", "where"))
-        case "no rows":
-            recording_file.write_text(recording_file.read_text().splitlines()[0] + "\n")
-        case "empty":
-            recording_file.write_bytes(b"")
-        case "binary":
-            recording_file.write_bytes(bytes(range(256)))
-    refused(capsys, tmp_path / "out", verb, recording_file, "--out", tmp_path / "out")
-
-
 def test_a_table_without_places_is_perhaps_one_for_a_simulator(tmp_path, capsys):
     (tmp_path / "swings.csv").write_text("t_s,angle\n0,1\n1,2\n")
     said = refused(capsys, tmp_path / "out", "diagnose", tmp_path / "swings.csv", "--out", tmp_path / "out")
@@ -93,12 +36,9 @@ OWN = (*EXPLORE, "--arm", "own.py")
 INVESTIGATE = ("investigate", "--plan", "paper")
 TRUTHS = {
     "500,250,-90": ("radius_mm", "-90.0", "20 to 150"),
-    "500,250,5000": ("radius_mm", "5000.0", "20 to 150"),
     "500,nan,90": ("y_mm", "nan", "0 to 520"),
-    "inf,250,90": ("x_mm", "inf", "0 to 1048"),
     "rectangle:500,250,100,60,2": ("angle_rad", "2.0", "0 to 1.5708"),
     "ellipse:500,250,90,120,0.3": ("semi_minor_mm", "120.0", "20 to 90"),
-    "ellipse:500,250,inf,inf,0.3": ("semi_major_mm", "inf", "20 to 150"),
 }
 # Words of a command, and what its refusal says.
 CONTRADICTIONS = [
@@ -167,7 +107,7 @@ def test_options_that_contradict_each_other_are_refused_before_any_work(
     assert says in refused(capsys, tmp_path / "out", *words, "--out", "out")
 
 
-@pytest.mark.parametrize("value", ["9" * 30, "1" * 5000, "1e400", "nan", "-1", "0"], ids=lambda value: value[:6])
+@pytest.mark.parametrize("value", ["1" * 5000, "1e400", "0"], ids=lambda value: value[:6])
 @pytest.mark.parametrize(
     "words",
     [
@@ -215,14 +155,6 @@ def test_a_journal_is_no_recording_and_it_is_said_what_to_do_with_it(verb, tmp_p
     more = ["sensor.json"] if verb == "predict" else []
     said = refused(capsys, tmp_path / "out", verb, *more, journal, "--out", tmp_path / "out")
     assert f"probewise diagnose {journal} --sensor S.json --out DIR" in said
-
-
-def test_a_recording_without_contrast_cannot_be_calibrated(recording_file, tmp_path, capsys):
-    lines = recording_file.read_text().splitlines()
-    at = lines[0].split(",").index("reading")
-    rows = [",".join([*line.split(",")[:at], "30", *line.split(",")[at + 1 :]]) for line in lines[1:]]
-    recording_file.write_text("\n".join([lines[0], *rows]) + "\n")
-    refused(capsys, tmp_path / "out", "calibrate", recording_file, "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize("truth", ["0,0,20", "1048,520,150", "ellipse:500,250,90,90,0", "hexagon:500,250,30,0"])

@@ -67,15 +67,6 @@ def test_the_journal_names_the_utility(explore, options, utility):
 
 
 @pytest.mark.slow
-def test_readings_may_be_chosen_several_at_a_time(explore):
-    status, lines = explore("--batch", 2, "--max-readings", 2)
-    assert status == 0
-    assert lines[0]["options"]["batch"] == 2
-    first, second = (line["pose"] for line in lines[1:])
-    assert lines[1]["belief"]["next"] == second != first
-
-
-@pytest.mark.slow
 def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, monkeypatch, tmp_path):
     """The naive model left, as in the paper, whichever chooses; the run itself is the same as without."""
     drawn, quick = [], exploration.robot_views_by_model_png
@@ -129,13 +120,6 @@ def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept
 def test_the_lego_arms_own_height_may_be_named(sensor_file, tmp_path):
     words = ("explore", "--sensor", sensor_file, "--out", tmp_path, "--heights", "14", "--arm", "nxt:/dev/null")
     assert read_checked_inputs(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
-
-
-def test_a_height_is_refused_where_that_of_the_calibration_is_not_known(sensor_file, tmp_path, capsys):
-    out = tmp_path / "found"
-    assert main(["explore", "--sensor", str(sensor_file), "--out", str(out), "--heights", "10"]) == 2
-    assert "does not say at which height_mm it was calibrated" in capsys.readouterr().err
-    assert not out.exists()
 
 
 def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behind(sensor_file, tmp_path, capsys):
@@ -224,18 +208,6 @@ def test_the_papers_robot_leaves_what_the_other_leaves_and_its_journal_names_it(
     assert found["readings"] == 1
     assert "nested sampling anew after each reading" in (tmp_path / "found" / "report.html").read_text()
     assert "radius_mm" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_the_papers_robot_goes_on_bit_for_bit_from_its_journal(explore, tmp_path):
-    naive = (*PAPER, "--model", "naive", "--max-readings", 3)
-    _, whole = explore(*naive)
-    journal = tmp_path / "found" / "journal.jsonl"
-    journal.write_text("".join(line + "\n" for line in journal.read_text().splitlines()[:2]))
-    status, resumed = explore(*naive, "--resume")
-    assert status == 0
-    assert resumed == whole
-    assert whole[0]["likelihood"].startswith("Naive(mu_black=")
 
 
 def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, monkeypatch, capsys):

@@ -150,15 +150,6 @@ def test_a_seed_makes_the_same_run_in_python_and_on_the_command_line(sensor_file
     assert "hidden       circle: x_mm" in run.summary()
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_from_its_journal_with_the_noise_it_would_have_had(sensor, tmp_path):
-    whole = probewise.explore(sensor, max_readings=3, rng=np.random.default_rng(7), progress=False)
-    journal = tmp_path / "journal.jsonl"
-    probewise.explore(sensor, max_readings=1, rng=np.random.default_rng(7), journal=journal, progress=False)
-    resumed = probewise.explore(sensor, max_readings=3, rng=np.random.default_rng(7), journal=journal, progress=False)
-    assert [r.value for r in resumed.readings] == [r.value for r in whole.readings]
-
-
 def test_an_arm_of_ones_own_is_entered_measured_with_and_left(sensor):
     said = []
 

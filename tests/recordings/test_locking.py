@@ -32,11 +32,6 @@ def test_a_second_process_is_refused_and_a_killed_holder_holds_it_no_more(tmp_pa
     assert [p.name for p in tmp_path.iterdir()] == [".journal.jsonl.lock"]
 
 
-def test_a_lock_is_not_taken_twice_within_one_process_either(tmp_path):
-    with hold_lock(tmp_path / "a"), pytest.raises(FileError, match="another process"), hold_lock(tmp_path / "a"):
-        pass
-
-
 def test_a_folder_that_is_missing_is_named(tmp_path):
     with pytest.raises(FileError, match=r"nowhere.*cannot be written"), hold_lock(tmp_path / "nowhere" / "a"):
         pass

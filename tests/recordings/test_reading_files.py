@@ -63,10 +63,6 @@ def test_a_scan_name_that_returns_is_a_new_scan(tmp_path):
     assert plan.scan_names == ("a", "b", "a")
 
 
-def test_a_column_without_any_name_of_a_scan_is_one_scan(tmp_path):
-    assert read_plan(put(tmp_path, "x_mm,y_mm,scan\n0,0,\n1,0,\n")).scan.tolist() == [0, 0]
-
-
 def test_a_session_is_a_number_of_each_scan_and_one_session_is_none(tmp_path):
     csv = "x_mm,y_mm,reading,scan,session\n0,0,1,a,0\n1,0,1,a,0\n0,0,1,b,{0}\n1,0,1,c,{0}\n"
     assert read_plan(put(tmp_path, csv.format(3))).sessions == (0, 3, 3)
@@ -142,10 +138,6 @@ def test_every_pattern_kind_is_read(tmp_path):
     }
 
 
-def test_a_recording_is_accepted_as_a_plan_even_without_any_reading(tmp_path):
-    assert len(read_plan(put(tmp_path, "x_mm,y_mm,reading\n0,0,\n"))) == 1
-
-
 def test_time_that_runs_backwards_is_noted(tmp_path):
     recording = read_recording(put(tmp_path, "x_mm,y_mm,reading,time_s\n0,0,1,5\n0,0,1,4\n"))
     assert recording.notes == ("time_s runs backwards at row 3",)
@@ -158,35 +150,21 @@ BAD_TABLES = {
     "text in a number": (HEAD + "0,0,1\n0,abc,2\n", ["row 3", "column y_mm", "'abc'", "finite number"]),
     "text in a reading": (HEAD + "0,0,dark\n", ["row 2", "column reading", "'dark'", "empty, nan or n/a"]),
     "comma as decimal point": (HEAD + "0,0,1,5\n", ["row 2", "4 cells", "1.5"]),
-    "underscore": (HEAD + "0,0,1_000\n", ["row 2", "'1_000'"]),
-    "no coordinate": (HEAD + "0,0,1\n0,,1\n", ["row 3", "column y_mm", "empty"]),
-    "NaN coordinate": (HEAD + "nan,0,1\n", ["row 2", "column x_mm", "'nan'"]),
     "infinite reading": (HEAD + "0,0,1\n0,0,inf\n", ["row 3", "column reading", "'inf'"]),
-    "overflow": (HEAD + "0,0,1e999\n", ["row 2", "column reading", "'1e999'"]),
     "huge coordinate": (HEAD + "1e300,0,1\n", ["row 2", "column x_mm", "'1e300'", "1e+09"]),
     "radians": ("orientation_rad," + HEAD + "0,0,0,1\n", ["row 1", "orientation_rad", "orientation_deg"]),
-    "NaN orientation": ("orientation_deg," + HEAD + "nan,0,0,1\n", ["row 2", "column orientation_deg"]),
-    "NaN time": ("time_s," + HEAD + ",0,0,1\n", ["row 2", "column time_s"]),
     "text in a covariate": ("t_c," + HEAD + "1,0,0,1\n2,0,0,1\nx,0,0,1\n", ["row 4", "column t_c", "'x'"]),
-    "infinite covariate": ("t_c," + HEAD + "1,0,0,1\n1e400,0,0,1\n", ["row 3", "column t_c"]),
     "no scan": ("scan," + HEAD + "a,0,0,1\n,0,0,1\nb,0,0,1\n", ["row 3, column scan: the cell is empty", "in none"]),
     "unprintable scan": ("scan," + HEAD + "a,0,0,1\nb\0,0,0,1\n", ["row 3", "column scan", "b\\x00", "printable"]),
-    "unprintable column": ("t\x07," + HEAD + "1,0,0,1\n", ["row 1", "t\\x07", "printable"]),
     "duplicate header": ("x_mm,y_mm,reading,x_mm\n0,0,1,2\n", ["row 1", "column x_mm", "twice"]),
     "short row": (HEAD + "0,0,1\n\n0,0\n", ["row 4", "2 cells", "3 cells"]),
-    "long row": (HEAD + "0,0,1,9\n", ["row 2", "4 cells", "3 cells"]),
-    "only a header": (HEAD, ["no reading at all"]),
     "no reading": (HEAD + "0,0,\n0,0,nan\n", ["column reading", "no reading at all"]),
     "nothing in range": (HEAD + "0,0,200\n", ["column reading", "0 to 100"]),
     "empty": ("", ["the file is empty"]),
-    "only blank lines": ("\n\n", ["the file is empty"]),
     "open quote": (HEAD + '0,0,"1\n', ["row", "CSV"]),
     "not UTF-8": (HEAD.encode() + b"0,0,1\n0,0,\xff\n", ["row 3", "0xff", "UTF-8"]),
     "half of UTF-16": (HEAD.encode("utf-16")[:-1], ["row", "is not UTF-16", "UTF-8"]),
-    "half a session": ("session," + HEAD + "0,0,0,1\n0.5,0,0,1\n", ["row 3", "column session", "0.5", "whole number"]),
     "two sessions": ("session," + HEAD + "0,0,0,1\n1,0,0,1\n", ["row 3", "column session", "throughout a scan"]),
-    "negative session": ("session," + HEAD + "-1,0,0,1\n", ["row 2", "column session", "from 0"]),
-    "missing session": ("session," + HEAD + "1,0,0,1\n1,0,0,1\n,0,0,1\n", ["row 4", "column session"]),
     "unknown pattern": ("pattern," + HEAD + "white,0,0,1\nred,0,0,1\n", ["row 3", "column pattern", "'red'", "white"]),
 }  # fmt: skip
 
@@ -220,30 +198,21 @@ def with_white(**more):
 
 BAD_DESCRIPTIONS = {
     "does not parse": ('{"format": \n "recording/1",,}', ["line 2", "JSON"]),
-    "cut short": ('{"format": "recording/1"', ["line 1", "JSON"]),
     "not a number of JSON": ('{"format": "recording/1", "reading": {"min": NaN}}', ["NaN"]),
     "a list": ("[]", ["an object"]),
     "a name twice": ('{"format": 1, "format": 2}', ["'format' comes twice"]),
     "too deep": ("[" * 100_000, ["JSON"]),
     "another format": ('{"format": "recording/9", "patterns": {}}', ["format is", '"recording/1"']),
-    "no format": ("{}", ["format is missing", '"recording/1"']),
     "no patterns": ('{"format": "recording/1"}', ["patterns is missing"]),
-    "empty patterns": (described(), ["patterns is empty"]),
     "unknown kind": (described(a={"kind": "blob"}), ['patterns.a.kind is "blob"', "half_plane", "image"]),
-    "no kind": (described(a={}), ["patterns.a.kind is missing"]),
-    "not an object": (described(a=3), ["patterns.a is 3"]),
     "unprintable pattern": (described(**{"a\n": {"kind": "uniform"}}), ["a\\n", "printable"]),
     "field missing": (described(a={"kind": "uniform"}), ["patterns.a.albedo is missing"]),
     "text in a field": (described(a={"kind": "uniform", "albedo": "1"}), ['patterns.a.albedo is "1"', "finite number"]),
-    "true in a field": (described(a={"kind": "uniform", "albedo": True}), ["patterns.a.albedo is true"]),
     "huge field": ('{"format": "recording/1", "patterns": {"a": {"albedo": 1e999}}}', ["'1e999' is beyond"]),
     "negative radius": (
         described(a={"kind": "disc", "center_mm": [0, 0], "radius_mm": -3}),
         ["radius_mm is -3", "greater than 0"],
     ),
-    "half a pair": (described(a={"kind": "disc", "center_mm": [0], "radius_mm": 3}), ["center_mm is [0]"]),
-    "direction": (described(a={"kind": "quadrant", "corner_mm": [0, 0], "direction": [1, 0]}), ["direction is [1, 0]"]),
-    "two corners": (described(a={"kind": "polygon", "vertices_mm": [[0, 0], [1, 1]]}), ["three corners"]),
     "duty": (
         described(a={"kind": "stripes", "normal_deg": 0, "period_mm": 1, "duty": 2, "phase_mm": 0}),
         ["duty is 2", "0 to 1"],
@@ -257,7 +226,6 @@ BAD_DESCRIPTIONS = {
         ["patterns.a.file", "x.png", "same folder"],
     ),
     "range": (with_white(reading={"min": 5, "max": 5}), ["reading.max is 5", "greater than min"]),
-    "step": (with_white(reading={"step": 0}), ["reading.step is 0", "greater than 0"]),
     "controls": (with_white(controls="led"), ["controls", "list of texts"]),
 }  # fmt: skip
 

@@ -66,14 +66,6 @@ def test_a_whole_turn_takes_no_time():
         assert duration_s(arm, turned, origin_mm=ORIGIN) == duration_s(arm, plan, origin_mm=ORIGIN)
 
 
-def test_a_sensor_that_an_earlier_plan_left_turned_is_turned_back(told):
-    plan = paper_plan()
-    turned = plan.take(np.flatnonzero(plan.scan == 1)[:2])
-    for rows in (turned, turned, plan.take(np.arange(2))):
-        told.take(rows)
-    assert [round(math.degrees(r.turned_rad)) for r in told.asked if r.turned_rad is not None] == [90, 0]
-
-
 def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told):
     plan = thinned(paper_plan())
     readings = told.take(plan)

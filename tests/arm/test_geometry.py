@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probewise.arm import Geometry, Joint, read_geometry, shipped_geometry_path
-from probewise.errors import FileError, ShapeError
+from probewise.errors import FileError
 
 SHIPPED = read_geometry(shipped_geometry_path())
 RELATIVE = dataclasses.replace(
@@ -115,26 +115,14 @@ def test_the_play_lies_behind_the_motor():
     assert math.degrees(joint.angle_at(0, 1)) == pytest.approx(-1.0)
 
 
-def test_rows_must_have_the_right_length():
-    with pytest.raises(ShapeError, match=r"allowed: \(n, 2\)"):
-        SHIPPED.contains(np.zeros(2))
-    with pytest.raises(ShapeError, match=r"allowed: \(n, 3\)"):
-        SHIPPED.position_mm(np.zeros((4, 2)))
-
-
 # What a person may get wrong in the file, the line to spoil it with, and what is said.
 SPOILED = [
     ('format = "arm/1"', 'format = "arm/2"', "format is 'arm/2'; allowed: \"arm/1\""),
     ("x_mm = 524", "", "base.x_mm is missing"),
-    ("x_mm = 524", 'x_mm = "524"', "base.x_mm is '524'; allowed: a number"),
     ("x_mm = 524", "x_mm = nan", "base.x_mm is nan"),
-    ("x_mm = 524", "x_mm = 1e9", "of magnitude up to 1e+06"),
-    ("x_mm = 524", "x_mm = true", "base.x_mm is True"),
     ("x_mm = 524", "x_mn = 524\nx_mm = 524", "base.x_mn is not known"),
     ("upper_mm = 350", "upper_mm = 0", "links_mm is 0.0; allowed: greater than 0"),
-    ('elbow = "absolute"', 'elbow = "up"', "links.elbow is 'up'"),
     ("port = 1\n", "port = 5\n", "sensor.port is 5; allowed: 1, 2, 3 or 4"),
-    ("port = 1\n", "port = true\n", "sensor.port is True"),
     ("read_height_mm = 14", "read_height_mm = 70", "heights above 0, each above the one before"),
     ("whole_percent = true", "whole_percent = 1", "sensor.whole_percent is 1; allowed: true or false"),
     ('port = "A"', 'port = "D"', "joints.base.port is 'D'"),
@@ -142,12 +130,9 @@ SPOILED = [
     ("gear_ratio = 21", "gear_ratio = 0", "joints.base.gear_ratio is 0.0"),
     ("home_deg = -90", "home_deg = 90", "joints.base.home_deg is"),
     ("low_deg = -190", "low_deg = 190", "the low one below the high"),
-    ("play_deg = 0.3", "play_deg = -1", "joints.base.play_deg is"),
     ("play_deg = 0.3", "play_deg = 0.3\nstop_deg = -100", "joints.base.stop_deg is -100.0"),
     ("home_deg = 90", "home_deg = 90\nstop_deg = -25", "not -178 mm"),
-    ("home_deg = 90", "home_deg = 90\nstop_deg = true", "joints.shoulder.stop_deg is True"),
     ("[links]", "[lines]", "links is missing"),
-    ("[links]", "links = 3\n[lines]", "links is missing"),
     ("[field]", "[field", "not TOML"),
 ]
 

@@ -18,7 +18,7 @@ from probewise.arm import (
     read_geometry,
     shipped_geometry_path,
 )
-from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
+from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.errors import LinkError, ParameterError, ReachError
 
 SHIPPED = read_geometry(shipped_geometry_path())
@@ -112,7 +112,7 @@ def test_the_links_come_down_on_every_place(bench):
 def test_every_place_that_the_arm_holds_can_be_taken(bench):
     """The way there and back, with all that the motors need beyond it, is never refused."""
     rng = np.random.default_rng(3)
-    places = rng.uniform((0, 0), (1048, 520), (200, 2))
+    places = rng.uniform((0, 0), (1048, 520), (60, 2))
     with bench.arm as arm:
         for x_mm, y_mm in places[bench.geometry.contains(places)]:
             arm.measure(bench.pose(float(x_mm), float(y_mm)))
@@ -130,15 +130,6 @@ def test_the_pose_told_is_that_of_the_motors(bench):
             )
             assert math.dist((reading.pose.x_mm, reading.pose.y_mm), place) < 2.5
             assert reading.pose.orientation_rad == pytest.approx(bench.pose(*place).orientation_rad, abs=2e-3)
-
-
-def test_readings_carry_the_time_from_the_start(paper_brick, clock):
-    arm = Bench(paper_brick, clock, SHIPPED)
-    later = LegoArm(arm.arm._machine, arm.geometry, clock=clock, start_s=500.0)
-    with later:
-        first = later.measure(arm.pose(*PLACES[0]))
-        second = later.measure(arm.pose(*PLACES[1]))
-    assert 500 < first.time_s < second.time_s < clock.now_s - 100 + 500
 
 
 @pytest.mark.parametrize("height_mm", [None, 20.0])
@@ -165,15 +156,6 @@ def test_a_pose_that_the_arm_cannot_take_moves_nothing(bench):
         with pytest.raises(ReachError):
             arm.go_over(0.0, 2000.0)
     assert not bench.paper.drives()
-
-
-def test_a_sensor_turned_on_its_mount_stands_otherwise(bench):
-    with bench.arm as arm:
-        before = bench.pose(300.0, 200.0).orientation_rad
-        arm.turned_rad = math.pi / 2
-        assert bench.pose(300.0, 200.0).orientation_rad == pytest.approx(before + math.pi / 2)
-        reading = arm.measure(bench.pose(300.0, 200.0))
-        assert reading.pose.orientation_rad == pytest.approx(before + math.pi / 2, abs=2e-3)
 
 
 def test_an_arm_can_be_brought_home_by_hand_or_by_itself(bench):
@@ -241,14 +223,6 @@ def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
             arm.turn_joint(0, math.nan)
 
 
-def test_the_battery_and_the_sensor_can_be_read_without_moving(bench):
-    """In LEGO units, as `measure` gives and recordings hold."""
-    with bench.arm as arm:
-        assert arm.read_here() == 100 * 582 // 1023
-        assert arm.battery_mv() == 7412
-    assert not bench.paper.drives()
-
-
 def test_fractions_are_kept_where_the_geometry_says_so(paper_brick, clock):
     fine = Bench(paper_brick, clock, dataclasses.replace(SHIPPED, whole_percent=False))
     with fine.arm as arm:
@@ -275,20 +249,6 @@ def test_a_reading_that_is_there_is_not_lost_when_the_line_dies_on_the_way_up(pa
     with pytest.raises(LinkError, match="cut"):
         run()
     assert [reading.value for reading in readings] == [56]
-
-
-def test_a_stuck_motor_ends_the_run_with_everything_released(paper_brick, clock):
-    bench = Bench(paper_brick, clock, SHIPPED)
-    paper_brick.motors[1].blocked_at = -100
-
-    def run():
-        with bench.arm as arm:
-            arm.measure(bench.pose(*PLACES[0]))
-
-    with pytest.raises(MotorError, match="motor B"):
-        run()
-    assert paper_brick.at_rest
-    assert not paper_brick.is_open
 
 
 def test_a_brick_that_cannot_be_asked_at_the_start_is_let_go(paper_brick, clock):

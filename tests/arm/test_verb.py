@@ -21,14 +21,6 @@ def test_check_says_and_draws_how_far_the_arm_reaches(tmp_path, capsys):
     assert (tmp_path / "reach.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_check_names_what_is_wrong_with_a_file(tmp_path, capsys):
-    path = tmp_path / "mine.toml"
-    path.write_text(shipped_geometry_path().read_text().replace("gear_ratio = 21", "gear_ratio = 0"))
-    error = said(capsys, "arm", "check", "--geometry", path, status=2).err
-    assert error.count("\n") == 1
-    assert "mine.toml: joints.base.gear_ratio is 0.0" in error
-
-
 @pytest.fixture
 def at_port(paper_brick, clock, monkeypatch):
     monkeypatch.setattr(

@@ -19,7 +19,6 @@ from probewise.emulator import (
     VirtualClock,
     parse_scene,
     read_geometry,
-    set_up_bench,
     shipped_geometry_path,
 )
 from probewise.errors import FileError, ParameterError
@@ -74,16 +73,6 @@ def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometr
             motor.step(1e-3, 40 * way, brake=False, battery_mv=7400)
         angles.append(arm.sensor_pose().orientation_rad - math.radians(motor.angle_deg / geometry.joints[0].gear_ratio))
     assert math.degrees(angles[1] - angles[0]) == pytest.approx(geometry.joints[0].play_deg)
-
-
-def test_the_brick_counts_what_a_hand_turns(geometry: Geometry, clock: VirtualClock) -> None:
-    bench = set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1)
-    shoulder = bench.arm.joints[1]
-    shoulder.set_angle_by_hand(shoulder.numbers.home_deg + 10)
-    clock.sleep(0.01)
-    bench.radio.brick.advance()
-    counts = bench.radio.brick.outputs.ports["ABC".index(shoulder.numbers.port)].rotation_count
-    assert counts == pytest.approx(10 * shoulder.numbers.gear_ratio, abs=1)
 
 
 def sight(stand: SensorPose, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
@@ -163,12 +152,6 @@ def test_a_geometry_that_cannot_be_used_says_where(tmp_path: Path, old: str, new
     with pytest.raises(FileError, match=found) as caught:
         read_geometry(file)
     assert str(file) in str(caught.value)
-
-
-@pytest.mark.parametrize(("name", "sleep_min"), [("", 10), ("fifteen letters", 10), ("a\tb", 10), ("NXT", 7)])
-def test_a_brick_that_cannot_be_is_refused(geometry: Geometry, clock: VirtualClock, name: str, sleep_min: int) -> None:
-    with pytest.raises(ParameterError):
-        set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1, name=name, sleep_min=sleep_min)
 
 
 @pytest.mark.parametrize(

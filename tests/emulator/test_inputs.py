@@ -71,14 +71,6 @@ def test_a_change_of_mode_alone_is_valid_a_millisecond_later(ask, clock) -> None
     assert values(ask)[0] == 1
 
 
-def test_setting_the_same_type_and_mode_again_does_not_shorten_the_wait(ask, clock) -> None:
-    ask("80 05 01 05 80")
-    clock.sleep(0.01)
-    ask("80 05 01 05 80")
-    clock.sleep(0.002)
-    assert values(ask)[0] == 0
-
-
 def test_the_converter_takes_a_new_sample_every_three_milliseconds(clock: VirtualClock) -> None:
     taken = []
 
@@ -101,18 +93,6 @@ def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
     ask("80 05 01 05 00")
     clock.sleep(0.1)
     assert values(ask)[2] * 100 / 1023 == pytest.approx(percent, abs=0.3)
-
-
-@given(percent=st.floats(-1e6, 1e6))
-def test_no_light_leaves_the_converter_s_range(percent: float) -> None:
-    assert 0 <= LightSensor(lambda lit: percent, VirtualClock())(True) <= 1023
-
-
-def test_an_empty_port_reads_the_full_voltage(clock: VirtualClock) -> None:
-    ask = asking(light_brick(clock, empty_port))
-    ask("80 05 01 01 00")
-    clock.sleep(0.1)
-    assert values(ask) == (1, 1023, 1023, 1023)
 
 
 @given(telegrams=st.lists(st.binary(max_size=70), max_size=6))

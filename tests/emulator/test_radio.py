@@ -171,28 +171,6 @@ def test_the_same_seed_brings_the_same_mishaps() -> None:
     assert answers(VirtualClock(), faults, 300) == answers(VirtualClock(), faults, 300)
 
 
-def test_a_record_names_every_telegram_and_mishap(clock: VirtualClock) -> None:
-    noted: list[tuple[float, str, str]] = []
-    radio = Radio(
-        Brick(clock),
-        clock,
-        rng=np.random.default_rng(1),
-        faults=Faults(silence=1.0),
-        trace=lambda now_s, event, text: noted.append((now_s, event, text)),
-    )
-    radio.send(BATTERY)
-    assert radio.mishaps == {"silence": 1}
-    assert noted == [(0.0, ">", "00 0b  GETBATTERYLEVEL"), (0.0, "!", "silence")]
-
-
-def test_a_sleeping_brick_ends_the_line(clock: VirtualClock) -> None:
-    radio = Radio(Brick(clock, sleep_min=2), clock, rng=np.random.default_rng(1))
-    line = VirtualLine(radio, clock)
-    clock.sleep(121.0)
-    with pytest.raises(LinkError):
-        line.write(BATTERY)
-
-
 def test_faults_are_read_from_texts() -> None:
     faults = Faults.parse(["fragment", "late=0.1,1.5", "drop=0.25", "sag=30"])
     assert faults == Faults(fragment=1.0, late=0.1, late_s=1.5, drop=0.25, sag=30.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 
 from probewise.emulator import Brick, VirtualClock, empty_port
@@ -100,12 +98,6 @@ def test_output_state_is_laid_out_as_in_the_vectors(brick: Brick) -> None:
     )
 
 
-def test_a_name_is_kept_up_to_its_first_zero(ask: Callable[[str], str]) -> None:
-    """Clients send 15 bytes, 16, or the name and one zero."""
-    ask("81 98 42 4F 42 00 41")
-    assert ask("01 9B").startswith("02 9B 00 42 4F 42" + zeros(12))
-
-
 def test_no_error_of_a_command_without_reply_is_told(brick: Brick) -> None:
     for opcode in COMMANDS:
         kind = 0x81 if opcode >= 0x80 else 0x80
@@ -128,11 +120,3 @@ def test_half_a_frame_is_forgotten_after_a_silence_however_often_somebody_looks_
         for k in looks:
             assert not list(frames.feed(b"", 0.05 * k))
         assert list(frames.feed(framed(b"\x00\x0b"), 1.0)) == [b"\x00\x0b"]
-
-
-def test_a_frame_in_slow_pieces_is_whole_in_the_end() -> None:
-    frames, frame = FrameAssembler(), framed(b"\x00\x0b")
-    for k, byte in enumerate(frame[:-1]):
-        assert not list(frames.feed(bytes([byte]), 0.5 * k))
-        assert not list(frames.feed(b"", 0.5 * k + 0.4))
-    assert list(frames.feed(frame[-1:], 0.5 * (len(frame) - 1))) == [b"\x00\x0b"]

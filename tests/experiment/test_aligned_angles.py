@@ -61,11 +61,6 @@ def test_of_a_set_of_shapes_each_is_aligned_by_its_own_samples(small):
     assert sd[[4, 5]] == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
-def test_samples_of_a_shape_without_an_angle_stay_the_same_object(small):
-    experiment, posterior = of_samples(small, Circle(FIELD), np.array([[200.0, 150.0, 60.0]]))
-    assert with_aligned_angles(experiment, posterior) is posterior
-
-
 @dataclass(frozen=True)
 class Counted(SequentialMonteCarlo):
     """The default method; it writes down how many readings there were when a run asked it for lost modes."""

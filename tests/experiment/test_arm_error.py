@@ -20,8 +20,8 @@ from probewise.arm.geometry import (
     place_jacobian,
     places_at_parameters,
 )
-from probewise.errors import FileError, ParameterError
-from probewise.experiment import FittedArm, explore, found_shape, result_json, samples_csv
+from probewise.errors import ParameterError
+from probewise.experiment import FittedArm, found_shape, result_json, samples_csv
 from probewise.experiment.arm_error import arm_error_in_posterior
 from probewise.inquiry import Grid
 
@@ -130,12 +130,6 @@ ABOUT_ITS_BASE = dataclasses.replace(known_to(RULER_SDS / 10), axis_mm=(200.0, 1
 """It stands in the middle of its field, which it does not reach."""
 
 
-def test_an_arm_that_does_not_reach_where_it_was_calibrated_is_refused_when_a_run_begins():
-    allowed = r"calibrated_mm is \(200.0, 150.0\); allowed: a place within the arm's reach"
-    with pytest.raises(ParameterError, match=allowed):
-        FittedArm(ABOUT_ITS_BASE, LEVELS)
-
-
 def test_an_arm_that_does_not_reach_the_middle_was_calibrated_as_near_to_it_as_it_reaches(small_for_all):
     levels = SimpleNamespace(mean=lambda: {"I_min": DARK, "I_max": WHITE})
     arm = FittedArm.from_geometry_and_sensor(ABOUT_ITS_BASE, levels)
@@ -196,25 +190,6 @@ def test_a_run_whose_arm_alone_leaves_too_much_says_so_and_reads_no_further(clai
     assert "leaves 1.5 mm, which no reading lowers" in beyond.stop_reason
     assert not beyond.reached
     assert beyond.sd.max() > 1.5
-
-
-def test_a_run_that_ends_too_early_claims_the_arms_part_too(small_for_all):
-    experiment = small_for_all.experiment(fitted_arm=FittedArm(only("base x", 3.0), LEVELS))
-    early = run(small_for_all.arm(), experiment, rng=np.random.default_rng(4), max_readings=2)
-    assert early.arm_error is not None
-    assert early.steps[0].arm_error is None
-    assert early.stop_reason.endswith("the arm's own error included")
-
-
-def test_a_journal_is_not_continued_with_an_arm_that_is_known_otherwise(small_for_all, tmp_path):
-    def steps(sd_mm):
-        experiment = small_for_all.experiment(fitted_arm=FittedArm(only("base x", sd_mm), LEVELS))
-        rng = np.random.default_rng(4)
-        return list(explore(small_for_all.arm(), experiment, rng=rng, max_readings=2, journal=tmp_path / "j.jsonl"))
-
-    steps(0.8)
-    with pytest.raises(FileError, match="another geometry of the arm"):
-        steps(0.9)
 
 
 def built_and_fitted(rng):

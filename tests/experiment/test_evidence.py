@@ -132,18 +132,6 @@ def test_a_search_that_ends_in_a_false_mode_is_set_right_where_the_leader_has_th
     assert found.log_z == pytest.approx(-23.6, abs=1.5)
 
 
-@pytest.mark.slow
-def test_kinds_searched_just_now_are_not_searched_again_before_a_run_ends(doubting):
-    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "nonlinearity")]
-    method, rng = replace(doubting, n_live=100).inference_method, np.random.default_rng(1)
-    recording = journal(doubting, 3)
-    now = method.updated(prior_posterior(kinds, 1000, rng=rng), recording.take(np.arange(1)), rng=rng)
-    once = method.reconsidered(now, recording.take(np.arange(1)), rng=rng)
-    assert all(p.searched_at == 1 for p in once.particles)
-    again = method.reconsidered(once, recording.take(np.arange(1)), rng=rng)
-    assert all(a is b for a, b in zip(again.particles, once.particles, strict=True))
-
-
 @pytest.mark.parametrize(("behind", "sleeps"), [(60.0, True), (3.0, False)])
 def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_prior_when_it_wakes(
     doubting, behind, sleeps

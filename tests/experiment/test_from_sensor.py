@@ -24,12 +24,6 @@ def rng(seed=0):
     return np.random.default_rng(seed)
 
 
-def test_no_adjustment_is_the_calibrated_footprint():
-    adjusted = AdjustedMixture(TRUE).footprint(np.zeros((1, 4)))
-    for name in ("weight", "u_mm", "v_mm", "var_u", "var_v", "cov_uv"):
-        np.testing.assert_allclose(getattr(adjusted, name), getattr(TRUE.footprint(np.empty((1, 0))), name))
-
-
 def test_an_adjustment_stretches_about_the_mean_and_shifts():
     """By samples of the mixture: stretched along each axis about their mean, then shifted."""
     theta = np.array([[0.2, -0.4, 1.0, -2.0]])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from exploring import run
 
-from probewise.arm import LegoArm, Pose, Reading, as_instrument, read_geometry, shipped_geometry_path
+from probewise.arm import Pose, Reading, as_instrument
 from probewise.calibration import FittedSensor
 from probewise.cli._bench import InstrumentWithCallbacks
-from probewise.errors import DoubtfulResultWarning, ParameterError, ReachError
+from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.experiment import arm_over, experiment_for, explore, read_journal, result_json
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
@@ -184,7 +184,6 @@ class OwnArm:
 ELSEWHERE = {
     "of each reading": OwnArm({"height_mm": 20.0}),
     "of the arm": OwnArm({}, read_height_mm=20.0),
-    "of both": OwnArm({"height_mm": 20.0}, read_height_mm=20.0),
     "of an arm with callbacks": InstrumentWithCallbacks(
         as_instrument(OwnArm({}, read_height_mm=20.0)), lambda _: None, lambda _: None
     ),
@@ -255,28 +254,3 @@ def test_what_an_arm_does_not_declare_that_it_can_is_refused_before_it_moves(
         next(explore(arm, asked(small, **changes), rng=np.random.default_rng(1), journal=path))
     assert not moved
     assert not path.exists()
-
-
-@pytest.mark.parametrize(
-    ("declared", "changes"),
-    [
-        ({"lifts": True}, {}),
-        ({"read_height_mm": 21.0}, {"heights_mm": (21.0,)}),
-        ({"turns": True}, {"heights_mm": (), "orientations_rad": (0.0, 0.5)}),
-    ],
-)
-def test_what_an_arm_declares_that_it_can_may_be_chosen(small, declared, changes):
-    steps = explore(OwnArm({}, **declared), asked(small, **changes), rng=np.random.default_rng(1))
-    assert next(steps).number == 1
-    steps.close()
-
-
-def test_the_lego_arm_declares_its_height():
-    geometry = replace(read_geometry(shipped_geometry_path()), read_height_mm=20.0)
-    assert LegoArm(None, geometry).read_height_mm == 20.0
-
-
-def test_an_arm_without_that_height_says_so():
-    arm = arm_over(WORLD, DISC, FIELD, seed=1)
-    with arm, pytest.raises(ReachError, match=r"height_mm is -1.0; allowed: above the surface"):
-        arm.measure(Pose(140.0, 100.0, height_mm=-1.0))

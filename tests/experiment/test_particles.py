@@ -9,7 +9,6 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
-from probewise.errors import ParameterError
 from probewise.experiment.evidence import sampled_about_points
 from probewise.experiment.stopping import information_nats
 from probewise.inquiry.smc import (
@@ -18,13 +17,11 @@ from probewise.inquiry.smc import (
     Particles,
     _EvaluatedSamples,
     _move_by_metropolis,
-    _partition_rows,
     prior_particles,
     resample_and_move,
     update,
 )
 from probewise.nested import run
-from probewise.priors import Product, Uniform
 
 READINGS = [(120.0, 80.0, 10.3), (300.0, 200.0, 9.6), (250.0, 140.0, 59.2), (250.0, 203.0, 36.0), (190.0, 140.0, 41.5)]
 
@@ -91,18 +88,6 @@ def test_the_stated_error_of_the_evidence_is_its_scatter(small):
     runs = [carried(small, n_particles=600, seed=seed) for seed in range(12)]
     z = (np.array([r.log_z for r in runs]) - np.mean([r.log_z for r in runs])) / np.array([r.log_z_error for r in runs])
     assert 1.6 < (z**2).sum() < 4 * 36.0
-
-
-def test_samples_stay_distinct(small):
-    posterior = carried(small)
-    assert len(np.unique(posterior.theta, axis=0)) > 0.85 * len(posterior.theta)
-    assert posterior.n_eff >= 0.5 * len(posterior.theta)
-
-
-def test_one_seed_gives_one_posterior(small):
-    one, again = carried(small, n_particles=300), carried(small, n_particles=300)
-    np.testing.assert_array_equal(one.theta, again.theta)
-    assert one.log_z == again.log_z
 
 
 def test_a_reading_that_keeps_the_samples_has_each_predict_once(small):
@@ -199,18 +184,6 @@ def test_samples_can_be_made_fewer_and_more(small):
     np.testing.assert_allclose(more.weighted.mean(), before.weighted.mean(), atol=0.3 * before.weighted.sd().max())
 
 
-class Massless(Product):
-    """Draws from where its density is zero."""
-
-    def from_unit_cube(self, u):
-        return super().from_unit_cube(u) + 5.0
-
-
-def test_a_prior_without_mass_is_refused():
-    with pytest.raises(ParameterError, match="one with mass"):
-        prior_particles(Massless({"x_mm": Uniform(0.0, 1.0)}), 100, rng=rng())
-
-
 def test_kernels_have_the_density_of_the_gaussians_they_draw_from():
     """Two routes to the density: the product of features, and scipy's for each kernel."""
     points = rng().normal(size=(400, 3)) * [30.0, 1.0, 8.0] + [500.0, 200.0, 80.0]
@@ -240,14 +213,6 @@ def test_samples_that_have_collapsed_on_a_point_still_have_kernels_about_it():
     drawn = kernels.draw(100, rng=rng(2))
     np.testing.assert_allclose(drawn, np.broadcast_to(exact, drawn.shape), rtol=1e-6, atol=1e-90)
     assert np.isfinite(kernels.log_density(drawn)).all()
-
-
-def test_samples_that_all_descend_from_one_are_moved_as_one_part():
-    """Copies of one sample are in one part; a part with hardly any would have no kernels."""
-    alike = _partition_rows(np.zeros(40, dtype=np.int64))
-    assert [len(part) for part in alike] == [40]
-    halves = _partition_rows(np.arange(40))
-    assert [len(part) for part in halves] == [20, 20]
 
 
 def test_copies_of_one_sample_are_not_moved(small):

@@ -50,7 +50,6 @@ from probewise.inquiry import Readout
 from probewise.proof.concealed_study import (
     ConcealedTrial,
     _arm_in_concealed_world,
-    concealed_rows,
     run_concealed_trial,
 )
 from probewise.proof.configurations import REFERENCE
@@ -273,16 +272,6 @@ def test_the_fit_is_tested_where_the_declared_noise_leads(doubting, stepped, mon
     assert not doubting.fit_is_doubtful(info.p_value)
 
 
-def test_repeats_tell_names_by_their_mean():
-    """Four readings of the same noise tell as much as one of half the noise."""
-    weight, names = np.full(400, 1 / 400), np.repeat(["", "halo"], 200)
-    even = norm.ppf((np.arange(200) + 0.5) / 200)
-    near = np.concatenate([20.0 + 0.5 * even, 22.0 + 0.5 * even])[:, None]
-    repeated = expected_bits_about_left_out_effect(weight, near, names, Readout(2.0), repeats=4)
-    assert repeated == pytest.approx(expected_bits_about_left_out_effect(weight, near, names, Readout(1.0)), abs=0.003)
-    assert repeated > 1.5 * expected_bits_about_left_out_effect(weight, near, names, Readout(2.0))
-
-
 @pytest.mark.parametrize(
     ("sd_mm", "what"),
     [((30.0, 30.0, 9.0), INFORMATION), ((6.0, 1.0, 1.0), ENDS)],
@@ -382,15 +371,6 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     assert np.hypot(*(place - asked)) < 12.0
 
 
-def test_a_patch_may_lie_anywhere_on_the_field():
-    found = {rival.name: rival.effect.prior for rival in rivals() if rival.name in ("glint", "albedo_patch")}
-    drawn = {name: prior.from_unit_cube(np.random.default_rng(0).random((4000, 4))) for name, prior in found.items()}
-    assert {prior.names for prior in found.values()} == {("amp", "x", "y", "r"), ("albedo", "x", "y", "r")}
-    for theta in drawn.values():
-        np.testing.assert_allclose(theta[:, 1:3].mean(axis=0), (524.0, 260.0), atol=25.0)
-        np.testing.assert_allclose(theta[:, 1:3].max(axis=0), (1048.0, 520.0), rtol=0.01)
-
-
 def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
     rng = np.random.default_rng(1)
     assert repaired_sensor(sensor, stepped[-1], rng=rng) is sensor
@@ -473,24 +453,6 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     assert np.abs(steps[-1].mean - trial.true_circle_in_arm_frame).max() < 2.0
 
 
-def test_rows_of_the_study_are_summed_up():
-    runs = {
-        ConcealedTrial("backlash", 1, k, 0.9): {
-            "known": True,
-            "readings": 10 + k,
-            "error_mm": 20.0 * k,
-            "held": [True, False],
-            "noticed": False,
-            "credible": [CLEAN, "backlash"],
-            "cpu_s": [0.1, 0.2],
-        }
-        for k in range(2)
-    }
-    (row,) = concealed_rows(runs)
-    assert (row.sure_and_wrong.value, row.intervals_hold.value, row.in_credible_set.value) == (0.5, 0.5, 1.0)
-    assert row.size == 6.0
-
-
 def test_a_memory_of_the_noise_is_heard():
     """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
     law, level = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["correlated_noise"], np.full((1, 12), 35.0)
@@ -499,16 +461,6 @@ def test_a_memory_of_the_noise_is_heard():
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
     assert gained[0] > 3.0
     assert gained[1] < 0.5
-
-
-def test_readings_on_a_lattice_are_no_chance():
-    law, level = noise_likelihoods(DeclaredNoise(1.0, 0.0), LEVELS)["quantisation"], np.full((1, 8), 35.0)
-    level[0, 4:] = 12.0
-    plain = experiment_of(REFERENCE).likelihood
-    coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
-    smooth = level[0] + np.array([0.31, -0.72, 1.13, 0.05, -1.41, 0.93, 0.27, -0.68])
-    assert law.log_prob(coarse, level)[0] > plain.log_prob(coarse, level)[0] + 5.0
-    assert law.log_prob(smooth, level)[0] == pytest.approx(plain.log_prob(smooth, level)[0])
 
 
 @pytest.mark.parametrize("read", [[10.0, 10.0, 10.0, 10.0], [10.0, 5.0, 10.0, 10.0, 5.0]])
@@ -571,15 +523,6 @@ def test_readings_lost_to_exactly_black_are_no_chance():
 
 PLAYED = [(846.5, 260.0), (854.5, 260.0), (846.5, 243.8), (854.5, 178.8), (967.4, 243.8), (886.8, 162.5)]
 """Places about a circle, taken from all sides."""
-
-
-def played(experiment, kind, width_mm):
-    """Readings without noise about a circle, of an arm with gear play."""
-    places = [Reading(10.0, Pose(x, y), 8.0 * k) for k, (x, y) in enumerate(PLAYED)]
-    plan = experiment.problem(places).recording.plan
-    level = kind.model.predict(np.array([[922.0, 240.0, 77.0, width_mm]]), plan)[0]
-    read = [replace(reading, value=float(value)) for reading, value in zip(places, level, strict=True)]
-    return experiment.problem(read).recording
 
 
 def test_a_mode_that_samples_have_lost_is_found_by_a_search_of_the_prior(doubting):

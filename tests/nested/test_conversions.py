@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from nested_sampling import problems
 
-from probewise.errors import ParameterError
 from probewise.nested import NestedResult, merge, run
 from probewise.priors import Product, Uniform
 
@@ -99,9 +98,3 @@ def test_a_missing_package_is_named_with_its_install_line(
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=f"pip install {name}$"):
         result.to_anesthetic() if name == "anesthetic" else result.to_arviz(rng=np.random.default_rng(0))
-
-
-def test_a_result_without_parameters_has_no_samples_to_hand_over() -> None:
-    fixed = run(problems.Known(Product({}), lambda t: np.zeros(len(t)), 0.0), rng=np.random.default_rng(0))
-    with pytest.raises(ParameterError, match="without any there are no samples"):
-        fixed.to_arviz(rng=np.random.default_rng(0))

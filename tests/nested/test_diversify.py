@@ -58,11 +58,6 @@ def test_the_likelihood_is_never_asked_outside_the_prior() -> None:
     assert ((end >= 0) & (end <= 1)).all()
 
 
-def test_no_steps_change_nothing() -> None:
-    theta = np.full((4, 2), 0.5)
-    assert np.array_equal(diversify(theta, problems.plateau(), rng=np.random.default_rng(0), n_steps=0), theta)
-
-
 def test_an_impossible_sample_or_a_wrong_shape_is_refused() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(ParameterError, match=r"theta\[1\]"):

@@ -120,18 +120,12 @@ def test_chains_step_over_the_end_of_a_circle_and_stay_even() -> None:
     ("function", "prior", "options", "message"),
     [
         (one_point, None, {}, r"nested\.run\(log_likelihood, prior, rng=rng\)"),
-        (3.0, SQUARE, {}, "log_likelihood is 3.0; allowed: a function of a point"),
         (one_point, 3.0, {}, "prior is 3.0; allowed: a prior such as"),
         (one_point, to_square, {}, r"names is None; allowed: .*names=\['x', 'y'\]"),
-        (one_point, to_square, {"names": "xy"}, "allowed: a list of names"),
-        (one_point, to_square, {"names": ["x", "x"]}, "names is .*each name once"),
         (one_point, Joint((Product({"x": Uniform(0, 1)}), Product({"x": Uniform(0, 1)}))), {}, "each name once"),
         (one_point, lambda u: u[:1], {"names": ["x", "y"]}, "prior is 'a function that makes one point"),
-        (one_point, [stats.norm(0, 1)], {"names": ["x", "y"]}, "allowed: 1 names"),
         (one_point, SQUARE, {"names": ["y", "x"]}, "those of the prior"),
-        (one_point, {"x": stats.norm}, {}, "a frozen distribution"),
         (one_point, {"x": stats.poisson(3)}, {}, r"prior\['x'\] is .*continuous"),
-        (one_point, {"x": (0, 1, 2)}, {}, r"prior\['x'\] is \(0, 1, 2\)"),
         (one_point, SQUARE, {"periodic": ["z"]}, "periodic is .*names among"),
     ],
 )
@@ -140,11 +134,6 @@ def test_what_does_not_fit_is_refused_in_words(
 ) -> None:
     with pytest.raises(ParameterError, match=message):
         quiet(function, prior, **options)
-
-
-def test_a_problem_in_one_takes_no_prior_besides() -> None:
-    with pytest.raises(ParameterError, match="given beside a problem that has its own"):
-        run(make_problem(one_point, SQUARE), SQUARE, rng=rng())
 
 
 def test_a_function_of_many_points_that_was_not_said_to_be_one_is_told_how() -> None:

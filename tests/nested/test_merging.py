@@ -46,15 +46,6 @@ def test_births_and_deaths_alone_give_the_count_that_the_sampler_kept(name: str,
     assert np.array_equal(alive(result), result.n_at_death)
 
 
-def test_the_count_of_two_runs_by_hand() -> None:
-    """Runs of two points each: births and deaths interleave on a plateau at 1, ordered by labels."""
-    level = np.array([1.0, 1.0, 1.0, 2.0, 3.0, 4.0])
-    label = np.array([0.2, 0.4, 0.7, 0.5, 0.1, 0.3])
-    birth = np.array([-np.inf, -np.inf, -np.inf, 1.0, -np.inf, 1.0])
-    birth_label = np.array([1.0, 1.0, 1.0, 0.2, 1.0, 0.4])
-    assert n_alive_at_death(level, label, birth, birth_label).tolist() == [4, 4, 4, 3, 2, 1]
-
-
 def test_merged_runs_are_one_run_with_the_live_points_of_all(
     terraces: list[NestedResult], rng: np.random.Generator
 ) -> None:

@@ -10,7 +10,6 @@ from nested_sampling.problems import Known
 from scipy.special import ndtr
 
 from probewise import nested
-from probewise.errors import ParameterError
 from probewise.nested.repartition import repartitioned
 from probewise.priors import Normal, Product, Uniform
 
@@ -88,9 +87,3 @@ def test_a_peak_has_a_part_of_the_prior():
     inside = (np.abs(drawn[:, 0] - 2.0) < 0.2) & (np.abs(drawn[:, 1]) < 0.2)
     area = np.where(inside, np.exp(near.log_prior_ratio(drawn) - WIDE.log_prob(drawn)), 0.0)
     assert area.mean() == pytest.approx(0.16, abs=6 * area.std() / math.sqrt(4000))
-
-
-def test_too_few_samples_are_refused():
-    theta = np.random.default_rng(9).standard_normal((3, 2))
-    with pytest.raises(ParameterError, match="4 or more"):
-        repartitioned(Known(WIDE, _two, 0.0), np.repeat(theta, 10, axis=0))

@@ -29,7 +29,7 @@ from probewise.nested import (
     run,
     update,
 )
-from probewise.nested.clusters import Clusters, find_clusters
+from probewise.nested.clusters import find_clusters
 from probewise.nested.evidence import insertion_p_value, insertion_ranks, integrate
 from probewise.nested.sampler import replace_worst_live_points, run_once
 from probewise.nested.save import LivePoints
@@ -171,16 +171,6 @@ def test_slice_chains_leave_the_uniform_distribution_alone(
     if clustered:
         share = 0.75 * 0.15 / (0.1 + flat)
         assert (end.u[:, 0] < 0.15).mean() == pytest.approx(share, abs=4 * math.sqrt(share / 3000))
-
-
-def test_a_cluster_is_measured_without_the_start_of_the_chain_that_uses_it(rng: np.random.Generator) -> None:
-    points = rng.standard_normal((60, 4)) @ rng.standard_normal((4, 4))
-    without = Clusters.from_groups([points]).home_clusters_without_each_point(points[:3], np.zeros(3, dtype=int))
-    for i in range(3):
-        rest = np.delete(points, i, axis=0)
-        assert without.mean[i] == pytest.approx(rest.mean(axis=0))
-        assert without.root[i] @ without.root[i].T == pytest.approx(np.cov(rest, rowvar=False), abs=1e-7)
-        assert without.inverse_root[i] @ without.root[i] == pytest.approx(np.eye(4), abs=1e-9)
 
 
 def test_rare_possible_hypotheses_are_doubtful_but_used(rng: np.random.Generator) -> None:

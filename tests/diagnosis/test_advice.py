@@ -23,22 +23,19 @@ from probewise.diagnosis.advice import (
     measurement_separating_rivals,
     mutual_information_lower_bound,
 )
-from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, rows_by_command
+from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.light_sensor import (
     LightSensorApparatus,
     candidate_scans,
     excerpts_of_scan,
-    plan_of_alternatives,
-    plan_of_sequence,
-    scan_started_after,
     target_swaps,
 )
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.sensors import default_sensor
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.effects import VOCABULARY, Extent
-from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, write_plan
+from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
 from probewise.systems import Noise, RunTable, Simulator
@@ -146,17 +143,6 @@ def test_lag_against_backlash_wants_the_other_way():
     assert "backwards" in asked.description or "forth and back" in asked.description
 
 
-def test_a_plan_that_moves_nowhere_has_no_next_scan():
-    plan = paper_plan().take(np.arange(404, 408))
-    rivals = [rival("hysteresis", 0.5, [0.5], paper_plan()), rival("lag", 0.5, [0.5], paper_plan())]
-    assert (
-        measurement_separating_rivals(
-            [replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensorApparatus()
-        )
-        is None
-    )
-
-
 def read_by(plan: Plan) -> np.ndarray:
     chain = Chain(SPOT, FixedLevels(0.0, 1.0), KnownScene(plan.patterns), ())
     return chain.predict(np.empty((1, 0)), plan)[0]
@@ -186,19 +172,6 @@ def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
     np.testing.assert_allclose(read_by(turned), read_by(plan)[at], atol=1e-12)
 
 
-def test_along_an_edge_there_is_nothing_to_lay_otherwise():
-    plan = paper_plan()
-    along = replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(math.pi / 2, 0.0)})
-    assert {command.kind for command in target_swaps(along)} == {"lay", "across"}
-    assert all("boundary" not in command.description for command in target_swaps(along))
-    # Of several edges the first that a scan goes across.
-    names = (*plan.pattern_names, "upright")
-    under = np.where(plan.scan == 1, len(names) - 1, plan.pattern)
-    patterns = {**along.patterns, "upright": HalfPlane(0.0, 0.0)}
-    second = replace(along, pattern=under, pattern_names=names, patterns=patterns)
-    assert any("turn pattern upright by 180 degrees" in command.description for command in target_swaps(second))
-
-
 def test_short_scans_are_taken_whole():
     plan = paper_plan().take(np.arange(45, 57))
     assert {command.kind for command in candidate_scans(plan, strides=(2, 4))} == {
@@ -212,15 +185,6 @@ def test_short_scans_are_taken_whole():
     assert not any(re.search("by -?0 mm", command.description) for command in target_swaps(tiny))
 
 
-def test_a_name_that_is_taken_stands_for_something_else():
-    plan = paper_plan()
-    grey = replace(plan, pattern_names=(*plan.pattern_names, "plain_white"))
-    grey = replace(grey, patterns={**plan.patterns, "plain_white": Uniform(0.8)})
-    white = next(command.plan for command in target_swaps(grey) if command.description == "scan a plain white surface")
-    ((name, _),) = white.rows_by_pattern()
-    assert (white.patterns[name], white.patterns["plain_white"]) == (Uniform(1.0), Uniform(0.8))
-
-
 def test_excerpts_hold_the_step_and_every_so_many_readings():
     scan = np.arange(100, 201)
     level = np.where(np.arange(101) < 60, 10.0, 50.0) + np.linspace(0, 1, 101)
@@ -229,45 +193,6 @@ def test_excerpts_hold_the_step_and_every_so_many_readings():
     assert fourth.rows[:3].tolist() == [100, 104, 108]
     assert near.rows[0] <= 159 < 160 <= near.rows[-1]
     assert len(excerpts_of_scan(scan, strides=(1, 4), level=np.ones(101))) == 2  # nothing changes anywhere
-
-
-def test_a_scan_over_a_new_sheet_takes_longer():
-    plan = paper_plan()
-    again = next(c for c in candidate_scans(plan, strides=(4,)) if c.kind == "repeat")
-    new = next(c for c in target_swaps(plan) if c.plan.scan_names == ("boundary_half_round_4",))
-    assert new.minutes == pytest.approx(again.minutes + 1.0)
-    # In turn, or behind a plan: what the minutes say passes before the first reading.
-    end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
-    later = scan_started_after(new, plan).plan
-    assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
-    both = plan_of_sequence([again, new], plan)
-    assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
-    assert both.time_s[-1] - both.time_s[len(again.plan)] == pytest.approx(lasts_s)
-
-
-def test_a_battery_is_expected_to_stay_as_it_was():
-    plan = paper_plan()
-    everywhere, rows = plan_of_alternatives(candidate_scans(plan)[:3], plan), rows_by_command(candidate_scans(plan)[:3])
-    assert [len(own) for own in rows] == [101, 101, 102]
-    assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
-    asked = measurement_separating_rivals(
-        [rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensorApparatus()
-    )
-    assert asked is not None
-    assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
-    gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
-    after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
-    everywhere = plan_of_alternatives(candidate_scans(plan)[:3], after)
-    assert set(everywhere.covariates) == {"battery_mv"}
-    assert (everywhere.covariates["battery_mv"] == gone[-2]).all()
-
-
-def test_readings_without_noise_leave_a_number_beside_values_that_a_new_run_does_not_know():
-    """Slopes by an unknown value of 1e11 noise sds: a covariance of 1 + 1e22 is singular in floating-point numbers."""
-    slopes = 1e11 * np.array([[1.0, 0.0], [1.0, 0.0], [1.0, 1e-3]])
-    first, second = (PredictiveNormal(mean, slopes) for mean in (np.zeros(3), 1e11 * np.array([0.0, 1.0, 0.0])))
-    nats = mutual_information_lower_bound([first, second], np.array([0.5, 0.5]))
-    assert nats == pytest.approx(np.log(2))  # two readings that must be equal are not
 
 
 def searched(probabilities, plan, fits):

@@ -10,12 +10,10 @@ import pytest
 from mixtures import fixed_mixture
 
 from probewise.diagnosis import audit_plan
-from probewise.diagnosis.audit import PlanTemplates, ProjectedTemplates, _curing_step_by_effect
+from probewise.diagnosis.audit import PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.light_sensor import candidate_scans
-from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
-from probewise.errors import ParameterError
 from probewise.recordings import paper_plan, two_way_plan
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
@@ -101,15 +99,6 @@ def test_what_a_cure_claims_is_seen_after_all_of_it():
     assert all(effect.name in said for effect in audit.effects)
 
 
-def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
-    """Of three scans the second cures two effects for good but one, which the third, that cures nothing, spoils."""
-    detectability = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
-    words = {"a": "aliased", "f": "fine"}
-    steps = [[SimpleNamespace(name=n, detectability=words[of[k]]) for n, of in detectability.items()] for k in range(4)]
-    assert _curing_step_by_effect(steps) == {"lag": 2, "tilt": 2}
-    assert _curing_step_by_effect(steps[:1]) == {}
-
-
 @pytest.mark.slow
 def test_what_no_scan_of_the_same_sheet_parts_another_sheet_does():
     """A sensor that looks beside itself, and an edge that lies elsewhere."""
@@ -149,26 +138,6 @@ def test_without_the_led_only_what_is_no_signal_is_read():
     usual, unlit = (chain.predict(np.empty((1, 0)), p)[0] for p in (plan, dark))
     assert (unlit[:50] == 10.0).all()
     np.testing.assert_array_equal(unlit[50:], usual[50:])
-
-
-def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_commanded():
-    plan = paper_plan()
-    able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led",)))
-    dark = next(command.plan for command in candidate_scans(able) if command.kind == "relight")
-    both = join_plans([able, dark])
-    assert both.covariates["battery_mv"][-1] == plan.covariates["battery_mv"][-1]
-    assert np.isnan(both.covariates["led"][: len(plan)]).all()
-    assert (both.covariates["led"][len(plan) :] == 0).all()
-    assert both.scan_names[-1] == dark.scan_names[0]
-    gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
-    both = join_plans([replace(able, covariates={"battery_mv": gone}), dark])
-    assert (both.covariates["battery_mv"][len(plan) :] == gone[-2]).all()
-
-
-def test_a_plan_over_a_pattern_that_is_not_described_is_refused():
-    plan = paper_plan()
-    with pytest.raises(ParameterError, match="quadrant_a"):
-        audit_plan(replace(plan, patterns={k: v for k, v in plan.patterns.items() if k != "quadrant_a"}))
 
 
 def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from heater import ABOUT
 
 from probewise.diagnosis.samples import HypothesisSamples, ModelSamples, can_share_one_model, mix
 from probewise.diagnosis.search.searched import Posterior
@@ -18,7 +17,6 @@ from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import ACCURATE_NODES
-from probewise.systems.forms import bind_forms
 
 PLAN = two_way_plan()
 EXTENT = Extent(10.0, 60.0, PLAN)
@@ -30,16 +28,6 @@ def samples_of(n_gaussians: int, n: int = 500) -> ModelSamples:
     z = 0.3 * np.random.default_rng(n_gaussians).standard_normal((n, sensor.n_params))
     chain = sensor.chain(PLAN, (), n_nodes=ACCURATE_NODES)
     return ModelSamples(chain, sensor.theta(z), np.full(n, float(n_gaussians)), n_gaussians)
-
-
-def test_a_gaussian_in_halves_predicts_the_same():
-    one, three = samples_of(1), samples_of(3)
-    null = default_sensor(EXTENT, 3)
-    mixed = mix([one, three], np.array([1.0, 0.0]), null, PLAN, rng=np.random.default_rng(0))
-    assert mixed.n_gaussians == 3
-    assert mixed.theta.shape == three.theta.shape
-    expected = np.sort(one.chain.predict(one.theta, PLAN)[:, 150])
-    np.testing.assert_allclose(np.sort(mixed.chain.predict(mixed.theta, PLAN)[:, 150]), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", [n for n, e in BUILT.items() if e is not None and e.nothing])
@@ -99,16 +87,6 @@ def test_what_does_not_fit_into_one_model():
     assert can_share_one_model([first], [BUILT["lag"]])
     assert can_share_one_model([BUILT["lag"]], [dataclasses.replace(BUILT["lag"])])
     assert not can_share_one_model([SimpleNamespace(name="own", nothing=None)], [BUILT["lag"]])
-
-
-def test_variants_of_a_form_share_one_model_unless_they_act_otherwise():
-    """A step in one interval and in another are one action with other priors; a factor and a slope are two."""
-    step = bind_forms(ABOUT)["offset_step"]
-    first, second = step.variants()[:2]
-    assert can_share_one_model([first], [second])
-    assert step.variants()[0] is first
-    assert can_share_one_model([first], [step.with_fewer_variants().variants()[0]])
-    assert not can_share_one_model([first], [dataclasses.replace(first, act=lambda value, theta, rows: value)])
 
 
 def candidate(names, log_z):

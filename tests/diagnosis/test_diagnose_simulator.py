@@ -169,16 +169,6 @@ def shifted():
     return fit(model, prepared.recording, start, white_noise(N)), prepared.usable_rows
 
 
-def test_rows_impossible_without_an_effect_change_most(shifted):
-    found, usable = shifted
-    assert found.sd < 2 * SD_OF_IMPOSSIBLE
-    change = found.change_by_effect("input_offset:x", usable)
-    outside = X > 1.01
-    assert np.isfinite(change).all()
-    assert (change[outside] == change.max()).all()
-    assert change.max() >= max(1000 * found.sd, np.abs(change[~outside]).max())
-
-
 def test_an_effect_without_which_readings_are_impossible_is_detectable(shifted):
     found, usable = shifted
     assert log_probability_effects_detectable(found, white_noise(N), usable) == pytest.approx(0.0, abs=1e-12)

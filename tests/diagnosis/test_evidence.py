@@ -114,13 +114,6 @@ def _mean_and_sd(evidence):
     return mean, np.sqrt(evidence.weights @ (evidence.nodes.settings - mean) ** 2)
 
 
-def test_nodes_that_are_close_enough_stay_as_they_are():
-    found, recording = _found_with(WHITE[:100])
-    for effect in (random_walk(), correlated_noise(), drifting_noise(), signal_dependent_noise(), outliers()):
-        evidence = laplace_evidence(found, NoiseModel((effect,), recording))
-        assert refined(found, evidence) is evidence
-
-
 def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
     """AR(1) of correlation .75 whose innovations are sometimes wide: every third node of it was 20 nats too low."""
     n = 300

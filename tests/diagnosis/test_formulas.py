@@ -63,14 +63,6 @@ def _prepared_with_climate(change, *, seed=5, **more):
     return prepare_system(simulator, table_for(simulator, columns))
 
 
-def test_a_product_of_columns_alone_is_no_noise():
-    """Neither column drives the simulator, and neither acts alone: no function of one of them shows the product."""
-    prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))
-    searched = search(prepared, depth=0)
-    assert run_global_test(searched, rng=np.random.default_rng(1)).p_value < 0.001
-    assert searched.posterior.marginal_over_noise["unknown",] > 0.9
-
-
 @pytest.mark.slow
 def test_a_product_of_columns_alone_is_unknown_with_its_formula():
     prepared = _prepared_with_climate(lambda temp, damp: 0.001 * (temp - 20) * (damp - 40))

@@ -8,18 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.held_out import are_of_part_alone, mean_gain_over_parts, predictive_log_densities
+from probewise.diagnosis.held_out import mean_gain_over_parts, sequential_log_densities
 from probewise.diagnosis.light_sensor import held_out_parts
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.recordings import Recording, paper_plan
 
 PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))
-
-
-def test_a_few_scans_are_kept_back_one_by_one():
-    parts, names = held_out_parts(PAPER)
-    np.testing.assert_array_equal(parts, PAPER.plan.scan)
-    assert names == PAPER.plan.scan_names
 
 
 def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
@@ -83,13 +77,6 @@ def test_a_part_held_out_of_noise_with_memory_has_its_density_given_the_rest(kin
     )
     alone = predictive_log_densities(law, out, readings, slopes, mean, spread, sigma**2, sequential=False)
     np.testing.assert_allclose(alone, -0.5 * (np.log(2 * np.pi * variance) + left**2 / variance), rtol=1e-6)
-
-
-def test_a_parameter_of_one_part_stays_its_own_where_integration_leaves_rounding_in_the_others():
-    """Slopes of a run's start, without and with rounding, of a parameter of all runs, and of one that does nothing."""
-    part = np.array([True, True, False, False])
-    slopes = np.array([[3.0, 3.0, 3.0, 0.0], [2.0, 2.0, 3.0, 0.0], [0.0, 5e-10, 1e-3, 0.0], [0.0, -5e-10, 3.0, 0.0]])
-    np.testing.assert_array_equal(are_of_part_alone(slopes, part), [True, True, False, False])
 
 
 def test_what_comes_next_is_held_out_alone():

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from probewise import nested
-from probewise.diagnosis.evidence import laplace_evidence
-from probewise.diagnosis.fit import Model, fit
-from probewise.diagnosis.hypothesis_problem import FoldedNormal, HypothesisProblem, StandardNormal
-from probewise.diagnosis.noise_law import white_noise
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.fit import Model
+from probewise.diagnosis.hypothesis_problem import FoldedNormal, StandardNormal
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import Extent
 from probewise.nested.repartition import repartitioned
@@ -94,16 +90,3 @@ def test_the_evidence_of_two_gaussians_is_the_same_folded():
     second = nested.run(repartitioned(problem, first.samples(2000, rng=rng)), rng=rng, n_live=200)
     for found in (first, second):
         assert abs(found.log_z - truth) < 4 * np.hypot(found.log_z_error, error)
-
-
-def test_where_no_names_can_be_traded_nothing_is_folded():
-    recording = Recording(PLAN, np.random.default_rng(5).normal(30.0, 1.0, len(PLAN)))
-    for n_gaussians, same in ((1, True), (2, False)):
-        sensor = default_sensor(EXTENT, n_gaussians)
-        found = fit(Model(sensor, (), PLAN), recording, np.zeros(sensor.n_params), white_noise(len(PLAN), least=0.1))
-        evidence = laplace_evidence(found, NoiseModel((), recording, least_sd=0.1))
-        problem = HypothesisProblem(found.model, recording, evidence)
-        once = replace(problem, near=found.z)
-        assert (type(once.prior) is StandardNormal) == same
-        z = found.z[None, :]
-        np.testing.assert_array_equal(once.log_likelihood(z), problem.log_likelihood(z))

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ndtri
 
 from probewise.diagnosis import diagnose_system, fit_simulator
-from probewise.diagnosis.diagnose_simulator import prepare_system, readings_near_ends, recording_from_table
+from probewise.diagnosis.diagnose_simulator import prepare_system, recording_from_table
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
@@ -19,7 +19,7 @@ from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent
-from probewise.effects.noise import correlated_noise, dropouts
+from probewise.effects.noise import Dropouts
 from probewise.errors import ParameterError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system, table_for
 
@@ -184,17 +184,6 @@ def _without(prepared, rows):
     return replace(white_noise_of_recording(prepared.recording), lost=lost)
 
 
-def test_readings_that_stand_below_the_declared_end_stay():
-    """Those of a meter that stops at 900 lx: the fit does not explain them by the end at 1000 lx."""
-    table = _lamp(most=900.0)
-    recording = recording_from_table(LAMP, table)
-    system = System.of(LAMP, table)
-    model, law = Model(system, (), recording.plan), white_noise_of_recording(recording)
-    found = fit(model, recording, _coordinates_of(system, TRUE_LIMITED), law, max_steps=0)
-    assert (table.columns["lux"] == 900.0).sum() > 10
-    assert not readings_near_ends(system, found, SD, recording)[table.columns["lux"] == 900.0].any()
-
-
 @pytest.mark.parametrize(("reading", "expected"), [(np.nan, HIGH), (HIGH, HIGH), (1000.4, 1000.4), (700.0, 1262.0)])
 def test_a_prediction_beyond_an_end_is_limited_unless_a_reading_within_was_recorded(reading, expected):
     """With a step of 1, the reading of 1000.4 is at the end, and the residual there is 0."""
@@ -202,14 +191,6 @@ def test_a_prediction_beyond_an_end_is_limited_unless_a_reading_within_was_recor
     table = RunTable({"d_m": np.array([1.0, 2.0]), "lux": np.array([reading, 300.0])})
     predicted = System.of(lamp, table).chain(table, ()).predict(TRUE_LIMITED[None, :], table)
     np.testing.assert_allclose(predicted, [[expected, BACK + FULL / 4]])
-
-
-def test_an_advised_row_beyond_the_range_tells_nothing():
-    plan = RunTable({"d_m": np.array([0.9, 1.0, 2.0])})
-    system = System.of(LAMP, plan)
-    _, slopes = Model(system, (), plan).predict_and_differentiate(_coordinates_of(system, TRUE_LIMITED))
-    assert not slopes[:2].any()
-    assert slopes[2].all()
 
 
 def test_a_predicted_mean_is_within_the_range_and_a_reading_at_its_end_is_sure_there():
@@ -229,17 +210,6 @@ def test_a_reading_half_a_step_beyond_an_end_is_at_it_and_a_farther_one_is_an_er
     recording = recording_from_table(lamp, table)
     assert recording.usable.tolist() == [True, True, True, False, False]
     assert recording.censored.tolist() == [True, True, False, False, False]
-
-
-def test_the_noise_of_a_reading_at_an_end_is_correlated_with_none():
-    prepared, found, _ = _fitted(LAMP, _lamp())
-    effect = correlated_noise.for_extent(Extent.of(prepared.recording))
-    (law,) = NoiseModel((effect,), prepared.recording).laws_at(np.array([[0.5]]), found.predicted)
-    at_end = np.flatnonzero(law.censored)
-    assert at_end.size > 5
-    assert not law.carry[at_end].any()
-    assert not law.carry[at_end[at_end < len(law.carry) - 1] + 1].any()
-    assert (law.carry == 0.5).any()
 
 
 @pytest.mark.parametrize("carry", [0.0, 0.5], ids=["white", "correlated"])
@@ -313,21 +283,3 @@ def test_a_drag_is_found_beside_the_stop_behind_which_the_law_alone_slides_on():
     assert all(names in ({"limit:x", "drag:v"}, {"limit:x", "quadratic:v:v"}) for names in likely)  # one law: v > 0
     stop = next(effect for effect in found.effects if effect.name == "limit:x").parameters[0]
     assert abs(stop.mean - STOP_M) < 4 * stop.sd
-
-
-@pytest.mark.parametrize("row", ["r0", "m1"])
-def test_a_moderate_outlier_at_an_end_of_a_run_is_no_jump_and_no_delay(row):
-    true = {"r0": 20.0, "m1": 72.1}[row]
-    diagnosis = diagnose_system(OVEN, oven(**{row: true + 2}), rng=np.random.default_rng(1))
-    assert (diagnosis.verdict, diagnosis.combination) == ("noise", ("outliers",))
-
-
-def test_an_end_that_no_reading_reaches_leaves_nothing_out_however_wrong_the_simulator_is():
-    rng = np.random.default_rng(2)
-    x, w = rng.uniform(0, 10, 300), rng.uniform(0, 6, 300)
-    line = {"y": 10 + 4 * x + 28 * np.sin(w) + rng.normal(0, 0.2, 300), "x": x}
-    simulator = Simulator(
-        "y", "V", {"a": (-50, 50), "b": (0, 10)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"],
-        noise={"range": (-30, 90)},
-    )  # fmt: skip
-    assert prepare_system(simulator, table_for(simulator, line), with_effects=False).recording.usable.all()

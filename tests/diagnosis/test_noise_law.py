@@ -53,16 +53,6 @@ def test_the_misfit_is_minus_the_log_density(share, times):
     np.testing.assert_allclose(found, wanted)
 
 
-def test_the_scale_is_where_the_misfit_is_least():
-    z = np.random.default_rng(1).normal(size=(50, 1))
-    z[:3] *= 9
-    law = heavy(0.05, 8.0)
-    sigma = law.likeliest_sigma(z)
-    trial = sigma * np.linspace(0.8, 1.25, 451)
-    misfits = np.array([float(law.minus_log_likelihood(z, np.array([s]))[0]) for s in trial])
-    assert trial[misfits.argmin()] == pytest.approx(float(sigma[0]), rel=1e-2)
-
-
 def test_a_tail_that_is_not_there_is_none():
     """With the floor of the scale too: white and nearly white noise are to have the same evidence."""
     z = np.random.default_rng(2).normal(size=(50, 2))
@@ -87,15 +77,6 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
     assert np.var(plain) == pytest.approx(1 / float(tail.fisher_information), rel=0.02)
     assert np.abs(plain).max() < 10
-
-
-def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
-    lost = np.zeros(50, dtype=np.bool_)
-    lost[7] = True
-    law = NoiseLaw(np.ones(50), np.zeros(50), lost, 0.05, 8.0)
-    drawn = law.draw_pseudo_residuals(4000, rng=np.random.default_rng(0))
-    assert drawn[~lost].std() == pytest.approx(1.0, rel=0.02)
-    np.testing.assert_array_equal(drawn[7], 0.0)
 
 
 @pytest.mark.slow
@@ -189,13 +170,6 @@ def test_lost_readings_are_found_where_every_reading_has_a_declared_sd_of_its_ow
     np.testing.assert_array_equal(np.flatnonzero(nodes.laws[0].lost), lost)
 
 
-def test_where_nothing_is_lost_there_is_no_such_law():
-    found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
-    evidence = laplace_evidence(found, NoiseModel((dropouts(),), recording, least_sd=1e-6))
-    assert evidence.log_z == -math.inf
-    assert evidence.nodes.laws == ()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("declared", [True, False])
 def test_lost_readings_are_found_among_rounded_ones(declared):
@@ -212,9 +186,3 @@ def test_lost_readings_are_found_among_rounded_ones(declared):
     assert "dropouts" in found.combination
     lost = next(effect for effect in found.effects if effect.name == "dropouts")
     assert lost.parameters[1].mean == pytest.approx(3.0, abs=0.01)
-
-
-def test_walks_that_differ_less_than_readings_tell_need_no_other_fit():
-    law = replace(white_noise(50), walk=np.full(50, 0.5))
-    assert law.is_practically_equal(replace(law, walk=1.15 * law.walk))
-    assert not law.is_practically_equal(replace(law, walk=1.3 * law.walk))

@@ -164,13 +164,6 @@ def test_of_spikes_on_a_walk_each_is_one_reading_and_not_its_neighbours():
     np.testing.assert_array_equal(law.take_readings(part).wide, law.wide[part])
 
 
-def test_without_noise_nothing_is_wide_but_what_deviates():
-    for residuals in (np.zeros(N), 1e3 * (np.arange(N) == 4)):
-        law = with_known_wide_readings(_law(0.05, 10.0, 0.5), residuals)
-        assert np.isfinite([law.log_extra, *law.sd]).all()
-        np.testing.assert_array_equal(law.wide > 0.05, residuals > 0)
-
-
 @pytest.mark.parametrize("far", [1e200, np.inf, np.nan])
 def test_predictions_that_ran_away_are_no_error(far):
     law = with_known_wide_readings(_law(0.05, 10.0, 0.5), np.full(N, far))

@@ -13,12 +13,11 @@ from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.noise_law import (
     NoiseLaw,
     n_rows_since_previous_usable,
-    noise_statistics,
     order_by_scan,
     previous_usable,
     white_noise,
 )
-from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.effects.noise import correlated_noise, noise_of_runs, random_walk
 from probewise.effects.noise_distribution import FittedReadings, reading_variance
@@ -135,21 +134,6 @@ def test_the_noise_of_mixed_runs_is_whitened_by_the_inverse_root_of_its_covarian
     found = -0.5 * np.sum(law(r) ** 2) - law.half_log_det()
     expected = -0.5 * r @ np.linalg.solve(cov, r) - 0.5 * np.linalg.slogdet(cov)[1]
     assert found == pytest.approx(expected)
-
-
-def test_mixed_runs_have_the_noise_of_the_same_runs_one_after_the_other():
-    recording, together = _recording(), _recording(SORTED)
-    order = order_by_scan(recording)
-    (rho, law), (same, other) = _law(recording), _law(together)
-    assert rho == same
-    columns = np.random.default_rng(3).normal(size=(len(order), 2))
-    np.testing.assert_allclose(law(columns)[order], other(columns[order]), rtol=1e-12)
-    assert rough_sd(recording) == rough_sd(together)
-    steps, before = n_rows_since_previous_usable(recording), previous_usable(recording)
-    np.testing.assert_allclose(
-        noise_statistics(columns, steps, columns[:, 0], before=before),
-        noise_statistics(columns[order], steps[order], columns[order, 0]),
-    )
 
 
 @pytest.mark.parametrize("left_out", ["first", "first two", "from the first on"])

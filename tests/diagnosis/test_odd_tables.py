@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis import audit_system, diagnose_system, fit_simulator
+from probewise.diagnosis import diagnose_system, fit_simulator
 from probewise.diagnosis.diagnose_simulator import prepare_system, recording_from_table
 from probewise.errors import ParameterError
 from probewise.systems import Law, Simulator, table_for
@@ -81,15 +81,6 @@ def test_a_simulator_that_copes_with_a_missing_input_has_effects_of_that_column(
     prepared = prepare_system(simulator, table_for(simulator, {"x": x, "y": 1.0 + 2.0 * np.nan_to_num(x) + _Y - 1}))
     assert {"periodic_error:x", "input_gain:x", "sensitivity:x"} <= set(prepared.effects)
     assert np.isfinite(prepared.effects["periodic_error:x"].bank()).all()
-
-
-def test_an_sd_of_0_where_nothing_was_read_does_not_count():
-    """Where most rows had none, the noise was 0: a division by it ended the diagnosis, and the audit saw everything."""
-    read = np.arange(_N) % 3 == 0
-    table = {"x": _X, "sd": np.where(read, 0.05, 0.0), "y": np.where(read, _Y, np.nan)}
-    simulator = _line(noise={"sd": "sd"})
-    assert prepare_system(simulator, table_for(simulator, table)).apparatus.about.sd == 0.05
-    assert "noise 0.05 V" in audit_system(simulator, table).assumed
 
 
 def test_where_all_times_are_equal_rows_count():

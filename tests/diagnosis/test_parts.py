@@ -15,17 +15,13 @@ from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
     SCALES,
     Linearised,
-    OrthonormalBlocks,
-    average_over_amplitude_scales,
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
 from probewise.diagnosis.locate import (
     Covariate,
-    figure_name_of,
     places_of_effect,
     significant_places,
-    window_columns_and_bounds,
 )
 from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
@@ -43,12 +39,10 @@ from probewise.effects.reference import candidate_scan_groups, sign_of_motion
 from probewise.errors import ParameterError
 from probewise.recordings import (
     HalfPlane,
-    Image,
     Instrumentation,
     Plan,
     Recording,
     Uniform,
-    paper_plan,
     read_recording,
     two_way_plan,
     write_recording,
@@ -79,16 +73,6 @@ def placed(effect, change, without, plan, covariates):
     shows_in = LightSensorApparatus().covariate_of_effect(effect, change, without, plan, covariates)
     scans = next((c for c in covariates if c.name == "scan"), None)
     return places_of_effect(effect, change, shows_in, scans, plan, change, p_value=0.001, size=8.0)
-
-
-def test_an_effect_of_scans_of_which_one_has_no_usable_reading_is_located_in_the_others():
-    plan = line(scans=4).plan
-    effect = VOCABULARY["scan_angle_error"].for_extent(Extent(0.0, 1.0, plan))
-    bound = replace(effect, where=Where(scans=("s1", "s2")))
-    kept = plan.take(plan.scan != 1)  # as of usable readings
-    scans = Covariate("scan", kept.scan.astype(float), np.arange(len(kept)), groups=True)
-    change = np.where(kept.scan == 1, 2.0, 0.0)
-    assert [place.scan for place in placed(bound, change, change, kept, [scans])] == ["s2"]
 
 
 @pytest.mark.parametrize("n_gaussians", [1, 2, 3])
@@ -181,20 +165,6 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
         assert few.variant_of_entry(k) == whole.variant_of_entry(own)
 
 
-def test_what_changes_nothing_but_the_last_digit_is_no_template():
-    """All scans lie on y = 0: a scale of Y moves nothing, whatever rounding makes of it."""
-    plan = paper_plan()
-    model = Model(default_sensor(Extent(10.0, 60.0, plan), 2), (), plan)
-    z = np.full(model.n_params, 0.2)
-    predicted = model.predict(z[None, :])[0] * (1 + 1e-13)
-    usable = np.flatnonzero(np.arange(len(plan)) % 5)
-    found = Fit(model, z, predicted[usable], np.zeros(len(usable)), np.zeros((len(usable), len(z))), 1.0, 0.0)
-    templates = templates_of_effect(found, VOCABULARY["position_scale"].for_extent(EXTENT), usable)
-    for columns in templates.columns:
-        assert np.abs(columns[:, 0]).max() > 0.01
-        assert not columns[:, 1].any()
-
-
 def test_templates_of_a_variant_are_what_its_scans_change():
     """Route one: in its own scans alone; route two: the whole plan with and without it."""
     plan = two_way_plan()
@@ -270,18 +240,6 @@ def _problem_and_templates():
     return Linearised(basis, residuals[:, 0], law, 1.3, n), residuals, templates
 
 
-def test_a_bank_weighs_as_orthonormal_columns_do():
-    """Route one: the products that a fit takes off; route two: each template projected and made orthonormal."""
-    problem, residuals, templates = _problem_and_templates()
-    blocks = OrthonormalBlocks.of(problem, templates)
-    explained = (blocks.u.T @ residuals) ** 2 / np.sum(residuals**2, axis=0)
-    wanted = [
-        average_over_amplitude_scales(explained[None, own], blocks.gain[None, own], problem.n_kept)[0]
-        for own in np.split(np.arange(blocks.u.shape[1]), blocks.starts[1:])
-    ]
-    np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4).log_bayes_factors(problem, residuals), wanted)
-
-
 def test_a_pair_weighs_as_one_template_of_all_its_columns():
     problem, _, templates = _problem_and_templates()
     one, first = (VOCABULARY["backlash"](),), np.zeros(1, dtype=np.int64)
@@ -322,22 +280,6 @@ def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
     (alias,) = collinear_pairs(problem, {"a": first, "b": second, "c": slopes[:, :1]}, otherwise="")
     assert alias.effects == ("a", "b")
     assert alias.cosine == pytest.approx(1.0, abs=1e-6)
-
-
-def test_windows_never_part_equal_values():
-    values = np.repeat(np.arange(10.0), 5)
-    columns, ends = window_columns_and_bounds(Covariate("place", values, np.arange(50)), 50)
-    assert columns.shape == (50, len(ends))
-    for column, (low, high) in zip(columns.T, ends, strict=True):
-        np.testing.assert_array_equal(column > 0, (values >= low) & (values <= high))
-
-
-def test_a_figure_has_a_file_of_its_own_whatever_the_columns_are_called():
-    names = [f"witness_{column}" for column in ("time", "a/b", "a:b", "a_b/", "../a", "x" * 300, "x" * 301, "µ")]
-    files = [figure_name_of(name) for name in names]
-    assert files[0] == "witness_time.svg"
-    assert len(set(files)) == len(files)
-    assert all(len(file.encode()) < 255 and not set(file[:-4]) & set("./\\:") for file in files)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e12])
@@ -439,16 +381,6 @@ def test_joined_recordings_keep_scans_and_patterns_apart():
     assert join([first]) is first
 
 
-def test_scans_that_were_joined_before_keep_apart_where_their_recording_comes_second():
-    """One of them has the very name that the other would get."""
-    joined = join([line(12), replace(line(12), readings=np.linspace(1.0, 3.0, 24))])
-    first = Recording(line(4).plan, line(4).readings)
-    names = join_plans([first.plan, joined.plan]).scan_names
-    assert len(set(names)) == len(names) == 6
-    returning = replace(first.plan, scan_names=("s0", "s0"))
-    assert join_plans([first.plan, returning]).scan_names == ("s0", "s1", "s0 (2)", "s0 (2)")
-
-
 def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tmp_path):
     joined = join([line(12), replace(line(12), readings=np.linspace(1.0, 3.0, 24))])
     write_recording(joined, tmp_path / "recording.csv")
@@ -463,21 +395,6 @@ def test_mountings_stay_apart_through_a_file_and_whoever_reads_on_mounts_anew(tm
     assert join_plans([more, more]).sessions == ()
     readings = readings_of_recording(joined)
     assert recording_of_readings(joined.plan, readings).plan.sessions == ()
-
-
-def test_images_of_one_name_that_differ_in_the_middle_alone_remain_two_patterns():
-    """The text of a large array leaves its middle out."""
-    one = np.zeros((60, 60))
-    other = one.copy()
-    other[30, 30] = 1.0
-    images = [Image(pixels, 1.0, (0.0, 0.0), "sheet.png") for pixels in (one, other, other.copy())]
-    recordings = [
-        Recording(replace(line(n).plan, pattern_names=("sheet",), patterns={"sheet": image}), line(n).readings)
-        for n, image in zip((4, 3, 2), images, strict=True)
-    ]
-    joined = join(recordings)
-    assert joined.plan.pattern_names[:2] == ("sheet", "sheet (2)")
-    np.testing.assert_array_equal(joined.plan.patterns["sheet (2)"].albedo, other)
 
 
 def test_a_recording_is_not_counted_twice():

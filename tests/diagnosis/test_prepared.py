@@ -118,12 +118,6 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     assert {cure.plan.instrumentation.height_mm for cure in audited.cures} <= {20.0}
 
 
-def test_an_effect_of_ones_own_stands_beside_the_vocabulary():
-    own = LightSensorApparatus({"backlash": VOCABULARY["backlash"]}).effects(recording(), None)
-    assert "backlash" in own
-    assert "lag" not in own
-
-
 def long_recording(n_scans: int, per_scan: int) -> Recording:
     n = n_scans * per_scan
     plan = Plan(
@@ -138,15 +132,6 @@ def long_recording(n_scans: int, per_scan: int) -> Recording:
         patterns={"edge": HalfPlane(0.0, 0.0)},
     )
     return Recording(plan, np.sin(plan.x_mm))
-
-
-def test_of_many_scans_whole_ones_are_taken_from_first_to_last():
-    whole = long_recording(100, 40)
-    rows = rows_to_diagnose(whole, 800)
-    scans, counts = np.unique(whole.plan.scan[rows], return_counts=True)
-    assert len(rows) == 800
-    np.testing.assert_array_equal(counts, 40)
-    assert (scans[0], scans[-1]) == (0, 99)
 
 
 def test_scans_of_an_effect_have_their_numbers_in_the_whole_recording(monkeypatch):
@@ -206,11 +191,3 @@ def test_a_stretch_lies_in_one_run(interleaved):
         streaks = np.diff(np.concatenate([[-1], np.flatnonzero(np.diff(place) != 1), [len(place) - 1]]))
         assert len(streaks) > 5
         assert streaks.min() >= 6
-
-
-def test_scans_there_and_back_are_chosen_of_both_ways():
-    whole = long_recording(200, 40)
-    kept = np.unique(whole.plan.scan[rows_to_diagnose(whole, 4000)])
-    assert len(kept) == 100
-    for half in (kept[:50], kept[50:]):
-        assert 0.25 < np.mean(half % 2) < 0.75

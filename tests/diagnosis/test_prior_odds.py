@@ -31,20 +31,6 @@ def test_everything_about_the_mean_sums_to_one_but_for_what_is_unknown_beside():
     assert total == pytest.approx(1.0, abs=1e-9)
 
 
-def test_half_of_the_unknown_has_a_name_of_our_own():
-    odds = PriorOdds.for_effects({name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()})
-    assert sum(math.exp(odds.log_prior_on_mean((name,))) for name in RARE_EFFECTS) == pytest.approx(
-        math.exp(odds.log_prior_with_unknown(()))
-    )
-    beside = odds.log_prior_on_mean(("arm_knock", "backlash")) - odds.log_prior_on_mean(("backlash",))
-    assert math.exp(beside) * len(RARE_EFFECTS) == pytest.approx(odds.unknown_beside * odds.out_of_vocabulary)
-
-
-def test_all_that_may_be_missing_from_the_mean_of_a_simulator_sums_to_one():
-    odds = SimulatorApparatus.prior_odds(cast(Any, OF_NO_LAW), {})
-    assert odds.clean_mean + odds.unknown + sum(odds.by_size) == pytest.approx(1.0)
-
-
 def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums_to_one():
     """Of three effects of which one may occur twice, counted by hand: seven sets, four of them with the wave."""
     odds = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twice=0.1, twofold=frozenset({"wave"}))

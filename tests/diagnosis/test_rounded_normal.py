@@ -237,16 +237,6 @@ def test_a_column_of_sds_beside_coarse_rounding_is_no_physics(declared):
     assert found.p_value > 0.05
 
 
-def test_no_pseudo_residual_is_farther_than_what_was_read():
-    law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
-    z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
-    pseudo = law.bounded_pseudo_residuals(z, np.array([0.5]))
-    assert (np.abs(pseudo) <= np.abs(z)).all()
-    np.testing.assert_array_equal(pseudo[3:], z[3:])
-    drawn = law.draw_pseudo_residuals(20_000, rng=np.random.default_rng(0))
-    assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("noise_sd", [0.9, 1.4])
 def test_a_step_that_is_declared_is_no_effect_and_what_it_leaves_no_physics(noise_sd):

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.diagnose_simulator import _notes_on_integration, prepare_system, recording_from_table
+from probewise.diagnosis.diagnose_simulator import _notes_on_integration, recording_from_table
 from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.calls import IntegrationTally
@@ -92,16 +92,6 @@ def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
     first = System.of(_simulator(), table)
     assert not first.tally.too_stiff
     assert with_step_for_likely_parameters(first, table, recording, found, sd).tally.too_stiff
-
-
-def test_a_law_that_is_said_to_be_stiff_is_searched_so():
-    """As the second search is, where the repaired law needs the linearly implicit method."""
-    table, simulator = _table(8.0, 4), _simulator()
-    prepared = prepare_system(simulator, table, with_effects=False, stiff=True)
-    assert prepared.null.stiff
-    predicted = prepared.null.chain(table, ()).predict(np.array([[0.01, 3.0], [8.0, 3.0]]), table)
-    np.testing.assert_allclose(predicted[1], _readings(8.0, 3.0), atol=0.1 * SD)
-    assert np.isfinite(predicted).all()
 
 
 @pytest.mark.parametrize("sets_step", [True, False])

@@ -16,7 +16,6 @@ from probewise.diagnosis.fit import Model
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
-from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.simulator_rows import (
     SimulatorApparatus,
     plan_of_alternatives,
@@ -39,7 +38,7 @@ from probewise.systems import (
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.table import covariate_of_column, published_covariate
+from probewise.systems.table import covariate_of_column
 
 TABLE = runs()
 
@@ -66,14 +65,6 @@ def test_a_control_is_swept_held_and_switched_between_its_ends():
     assert set(power["1 power_w middle"].tolist()) == {3.0}
 
 
-def test_a_control_is_swept_in_values_that_can_be_set():
-    """In thousandths of its range, from 2 to 4 W: two decimals would be too few, sixteen cannot be set."""
-    swept = offered()["1 power_w up"].plan.columns["power_w"]
-    np.testing.assert_array_equal(swept, np.round(swept, 3))
-    np.testing.assert_allclose(swept, np.linspace(2.0, 4.0, len(swept)), atol=0.0005)
-    assert len(np.unique(swept)) == len(swept)
-
-
 def test_time_that_goes_on_is_later_than_all_that_was_recorded():
     time = np.arange(float(len(TABLE)))
     table = TABLE.with_columns({"t_s": time})
@@ -87,11 +78,6 @@ def test_commands_set_behind_each_other_are_runs_of_their_own():
     together = cast(RunTable, plan_of_alternatives(list(offered().values())[:3], TABLE))
     assert len(together.scan_names) == 3
     assert set(together.like.values()) <= set(TABLE.scan_names)
-
-
-def test_no_command_has_more_than_102_readings():
-    long = runs((20.0,), n=1000)
-    assert max(len(command.plan) for command in offered(table=long).values()) <= 102
 
 
 def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
@@ -131,14 +117,6 @@ def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
     np.testing.assert_allclose(predicted[0], predicted[1][34:], rtol=1e-9)
 
 
-def test_when_time_begins_anew_does_not_depend_on_the_order_of_rows():
-    interleaved = TABLE.take(np.lexsort((TABLE.scan, TABLE.time_s)))
-    assert offered((), interleaved)["2 again"].plan.time_s[0] == 0.0
-    goes_on = TABLE.with_columns({"t_s": np.arange(float(len(TABLE)))})
-    last_first = goes_on.take(np.argsort(-goes_on.scan, kind="stable"))
-    assert offered((), last_first)["2 again"].plan.time_s[0] > len(TABLE) - 1
-
-
 _N = 60
 _T = 0.5 * np.arange(_N)
 _RNG = np.random.default_rng(8)
@@ -152,19 +130,6 @@ def _prepared(more, **options):
     return prepare_system(simulator, table_for(simulator, {"t_s": _T, "x": _X, **more, "y": y}))
 
 
-def test_covariates_that_are_no_columns_keep_their_values_beside_columns_of_that_name():
-    prepared = _prepared({**_OWN, "days": np.repeat([1.0, 2.0], _N // 2)}, run="days")
-    predicted = np.linspace(0.0, 1.0, _N) ** 2
-    found = prepared.apparatus.covariate_values_by_name(predicted)
-    np.testing.assert_array_equal(found["level"], predicted)
-    np.testing.assert_array_equal(found["time"], _T)
-    np.testing.assert_array_equal(found["run"], np.repeat([0.0, 1.0], _N // 2))
-    np.testing.assert_allclose(found["previous"][1 : _N // 2], np.diff(predicted)[: _N // 2 - 1])
-    for name, values in _OWN.items():
-        np.testing.assert_array_equal(found[covariate_of_column(name)], values)
-    assert covariate_of_column("room_c") == "room_c"
-
-
 @pytest.mark.parametrize("name", ["level", "time", "run", "previous", "scan", "state:s", "room_c"])
 def test_every_effect_of_a_column_shows_in_it(name):
     about = _prepared({name: _OWN[name]}).apparatus.about
@@ -172,17 +137,6 @@ def test_every_effect_of_a_column_shows_in_it(name):
     for form in (bind_forms(about)[f"sensitivity:{name}"], *(p for p in formula_forms(about) if name in p.name)):
         assert covariate_of_column(name) in form.covariates or "time" in form.covariates
         assert set(form.covariates) <= known
-
-
-def test_results_name_a_column_as_it_is_unless_that_means_something_else():
-    assert published_covariate(covariate_of_column("scan")) == "scan"
-    assert published_covariate(covariate_of_column("level")) == "column:level"
-    assert published_covariate("level") == "level"
-    words = _prepared({}).apparatus.words
-    assert words.covariate_in_words("level") == "predicted y"
-    assert words.covariate_in_words("column:level") == "column level"
-    assert words.covariate_in_words("slope") == "slope"
-    assert words.covariate_in_words("state:s") == "state s"
 
 
 @pytest.mark.parametrize(("name", "published"), [("scan", "scan"), ("level", "column:level"), ("room_c", "room_c")])
@@ -213,17 +167,6 @@ def test_a_column_with_the_name_of_a_state_is_no_second_variable_of_that_name():
     of_rate = [form for form in formula_forms(about) if form.name.startswith("formula:rate")]
     assert of_rate
     assert all(set(form.covariates) <= {"state:s", "time"} for form in of_rate)
-
-
-def test_samples_of_an_effect_are_its_own_beside_a_column_whose_name_goes_on_with_a_point():
-    """As "x.1", which is how data frames name the second of two columns: their average ended in a traceback."""
-    prepared = _prepared({"x.1": _RNG.normal(size=_N)})
-    table, system = prepared.recording.plan, prepared.apparatus.system
-    effects = [prepared.effects[name] for name in ("sensitivity:x", "sensitivity:x.1")]
-    samples = ModelSamples(system.chain(table, effects), np.array([[1.0, 2.0, 3.0]]), np.ones(1), 0)
-    alone = ModelSamples(system.chain(table, effects[1:]), np.array([[1.0, 3.0]]), np.ones(1), 0)
-    assert [samples.effect_samples(effect.name).tolist() for effect in effects] == [[[2.0]], [[3.0]]]
-    assert alone.effect_samples("sensitivity:x").shape == (1, 0)
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from probewise.diagnosis.unknown_bases import (
     PRODUCTS,
     bank_of_unknown_effects,
     bases_unlike_named,
-    without_products_like,
 )
 from probewise.recordings import two_way_plan
 
@@ -56,16 +55,6 @@ def test_what_varies_does_not_depend_on_the_unit(unit):
     assert names(unit * SIGNAL, unit * SLOPE, unit * TIME) == names(SIGNAL, SLOPE, TIME)
     still = unit * (30.0 + np.tile([0.0, 1e-14], N)[:N])
     assert not {"level", "slope", "dark"} & set(names(still, still - still[0], still))
-
-
-def test_a_column_that_is_called_as_another_covariate_is_a_covariate_beside_it():
-    names = ("time", "level", "slope", "direction", "orientation", "place", "edge_distance", "dark")
-    plan = replace(PLAN, covariates=dict.fromkeys(names, 360 * TIME))
-    own = [c.name for c in varying_covariates(replace(PLAN, covariates={}), np.arange(N), SIGNAL, SLOPE)]
-    found = [c.name for c in varying_covariates(plan, np.arange(N), SIGNAL, SLOPE)]
-    added = {"dark", *(f"column {name}" for name in names if name != "dark")}
-    assert [name for name in found if name not in added] == own
-    assert added < set(found)
 
 
 @pytest.mark.parametrize("mismatch", MISMATCHES.values(), ids=MISMATCHES)
@@ -123,15 +112,3 @@ def test_products_of_two_columns_are_one_family_that_no_function_of_one_imitates
         every = [apart[k] for k in range(len(apart.widths))]
         left = [np.sum((wanted - t @ np.linalg.lstsq(t, wanted)[0]) ** 2) / np.sum(wanted**2) for t in every]
         assert min(left) > 0.7
-
-
-def test_a_product_that_is_a_formula_is_no_basis():
-    """The other bases stay, whatever the formula: they are no formulas."""
-    columns, bases, apart = _three_columns_and_bases()
-    a, b, _ = columns - columns.mean(axis=1, keepdims=True)
-    problem = Linearised(np.ones((200, 1)) / np.sqrt(200), np.zeros(200), white_noise(200), 1.0, 200)
-    formulas = [(a * b)[:, None], apart[0]]
-    left = without_products_like(bases, TemplateBank.of(formulas, ["formula", "other"]), problem)
-    assert left.labels.count(PRODUCTS) == bases.labels.count(PRODUCTS) - 1
-    assert len(left.labels) == len(bases.labels) - 1
-    assert without_products_like(apart, TemplateBank.of(formulas, ["formula", "other"]), problem) is apart

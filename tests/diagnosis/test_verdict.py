@@ -119,13 +119,6 @@ def test_a_rival_that_the_readings_cannot_tell_from_the_leader_keeps_it_from_bei
     assert verdict({(("lag",), ()): 0.9, (("backlash",), ()): 0.1}, same=[("backlash",)]) == ("named", ("lag",))
 
 
-def test_a_class_of_aliases_that_holds_half_is_not_told_apart():
-    two = {(("lag",), ()): 0.4, (("backlash",), ()): 0.3, ((), ()): 0.3}
-    pair = Alias(("backlash", "lag"), 1.0, "scan faster", 26)
-    assert verdict(two) == ("named", ("lag",))
-    assert verdict(two, aliases=(pair,)) == ("cannot_tell", ("lag",))
-
-
 def test_of_a_simulator_nothing_is_named_below_one_half():
     """Whatever noise is beside it counts; a light sensor's contract names the leader of several."""
     three = {(("lag",), ()): 0.4, (("drift",), ()): 0.3, (("glint",), ()): 0.3}

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.priors import Uniform
-from probewise.systems import Law, ProgressWithCallCount, RunTable, Simulator, System, read_simulator
+from probewise.systems import Law, RunTable, Simulator, System, read_simulator
 from probewise.systems.calls import Caller, SpreadCalls
 
 X = np.linspace(0, 1, 11)
@@ -122,15 +122,6 @@ def test_the_same_call_is_made_once():
     assert system.caller.n_calls == n_calls
 
 
-def test_every_call_is_told():
-    system, table = _system(_with_a_loop)
-    told = []
-    ProgressWithCallCount(lambda stage, done=0, total=0, note="": told.append((stage, note)), system.caller)("fitting")
-    n_calls = system.caller.n_calls
-    system.chain(table, ()).predict(system.theta(system.starts[-1:]), table)
-    assert told[-1] == ("fitting", f"{n_calls + 1} of about 10,000 calls of simulate")
-
-
 def test_a_law_that_raises_for_some_parameters_is_counted_and_the_others_are_integrated():
     def rates(s, p, u):
         if np.any(p["k"] > 1.0):
@@ -166,13 +157,6 @@ def test_a_function_that_looks_at_all_rows_of_a_column_sees_those_of_one_sample_
     np.testing.assert_allclose(system.caller(parameters, {"x": changed}), apart)
 
 
-def test_an_elementwise_function_is_called_once_for_all_samples_of_a_changed_column():
-    system, _ = _system(_elementwise)
-    system.caller.n_calls = 0
-    system.caller({"a": np.ones((3, 1)), "b": np.ones((3, 1))}, {"x": X + np.arange(3.0)[:, None]})
-    assert system.caller.n_calls == 1
-
-
 @pytest.mark.parametrize("vectorized", [False, True])
 def test_a_sample_for_which_a_broadcasting_function_raises_leaves_the_others_as_they_are(vectorized):
     def simulate(p, data):
@@ -187,23 +171,6 @@ def test_a_sample_for_which_a_broadcasting_function_raises_leaves_the_others_as_
     np.testing.assert_allclose(readings[[0, 2, 3]], theta[[0, 2, 3], :1] + X)
     assert np.isnan(readings[[1, 4]]).all()
     assert system.caller.n_failed == 2
-
-
-@pytest.mark.parametrize("n_rows", [1, 2])
-def test_a_parameter_per_run_is_an_array_in_a_table_of_one_row_too(n_rows):
-    simulator = Simulator(
-        "y",
-        "V",
-        {"a": Uniform(0.5, 2.0), "b": Uniform(0.5, 2.0)},
-        simulate=lambda p, data: p["a"][np.zeros(len(data["x"]), dtype=int)] + float(p["b"]) * data["x"],
-        run="run",
-        per_run=("a",),
-    )
-    table = RunTable({"x": X[:n_rows], "run": np.ones(n_rows)}, run="run")
-    system = System.of(simulator, table)
-    found = system.chain(table, ()).predict(np.array([[0.7, 1.5]]), table)
-    by_name = dict(zip(system.marginals, [0.7, 1.5], strict=True))
-    np.testing.assert_allclose(found[0], by_name["a[1]"] + by_name["b"] * X[:n_rows])
 
 
 def _in_place(p, data):
@@ -284,19 +251,3 @@ def test_a_function_that_draws_random_numbers_is_refused(vectorized):
 
     with pytest.raises(ParameterError, match=r"simulate.*called again.*no random numbers"):
         _system(noisy, vectorized=vectorized)
-
-
-def test_the_recording_that_is_tried_is_the_one_with_the_most_values():
-    """A column may be empty in the first of two tables."""
-    both = RunTable(
-        {
-            "file": np.repeat(["one", "two"], 5),
-            "x": np.arange(10.0),
-            "u": np.repeat([np.nan, 1.0], 5),
-            "y": np.zeros(10),
-        },
-        run="file",
-    )
-    simulator = Simulator("y", "V", {"a": Uniform(0, 1)}, simulate=lambda p, data: p["a"] * data["u"])
-    system = System.of(simulator, both)
-    np.testing.assert_allclose(system.chain(both, ()).predict(np.array([[0.5]]), both)[0, 5:], 0.5)

@@ -10,7 +10,7 @@ from heater import ABOUT, SIMULATOR, TABLE, fitted
 from scipy.special import ndtri
 
 from probewise.errors import FileError, ParameterError
-from probewise.systems import FittedSystem, Law, RunTable, Simulator, System
+from probewise.systems import FittedSystem, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import StoredFit, extract_stored_fit, rebind_forms
 
@@ -69,14 +69,6 @@ def test_fewer_than_500_samples_are_refused():
         dataclasses.replace(whole, samples=whole.samples[:499], noise_sd=whole.noise_sd[:499])
 
 
-def test_a_parameter_may_have_brackets_in_its_name():
-    simulator = Simulator("y", "V", {"c[0]": (0, 1), "c[1]": (0, 1)}, simulate=lambda p, data: p["c[0]"] * data["x"])
-    made = FittedSystem(simulator, names=("c[0]", "c[1]"), samples=np.full((500, 2), 0.5), noise_sd=np.ones(500))
-    assert made.names == ("c[0]", "c[1]")
-    with pytest.raises(ParameterError, match=r"c\[1\] is missing"):
-        dataclasses.replace(made, names=("c[0]",), samples=made.samples[:, :1])
-
-
 def test_every_form_that_is_bound_again_does_what_it_did():
     """About the fit and from what is in the file, with any parameters: the same readings, to the last bit."""
     forms = bind_forms(ABOUT)
@@ -119,32 +111,9 @@ def test_predictions_that_are_no_number_are_stored():
     assert known.sd == 0.07
 
 
-def test_a_file_with_names_of_runs_as_numbers_is_read():
-    """Earlier versions wrote them so."""
-    document = json.loads(dataclasses.replace(fitted(), known=StoredFit(TABLE, ABOUT.predicted, 0.07)).to_json())
-    stored = document["bound_about"]["columns"]
-    stored["run"] = [float(name) for name in stored["run"]]
-    known = FittedSystem.from_json(json.dumps(document), SIMULATOR).known
-    assert known.table.scan_names == TABLE.scan_names
-
-
 def test_the_file_of_another_reading_is_refused_without_fingerprints():
     here, there = (dataclasses.replace(SIMULATOR, fingerprint="", unit=unit) for unit in ("degC", "K"))
     text = dataclasses.replace(fitted(), simulator=here).to_json()
     assert FittedSystem.from_json(text, here).to_json() == text
     with pytest.raises(FileError, match=r"fitted to temp_c \(degC\); allowed: a model of temp_c \(K\)"):
         FittedSystem.from_json(text, there)
-
-
-def test_forms_are_bound_again_without_a_call_of_rates():
-    """They were called at the middle of the prior, where they may raise."""
-
-    def rates(s, p, u):
-        raise ValueError("no such tank")
-
-    law = Law({"upper": 0.0, "lower": 0.0}, rates)
-    simulator = Simulator("y", "V", {"a": (0, 1)}, law=law, time="t")
-    level = np.linspace(0.0, 1.0, 20)
-    table = RunTable({"t": np.arange(20.0), "y": level}, "t")
-    known = StoredFit(table, level, 1.0, {"upper": level, "lower": level**2})
-    assert rebind_forms(["limit:upper"], simulator, known).keys() == {"limit:upper"}

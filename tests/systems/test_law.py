@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from probewise.errors import FileError, ParameterError
+from probewise.errors import ParameterError
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.all_steps import TrajectoryCache
-from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.inputs import delayed_held_column
 from probewise.systems.law import LawWithEffects, Limit, integrate_states
@@ -89,18 +88,6 @@ def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction()
     table = _table(np.linspace(0, 4, 6))
     found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 1.0)), table, {}, 0.8)["v"]
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
-
-
-def test_a_coarse_step_is_split_where_friction_brings_a_damped_body_to_rest():
-    """Closed form: of v' = -v - 0.5 from 1, v is 0 at ln 3, and the way is 1 - 0.5 ln 3.
-
-    The error of the same steps without friction is the scale: the way is then 1 - exp(-2).
-    """
-    law = Law({"x": 0.0, "v": 1.0}, lambda s, p, u: {"x": s["v"], "v": -s["v"]})
-    table = _table(np.linspace(0, 2, 5))
-    free = _states(law, table, {}, 0.5)["x"][-1] - (1 - np.exp(-2))
-    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 0.5)), table, {}, 0.5)["x"][-1]
-    assert abs(found - (1 - 0.5 * np.log(3))) < 2 * abs(free)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9])
@@ -195,19 +182,6 @@ def test_what_a_law_changes_in_place_is_its_own(hold):
         theta = system.theta(system.starts)
         predicted.append([system.chain(table, ()).predict(theta * k, table) for k in (1.0, 1.0, 1.001)])
     np.testing.assert_allclose(*predicted, rtol=1e-9, atol=1e-9)
-
-
-def test_a_parameter_changed_in_place_to_an_array_of_more_runs_is_a_clear_mistake():
-    def rates(s, p, u):
-        rate = p["c"]
-        rate *= s["phi"]
-        return {"phi": -rate}
-
-    columns = {"t_s": np.arange(12.0), "y": np.zeros(12), "run": np.repeat(["a", "b"], 6)}
-    table = RunTable(columns, "t_s", "run")
-    simulator = Simulator("y", "V", {"c": (0.1, 1.0)}, law=Law({"phi": 1.0}, rates), time="t_s", run="run")
-    with pytest.raises(FileError, match=r"allowed: k = k \* x in place of k \*= x"):
-        System.of(simulator, table)
 
 
 _RNG = np.random.default_rng(0)
@@ -400,31 +374,6 @@ def test_a_late_column_is_held_exactly_one_row_later_where_the_dead_time_is_a_ga
     np.testing.assert_array_equal(found[0], values[0])
     np.testing.assert_array_equal(found[1], values[0, np.maximum(np.arange(40) - 3, 0)])
     np.testing.assert_array_equal(found[2], np.full(40, values[0, 0]))
-
-
-def test_a_column_with_a_wrong_scale_beside_its_dead_time_has_both(about_of, forms_of):
-    form, gain = (forms_of["previous"][name] for name in ("input_delay:force", "input_gain:force"))
-    about = about_of["previous"]
-    theta = np.concatenate([about.theta[0], [0.33], [0.1]])[None, :]
-    found = about.system.chain(TABLE, (form, gain)).predict(theta, TABLE)[0]
-    np.testing.assert_allclose(found, _spring_by_solve_ivp("previous", delay=0.33, gain=1.1), atol=1e-5)
-
-
-def test_the_cost_counts_the_parts_of_the_steps_that_a_late_column_divides(about_of, forms_of):
-    n_calls, about = 0, about_of["previous"]
-    own = about.system.simulator.law
-
-    def rates(s, p, u):
-        nonlocal n_calls
-        n_calls += 1
-        return own.rates(s, p, u)
-
-    simulator = replace(about.system.simulator, law=replace(own, rates=rates))
-    system = replace(
-        about.system, simulator=simulator, tally=IntegrationTally(), trajectories=TrajectoryCache(n_refused=99)
-    )
-    _predicted(replace(about, system=system), forms_of["previous"]["input_delay:force"], np.array([[0.33]]))
-    assert system.tally.n_evaluations == pytest.approx(n_calls, rel=0.25)
 
 
 def test_a_late_column_on_straight_lines_conserves_what_it_brings():

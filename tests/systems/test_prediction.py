@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from heater import ABOUT, SIMULATOR, fitted, runs
 
-from probewise.diagnosis.simulator_rows import plan_of_sequence, possible_run_commands
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.systems import (
     FittedSystem,
@@ -70,27 +69,12 @@ def test_a_new_run_has_an_offset_as_those_of_the_recorded_runs_differ():
     np.testing.assert_allclose(np.sqrt(found.sd[0] ** 2 - plain.sd[0] ** 2), np.sqrt(8 / 3), rtol=0.15)
 
 
-def test_the_density_of_a_sure_prediction_is_that_of_its_noise():
-    model = fitted()
-    sure = dataclasses.replace(model, samples=np.tile(model.samples[:1], (500, 1)))
-    found = predicted(sure, runs())
-    z = (runs().columns["temp_c"] - found.mean) / 0.05
-    np.testing.assert_allclose(found.log_density, -0.5 * z**2 - np.log(0.05 * np.sqrt(2 * np.pi)))
-
-
 def test_a_table_without_readings_is_predicted_and_not_scored():
     table = runs()
     bare = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "temp_c"})
     found = predicted(fitted(), bare)
     assert np.isnan(found.log_density).all()
     np.testing.assert_array_equal(found.mean, predicted(fitted(), table).mean)
-
-
-def test_a_model_that_was_read_predicts_as_the_one_that_was_written():
-    model = fitted(("lag", "sensitivity:room_c"))
-    read = FittedSystem.from_json(model.to_json(), SIMULATOR)
-    new = runs((20.0, 22.0), names="89")
-    np.testing.assert_array_equal(predicted(read, new).log_density, predicted(model, new).log_density)
 
 
 def test_a_row_that_lacks_a_column_is_not_predicted_and_the_others_are():
@@ -208,12 +192,6 @@ def _model_with_a_step_at_a_row():
     return model, table
 
 
-def test_a_step_at_a_row_is_told_as_a_spreadsheet_counts():
-    """The step is between data rows 24 and 25, counted from 0; data row 25 is row 27 of the file."""
-    form = bind_forms(_step_without_a_time())["offset_step"]
-    assert "at row 27 of the table" in form.sentence(np.array([2.0, _STEP_AT]), np.array([0.1, 0.3]))
-
-
 def test_a_step_at_a_row_is_there_in_the_recording_and_its_first_rows():
     model, table = _model_with_a_step_at_a_row()
     np.testing.assert_allclose(predicted(model, table).mean, table.columns["y"])
@@ -233,35 +211,12 @@ def test_a_part_of_the_recording_is_predicted_where_it_is_in_it(rows):
     np.testing.assert_allclose(later, 3.0)
 
 
-def test_a_part_is_found_in_a_recording_in_which_rows_are_repeated_and_cells_are_missing():
-    model, table = _model_with_a_step_at_a_row()
-    known = model.known
-    x, y = np.round(table.columns["x"]), np.round(table.columns["y"])
-    y[30] = np.nan
-    table = RunTable({"x": x, "y": y})
-    model = dataclasses.replace(model, known=dataclasses.replace(known, table=table))
-    part = {"x": x[22:35].copy(), "y": y[22:35]}
-    part["x"][1] = np.nan  # as in the file; the model's own copy has it interpolated
-    with pytest.warns(DoubtfulResultWarning, match="first row 3"):
-        found = predicted(model, part).mean - x[22:35]
-    np.testing.assert_allclose(
-        np.delete(found, 1), np.where(np.arange(22, 35) > _STEP_AT, 3.0, 1.0)[np.arange(13) != 1]
-    )
-
-
 def test_a_new_table_comes_after_the_step_at_a_row_of_the_recording():
     """The machine jumped and stayed there; before, a new table began anew, ahead of the jump."""
     model, table = _model_with_a_step_at_a_row()
     x = np.random.default_rng(5).normal(size=30)
     for new in ({"x": x, "y": x}, {"x": x}, {"x": table.columns["x"]}):
         np.testing.assert_allclose(predicted(model, new).mean, 3.0 + new["x"])
-
-
-def test_a_run_that_could_be_recorded_next_comes_after_the_step_at_a_row():
-    _, table = _model_with_a_step_at_a_row()
-    commands = possible_run_commands(table, "y", ("x",), "s")
-    assert {command.plan.first_row for command in commands} == {40}
-    assert plan_of_sequence(commands[:2], table).row_number[0] == 40
 
 
 def _with_missing_power(table, *rows):
@@ -304,14 +259,6 @@ def test_a_law_has_no_prediction_from_a_missing_input_to_the_end_of_its_run():
     with pytest.warns(DoubtfulResultWarning):
         found = predicted(model, _with_missing_power(runs(), 3))
     assert np.flatnonzero(np.isnan(found.mean)).tolist() == list(range(3, 12))
-
-
-def test_a_missing_number_that_nothing_needs_is_no_matter():
-    table = runs()
-    room = table.columns["room_c"].copy()
-    room[:5] = np.nan
-    found = predicted(fitted(("lag",)), table.with_columns({"room_c": room}))
-    np.testing.assert_array_equal(found.mean, predicted(fitted(("lag",)), table).mean)
 
 
 def test_a_table_of_which_no_row_has_what_it_needs_is_refused():
@@ -397,20 +344,6 @@ def test_later_rows_of_a_recorded_run_go_on_from_its_recorded_state(rows):
     found = predicted(model, part.with_columns({"humidity": np.ones(len(part))}))
     np.testing.assert_allclose(found.mean, part.columns["x"] + part.time_s, atol=1e-5)
     assert (len(found.table), found.notes) == (len(part), ())
-
-
-def test_later_rows_are_said_to_start_again_where_the_model_has_no_recorded_rows():
-    model, whole = _decaying((), known=False)
-    found = predicted(model, whole.take(np.arange(20, 40)))
-    np.testing.assert_allclose(found.mean[0], 8.0)
-    assert "note: run a: started again at its first row here" in found.summary()
-    assert predicted(model, whole).notes == ()  # it begins at 0
-
-
-def test_runs_named_by_numbers_with_decimals_are_pointed_out():
-    assert "1.10 is 1.1" in RunTable({"y": [1.0, 2.0], "run": [1.1, 1.10]}, run="run").notes[0]
-    for names in ([1.0, 2.0], ["1.1", "1.10"]):
-        assert RunTable({"y": [1.0, 2.0], "run": names}, run="run").notes == ()
 
 
 def test_an_infinite_reading_is_refused_with_its_row():

@@ -3,14 +3,13 @@
 import dataclasses
 import datetime
 from collections.abc import Iterator
-from decimal import Decimal
 
 import numpy as np
 import pytest
 from heater import runs
 
 from probewise.errors import ParameterError
-from probewise.systems import RunTable, concatenate_tables, read_run_table
+from probewise.systems import RunTable, concatenate_tables
 
 
 def test_numbers_among_which_some_are_none_are_a_column_of_numbers():
@@ -25,15 +24,6 @@ def test_missing_values_are_interpolated_within_each_run():
     np.testing.assert_allclose(table.interpolated_within_runs(values), expected)
 
 
-def test_masked_values_are_missing_and_decimal_numbers_are_numbers():
-    x = np.ma.masked_equal([1, 2, -999], -999)
-    texts = np.ma.masked_array(["a", "bad"], mask=[False, True])
-    np.testing.assert_array_equal(RunTable({"x": x}).columns["x"], [1.0, 2.0, np.nan])
-    assert RunTable({"who": texts}).columns["who"].tolist() == ["a", ""]
-    exact = RunTable({"x": [Decimal("1.5"), None, Decimal(2)]})
-    np.testing.assert_array_equal(exact.covariates["x"], [1.5, np.nan, 2.0])
-
-
 def test_two_columns_of_one_name_are_refused():
     class Frame(dict[str, list[float]]):
         def items(self) -> Iterator[tuple[str, list[float]]]:  # type: ignore[override]  # as of a data frame
@@ -41,15 +31,6 @@ def test_two_columns_of_one_name_are_refused():
 
     with pytest.raises(ParameterError, match=r"columns is 'x twice'; allowed: each column once"):
         RunTable(Frame())
-
-
-def test_large_numbers_in_a_file_are_numbers(tmp_path):
-    path = tmp_path / "diode.csv"
-    rows = "9007199254740992,1e22,0.1\n9007199254740993,3e23,\n"
-    path.write_text(f"run,doping_per_m3,u_v\n{rows}", encoding="utf-8")
-    table = read_run_table(path, time=None, run="run")
-    assert table.scan_names == ("9007199254740992", "9007199254740993")
-    np.testing.assert_array_equal(table.covariates["doping_per_m3"], [1e22, 3e23])
 
 
 @pytest.mark.parametrize(
@@ -143,12 +124,6 @@ def test_tables_without_runs_are_a_run_each():
     assert joined.scan_names == ("a.csv", "b.csv")
 
 
-def test_a_renamed_run_is_not_merged_with_another_run_of_its_table():
-    joined, _ = concatenate_tables([runs((20.0,)), runs((25.0, 26.0), names=("1", "1 (2)"))], ["a.csv", "b.csv"])
-    assert joined.scan_names == ("1", "1 (3)", "1 (2)")
-    assert len(set(joined.scan.tolist())) == 3
-
-
 def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
     first = RunTable({"day": [1.0, 1.0, 2.0], "x": [1.0, 2.0, 3.0]}, run="day")
     advised = RunTable({"day": ["1 again", "1 again"], "x": [1.0, 2.0]}, run="day")
@@ -156,16 +131,3 @@ def test_runs_named_by_numbers_are_joined_with_runs_named_by_texts():
     assert joined.scan_names == ("1", "2", "1 again")
     assert list(joined.columns) == ["day", "x"]
     assert concatenate_tables([advised, first], ["next.csv", "a.csv"])[0].scan_names == ("1 again", "1", "2")
-
-
-@pytest.mark.parametrize(
-    ("one", "other", "joined"),
-    [
-        ([np.nan], ["rain"], ["", "rain"]),
-        (["rain"], [np.nan], ["rain", ""]),
-        (["2", "2b"], [2.0, 3.0], ["2", "2b", "2", "3"]),
-    ],
-)
-def test_a_column_of_texts_may_be_empty_or_of_numbers_in_one_table(one, other, joined):
-    tables = [RunTable({"x": np.arange(len(c)) + 9.0 * k, "note": c}) for k, c in enumerate((one, other))]
-    assert concatenate_tables(tables, ["a.csv", "b.csv"])[0].columns["note"].tolist() == joined

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from probewise.effects import is_out_of_vocabulary
-from probewise.errors import ParameterError
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.readings import sign_of_change, values_at_earlier_times
-from probewise.systems.forms.reference import clipping_between, switch_points
+from probewise.systems.forms.reference import clipping_levels, switch_points
 from probewise.systems.law import LawWithEffects
 
 SD = 0.01
@@ -162,12 +160,6 @@ def test_an_input_delay_looks_the_column_up_as_it_was():
     np.testing.assert_allclose(_read("input_delay:drive", 0.4), expected, atol=1e-12)
 
 
-def test_a_delay_of_nothing_changes_nothing_where_rows_share_a_time():
-    values = np.array([[1.0, 2.0, 3.0, 4.0]])
-    found = values_at_earlier_times(np.array([0.0, 0.0, 1.0, 1.0]), values, np.array([0.0, 0.5]))
-    np.testing.assert_array_equal(found, [[1.0, 2.0, 3.0, 4.0], [1.0, 1.0, 2.5, 2.5]])
-
-
 def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
     about = _about(_simulator(
         parameters={"gain": (0, 4)}, simulate=lambda p, u: p["gain"] * u["drive"] * (1 + p["bend"] * u["drive"]),
@@ -188,14 +180,6 @@ def test_a_term_that_adds_to_a_rate_is_told_without_a_double_negative(a, told):
     assert damping.sentence(np.array([a]), np.array([0.02])) == f"the rate of x lacks {told}"
 
 
-def test_a_switch_is_proposed_for_each_column_that_takes_many_values():
-    (switch,) = [form for form in formula_forms(_about(_simulator())) if form.name.endswith("sign(room_c - at)) / 2")]
-    assert switch.expression == "a (1 + sign(room_c - at)) / 2"
-    shifted = switch.apply(np.zeros((1, N_ROWS)), np.array([[0.3, 20.5]]), TABLE)
-    np.testing.assert_array_equal(shifted[0], np.where(TABLE.columns["room_c"] > 20.5, 0.3, 0.0))
-    assert all(low < high for low, high in zip(switch.change_points.at[:-1], switch.change_points.at[1:], strict=True))
-
-
 def test_a_state_stops_at_a_floor_as_well_as_at_a_ceiling():
     """Closed form: x' = -1 from x = 9 falls on a straight line to where it is held."""
     about = _about_law(lambda s, p, u: {"x": -p["rate"] + 0 * s["x"]}, x=9.0)
@@ -209,13 +193,6 @@ def test_a_state_stops_at_a_floor_as_well_as_at_a_ceiling():
     )
     assert "falls no further" in form.sentence(np.array([level]), np.array([0.01]))
     assert form.prior.log_prob(form.bank()[:, 0, :]).min() > -np.inf
-
-
-def test_a_clock_that_gains_hastens_a_law():
-    """Closed form: x' = 0.8 exp(-x / 2) from x = 0 is 2 ln(1 + 0.4 t), at the true time t (1 + a)."""
-    about = _about_law(lambda s, p, u: {"x": 0.8 * np.exp(-s["x"] / 2)}, observe=lambda s, p, u: p["rate"] * s["x"])
-    found = _read("clock_drift", 0.03, about=about, forms=bind_forms(about))
-    np.testing.assert_allclose(found, about.theta[0, 0] * 2 * np.log(1 + 0.4 * 1.03 * _T), atol=1e-6)
 
 
 def test_an_input_is_cut_off_below_as_well_as_above():
@@ -314,15 +291,6 @@ def test_what_may_be_missing_does_not_depend_on_the_last_digits_of_the_columns()
     assert not any("load" in name for name in found[0])
 
 
-def test_readings_that_stay_keep_the_direction_of_the_last_change():
-    """A settled law wavers in the last digits of its readings."""
-    readings = np.append(np.linspace(0, 1, 20), 1 + 1e-16 * np.tile([1.0, -1.0], 20))[None, :]
-    table = TABLE.take(np.arange(30)).with_columns({"t_s": np.arange(30.0), "run": np.ones(30)})
-    assert np.unique(np.diff(readings[0, :30])[19:]).size > 1
-    np.testing.assert_array_equal(sign_of_change(readings[:, :30], table), 1.0)
-    np.testing.assert_array_equal(sign_of_change(-readings[:, :30], table), -1.0)
-
-
 def test_no_form_has_the_name_of_an_effect_out_of_vocabulary():
     """Such a name would count as unknown however sure it is: `gain_step` did, as a light sensor's jump of the gain."""
     assert "gain_step" in FORMS
@@ -388,18 +356,6 @@ def test_a_wave_whose_frequency_changes_is_begun_from_its_two_columns():
     np.testing.assert_allclose(found, expected, atol=0.01 * a)
 
 
-def test_a_long_table_asks_for_no_more_waves_of_changing_frequency_than_a_short_one():
-    """20,000 rows tell 3,333 waves apart; the bank of the sweeps of all of them would take 850 MB."""
-    times = np.linspace(0.0, 1000.0, 20_000)
-    columns = {"t_s": times, "drive": np.sin(times), "y": np.zeros(len(times))}
-    table = RunTable(columns, time="t_s", run=None)
-    (swept,) = [form for form in formula_forms(_about(_simulator(run=None), table)) if ":sin(2 pi hz (u" in form.name]
-    hz = swept.bank()[:, 0, swept.prior.names.index("hz")]
-    assert 35 < hz.max() * 1000.0 <= 40
-    assert np.diff(np.unique(hz)).max() * 1000.0 < 0.51
-    assert len(hz) < 3000
-
-
 def test_two_settlings_add_up_at_the_start_of_each_run():
     form = _proposed("t since the start of the run")
     found = form.apply(np.zeros((1, N_ROWS)), np.array([[0.5, -0.8, 0.2, 2.0]]), TABLE)[0]
@@ -434,16 +390,6 @@ def test_the_influence_of_a_column_is_a_quadratic_function_of_the_reading():
     assert "a = 0.200 ± 0.010 V, b = -0.100" in form.sentence(np.array([0.2, -0.1, 0.3]), np.full(3, 0.01))
 
 
-def test_a_law_is_tried_with_as_many_waves_as_its_rows_tell_apart():
-    """A force between two trial frequencies three widths apart starts no fit near it, and was missed."""
-    times = np.tile(np.linspace(0.0, 6.0, 200), 2)
-    columns = {"t_s": times, "run": np.repeat([1.0, 2.0], 200), "y": np.zeros(400)}
-    about = _about_law(lambda s, p, u: {"x": p["rate"] - s["x"]}, table=RunTable(columns, time="t_s", run="run"))
-    tried = bind_forms(about)["periodic_forcing:x"].bank()[:, 0, 1]
-    assert np.diff(tried).max() <= 0.52 / 6.0
-    assert tried[-1] == pytest.approx(0.5 / np.diff(times)[0])
-
-
 def test_a_wave_is_slow_enough_to_be_seen_as_a_whole_and_a_periodic_error_to_repeat():
     """Half a wave follows any smooth bend: of an S-shaped one x had "a period of 1365" in a range of 362."""
 
@@ -458,16 +404,6 @@ def test_a_wave_is_slow_enough_to_be_seen_as_a_whole_and_a_periodic_error_to_rep
     drive = np.ptp(TABLE.columns["drive"])
     assert possible("periodic_error:drive", 1.5, drive)
     assert not possible("periodic_error:drive", 1.3, drive)
-
-
-def test_rows_without_a_reading_resolve_no_waves():
-    """Inputs on a finer grid than the readings: waves that only these rows told apart fitted any readings."""
-    grid = np.linspace(0.0, 60.0, 241)
-    read = np.arange(241) % 4 == 0
-    table = RunTable({"t_s": grid, "drive": grid * 1.7, "y": np.where(read, 0.0, np.nan)}, time="t_s")
-    forms = bind_forms(_about(_simulator(run=None), table))
-    assert forms["interference"].bank()[:, :, 1].max() == pytest.approx(0.5 / 1.0)
-    assert forms["periodic_error:drive"].bank()[:, :, 1].min() == pytest.approx(4 * 1.7)
 
 
 def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
@@ -491,25 +427,6 @@ def test_a_form_that_looks_back_to_earlier_times_says_so():
         assert form.needs_rising_time == bool(np.any(change[others] != 0)), form.name
     named = {name.partition(":")[0] for name, form in FORMS.items() if form.needs_rising_time}
     assert named == {"lag", "delay", "input_delay"}
-
-
-def test_a_dose_is_the_integral_over_time_in_a_table_of_one_row_too():
-    """At the start of a run nothing has been taken up yet; before, the one row was added up as where no time is."""
-    dose = next(form for form in formula_forms(ABOUT) if "integral over t_s of |room_c|" in form.name)
-    theta = np.concatenate([ABOUT.theta[0], [1.0, 5.0]])[None, :]
-    for n_rows in (1, 2):
-        first = TABLE.take(np.arange(n_rows))
-        change = ABOUT.system.chain(first, [dose]).predict(theta, first) - ABOUT.system.chain(first, []).predict(
-            ABOUT.theta, first
-        )
-        assert change[0, 0] == 0.0
-
-
-def test_an_extra_effect_has_no_name_of_an_effect_on_the_noise():
-    """It was replaced by that effect, which then counted as the user's own."""
-    for name in ("outliers", "unknown"):
-        with pytest.raises(ParameterError, match=name):
-            _simulator(extra={name: Extra((0, 1), 0.0, "{value}")})
 
 
 def test_the_rates_of_a_law_lack_nothing_where_no_time_passes():
@@ -546,25 +463,6 @@ def test_a_fast_wave_in_times_that_come_in_clusters_is_tried_where_the_residuals
     assert not FORMS["interference"].suggested.size
 
 
-def test_a_rate_of_change_of_what_has_no_unit_counts_from_one():
-    units = {name: form.units for name, form in FORMS.items()}
-    assert units["depends:gain:room_c"] == ("1 per room_c",)
-    assert units["drifts:gain"] == ("1/s",)
-    assert units["sensitivity:room_c"] == ("V per room_c",)
-    assert not [name for name, own in units.items() for unit in own if unit.startswith((" ", "/"))]
-
-
-def test_what_a_parameter_jumps_by_has_its_unit():
-    def decay(p, u):
-        return p["gain"] * np.exp(-u["t_s"] / p["tau_s"])
-
-    forms = bind_forms(_about(_simulator(parameters={"tau_s": (1, 5), "gain": (0, 4)}, simulate=decay)))
-    said = forms["steps:tau_s"].sentence(np.array([-2.0, 3.0]), np.array([0.1, 0.2]))
-    assert said == "tau_s jumps by -2.00 ± 0.10 s at 3.00 ± 0.20 s and stays there"
-    said = forms["sensitivity:room_c"].sentence(np.array([0.5]), np.array([0.1]))
-    assert said == "y changes by 0.50 ± 0.10 V per °C of room_c"
-
-
 def test_a_jump_of_the_gain_may_go_back_as_a_block_of_rows_in_another_unit_does():
     form = FORMS["gain_step"]
     assert form.prior.names == ("a", "until_s", "at_s")
@@ -593,12 +491,3 @@ def test_a_second_wave_of_a_column_is_the_shorter_of_two():
     first, second = FORMS["periodic_error:drive"], FORMS["periodic_error:drive~again"]
     assert second.marginals["period"].high == pytest.approx(first.marginals["period"].high / 2)
     assert np.isfinite(second.prior.log_prob(second.bank()[:, 0])).all()
-
-
-def test_what_begins_with_the_second_of_two_runs_differs_from_run_to_run():
-    later = TABLE.with_columns({"t_s": np.linspace(0.0, 12.0, N_ROWS)})
-    about = ReferenceFit(ABOUT.system, later, np.zeros(2), SD)
-    at = [variant.marginals["at_s"] for variant in bind_forms(about)["offset_step"].variants()]
-    border = later.time_s[N_ROWS // 2 - 1 : N_ROWS // 2 + 1].mean()
-    assert len(at) == N_ROWS - 2
-    assert not any(prior.low < border < prior.high for prior in at)

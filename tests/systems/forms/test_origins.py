@@ -13,7 +13,7 @@ from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, pr
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.modulations import origin_of_column, text_rounded_to_spread
+from probewise.systems.forms.modulations import origin_of_column
 
 EPOCH = 1.7e9  # s, a multiple of 2^-20 away from any of the times
 FAR = 2.0**21  # of a column
@@ -127,29 +127,6 @@ def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
     assert not [each for each, form in near.items() if form.counted_from]
     counting = {name_without_copy_suffix(each) for each, form in later.items() if form.counted_from}
     assert counting <= set(COUNTS_TIME)
-
-
-def test_a_column_that_is_far_from_0_is_named_in_the_sentence_of_its_wave():
-    form = bind_forms(_about(0.0, FAR, _function))["periodic_error:drive"]
-    said = sentence_from_samples(form, form.bank()[:1, 0])
-    assert said.endswith(f" (drive counts from {FAR + _DRIVE.min():.12g})")
-
-
-def test_the_proposal_of_a_square_wave_says_from_which_time_it_counts():
-    near, later = (
-        next(form for form in formula_forms(_about(shift, 0.0, _function)) if "mod 1" in form.name)
-        for shift in (0.0, EPOCH)
-    )
-    assert (near.counted_from, later.counted_from) == ("", "t_s counts from 1700000000 s")
-
-
-def test_a_mean_is_rounded_no_coarser_than_the_spread_about_it():
-    assert float(text_rounded_to_spread(1.7e9 + 600.25, 350.0, 6)) == pytest.approx(1.7e9 + 600.25, abs=0.05 * 350)
-    assert text_rounded_to_spread(12.3456789, 3.0, 6) == "12.3457"
-    assert text_rounded_to_spread(12.3456789, 3.0) == "12.35"
-    assert text_rounded_to_spread(1006.13, 0.25) == "1006.13"
-    assert text_rounded_to_spread(0.0, 1.0) == "0"
-    assert float(text_rounded_to_spread(1.7e9, 1e-12)) == 1.7e9
 
 
 def test_a_model_keeps_the_origin_of_its_recording_for_other_tables_and_through_its_file():

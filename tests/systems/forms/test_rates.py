@@ -46,15 +46,6 @@ def test_a_rate_with_a_parameter_or_a_loss_is_no_definition(factor):
     assert _prepared(rates).apparatus.about.states_with_rates_by_definition == frozenset()
 
 
-def test_a_law_that_raises_far_from_its_fit_has_no_definitions():
-    def rates(s, p, u):
-        if np.any(np.abs(s["angle"]) > 1.5):
-            raise ValueError("too far")
-        return _pendulum(s, p, u)
-
-    assert _prepared(rates).apparatus.about.states_with_rates_by_definition == frozenset()
-
-
 def test_prior_odds_of_effects_in_a_definition():
     prepared = _prepared(_pendulum)
     odds = prepared.apparatus.prior_odds(prepared.effects)

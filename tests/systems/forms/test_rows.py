@@ -8,7 +8,7 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.systems import Simulator, table_for
-from probewise.systems.forms.binding import names_of_jumps_in_sorted_rows, sorting_column
+from probewise.systems.forms.binding import sorting_column
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.reference import chance_of_sorted_readings, note_on_row_order
 
@@ -105,13 +105,3 @@ def test_a_jump_of_a_sorted_table_shows_in_the_column_and_says_so():
         "rows are sorted by x: what jumps or wanders from row to row may change with x instead"
         in prepared.recording.notes
     )
-
-
-def test_a_jump_of_a_sorted_table_has_a_tenth_of_the_prior():
-    prepared = _prepared()
-    jumps = names_of_jumps_in_sorted_rows(prepared.effects)
-    assert jumps == {"offset_step", "gain_step", "steps:a", "steps:b"}
-    odds = prepared.apparatus.prior_odds(prepared.effects)
-    apart = odds.log_prior_on_mean(("nonlinearity",)) - odds.log_prior_on_mean(("offset_step",))
-    assert math.isclose(apart, math.log(10))
-    assert not names_of_jumps_in_sorted_rows(_prepared(_RNG.permutation(_X)).effects)

@@ -6,7 +6,7 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit_simulator import repaired_of
-from probewise.systems import Noise, RunTable, Simulator, as_recording, predict_system, table_for
+from probewise.systems import RunTable, Simulator, as_recording, predict_system, table_for
 from probewise.systems.forms.stop import find_meter_stop_and_mask
 
 _N, _SD = 240, 0.05
@@ -47,11 +47,6 @@ _NOT_STOPPED = {
 @pytest.mark.parametrize("case", _NOT_STOPPED)
 def test_nothing_is_seen_where_no_meter_stops(case):
     assert _stop(_table(_NOT_STOPPED[case])) is None
-
-
-def test_a_declared_end_is_no_news():
-    table = _table(lambda y: np.minimum(y, 5.5))
-    assert _stop(table, noise=Noise(range=(0.0, 5.5))) is None
 
 
 def _prepared(readings):

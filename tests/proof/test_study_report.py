@@ -2,18 +2,17 @@
 
 import csv
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from probewise.experiment import CLEAN, least_readings
+from probewise.experiment import CLEAN
 from probewise.proof import pages as report
 from probewise.proof import plots
-from probewise.proof.concealed_study import ConcealedTrial, concealed_rows
+from probewise.proof.concealed_study import ConcealedTrial
 from probewise.proof.configurations import REFERENCE, SearchConfiguration
 from probewise.proof.study import summaries
-from probewise.proof.trial import Trial, experiment_of
+from probewise.proof.trial import Trial
 from probewise.report.html import draw_or_raise
 
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
@@ -60,15 +59,6 @@ def test_the_csv_holds_every_number_and_its_bounds(study):
         assert float(row["mean"]) == pytest.approx(summary.mean.value, rel=1e-5)
         assert float(row["mean_low"]) < float(row["mean"]) < float(row["mean_high"])
         assert "cpu" not in ",".join(row)
-
-
-def test_the_bound_stands_beside_what_was_measured(study):
-    """Bits over capacity, of the rows whose robot knows its sensor."""
-    least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
-    shown = str(report.lower_bound_table(summaries(study)))
-    assert f"{least.readings_of_search:.1f} = " in shown
-    assert f"{least.readings_of_refinement:.1f} = " in shown
-    assert ROWS[1].name not in shown
 
 
 def test_each_curve_is_the_median_of_its_runs():
@@ -127,19 +117,3 @@ def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
     assert "backlash (play) of the arm, 6" in page
     assert "0.00 | 1.00" in page
     assert "By form" not in page
-
-
-def test_the_page_sums_up_what_was_concealed_by_form_where_there_are_several():
-    runs = concealed_runs()
-    runs |= {replace(trial, effect="bent_rail"): run for trial, run in runs.items() if trial.effect}
-    page = report.concealed_page(runs, command="probewise study --concealed").html(draw_or_raise)
-    assert "By form" in page
-    assert ">in the list<" in page
-    assert ">in no list<" in page
-
-
-def test_doubt_and_trust_stand_beside_each_other_in_every_row():
-    axes = plots.doubt_against_trust(concealed_rows(concealed_runs()))
-    assert [label.get_text() for label in axes[0, 0].get_yticklabels()] == ["nothing", "backlash (play) of the arm, 6"]
-    (line, *_), *_ = axes[0, 2].containers
-    assert line.get_xdata().tolist() == [11.0, 7.0]

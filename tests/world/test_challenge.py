@@ -72,12 +72,6 @@ def test_a_campaign_of_a_hundred_turns_meets_the_strata_asked_for():
     assert {"alias", "ssf_order"} <= set(kinds)
 
 
-def test_the_cases_of_a_stratum_are_counted_through():
-    for stratum in set(WHEEL):
-        turns = [turn for k in range(3 * len(WHEEL)) for s, turn in [stratum_of(k)] if s == stratum]
-        assert turns == list(range(len(turns)))
-
-
 @pytest.mark.parametrize("number", [number_of("clean", other_noise=True), number_of("single", size=20.0, skip=1)])
 def test_seed_and_number_alone_make_the_case(number):
     first, again, other = case(number), draw(number), draw(number, seed=12)
@@ -210,21 +204,6 @@ def setup(request):
     return CleanSetup(
         draw_plan_with_displaced_patterns(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng)
     )
-
-
-def test_every_candidate_makes_effects_of_its_name(setup):
-    for name, candidate in SAMPLERS.items():
-        of_amplitude = candidate.draw(setup, np.random.default_rng(6))
-        for amplitude in (candidate.first, candidate.limit):
-            assert of_amplitude(amplitude).name == name
-        assert of_amplitude(candidate.first) == candidate.draw(setup, np.random.default_rng(6))(candidate.first)
-
-
-def test_scans_can_be_drawn_that_cross_an_edge_and_their_mounting(setup):
-    assert "edge_0" in setup.edge_scan_names or "edge_0_out" in setup.edge_scan_names
-    assert not any(name.startswith(("white", "black", "quadrants")) for name in setup.edge_scan_names)
-    mounting = setup.scans_at_orientation_of(next(name for name in setup.edge_scan_names if "90" in name))
-    assert all("90" in name for name in mounting)
 
 
 def test_a_local_effect_is_found_where_it_is(setup):

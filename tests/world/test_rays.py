@@ -122,21 +122,6 @@ def test_an_image_shows_nothing_outside_and_has_its_first_row_on_top():
     np.testing.assert_array_equal(albedo_at(photo, x, y), [0.1, 0.2, 0.3, 0.4, 0, 0])
 
 
-def test_a_polygon_that_crosses_itself_follows_the_even_odd_rule():
-    star = Polygon(tuple((math.sin(k * 4 * math.pi / 5), math.cos(k * 4 * math.pi / 5)) for k in range(5)))
-    np.testing.assert_array_equal(albedo_at(star, np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.7, 0.0])), [0, 1, 0])
-
-
-def test_inside_and_outside_can_be_any_two_levels():
-    disc = Disc((0, 0), 1.0, inside=0.2, outside=0.7)
-    np.testing.assert_array_equal(albedo_at(disc, np.array([0.0, 2.0]), np.zeros(2)), [0.2, 0.7])
-
-
-def test_no_surface_is_no_surface():
-    with pytest.raises(ParameterError, match="pattern of the recording format"):
-        albedo_at("white", np.zeros(1), np.zeros(1))
-
-
 def test_moments_of_a_gaussian_spot_are_those_asked_for():
     mean, covariance = gaussian_spot([BLOB]).moments()
     np.testing.assert_allclose(mean, [0, 1.5], atol=1e-6)
@@ -167,8 +152,3 @@ def test_the_other_spots_are_no_gaussians():
 def test_a_spot_without_light_is_refused(weights, pixel_mm, error):
     with pytest.raises(error):
         Spot(np.array(weights), pixel_mm, (0.0, 0.0))
-
-
-def test_a_skew_of_one_is_refused():
-    with pytest.raises(ParameterError):
-        tailed_spot(skew=1.0)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from probewise.errors import NotConvergedError, ParameterError
-from probewise.proof.sensors.effects import CleanSetup, EffectSizer, amplitude_of_size, noise_effect_size
+from probewise.errors import NotConvergedError
+from probewise.proof.sensors.effects import CleanSetup, EffectSizer, amplitude_of_size
 from probewise.world import World, gaussian_spot
 from probewise.world import concealed as known
 from probewise.world.spots import Blob
@@ -119,13 +119,3 @@ def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, pl
         true = np.log((1 - known["share"]) * np.exp(log_normal(z, 1.0)) + known["share"] * wide)
     gained = (true - even).sum(axis=1)
     assert abs(sizer.size(effect) ** 2 / 2 - gained.mean()) < 4 * gained.std() / math.sqrt(3000) + 0.02
-
-
-def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
-    clean = sizer.clean_recording.readings
-    assert sizer.size(known.dropouts(0.1, 0.0)) ** 2 == pytest.approx(0.1 * np.sum((clean / 0.5) ** 2))
-
-
-def test_noise_without_a_name_has_no_size(plan):
-    with pytest.raises(ParameterError, match="vocabulary"):
-        noise_effect_size(known.heavy_tails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)

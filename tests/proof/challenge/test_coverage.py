@@ -11,7 +11,7 @@ from probewise.proof.sensors.cases import HiddenEffect
 from probewise.proof.sensors.effects import CovariateRegion
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
-from probewise.world.concealed import flicker, saturation
+from probewise.world.concealed import flicker
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -54,11 +54,6 @@ def test_an_angle_counts_by_its_nearest_turn():
     within = effect_truths_and_intervals(HiddenEffect(flicker(1.5, 0.02, 2 * math.pi - 0.05), 8.0).parameters, stated)
     assert within["amp"] == [1.5, 1.0, 2.0]
     assert within["phase"] == pytest.approx([-0.05, -0.1, 0.1])
-
-
-def test_what_the_vocabulary_leaves_open_is_not_asked():
-    stated = found(("level", "LEGO", 50.0, 52.0), ("softness", "LEGO", 0.0, 1.0), ("scans", "scan", 0.0, 1.0))
-    assert list(effect_truths_and_intervals(HiddenEffect(saturation(51.0, 0.0), 8.0).parameters, stated)) == ["level"]
 
 
 def test_samples_at_the_truth_have_its_moments():

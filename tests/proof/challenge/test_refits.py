@@ -10,7 +10,7 @@ from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_
 from probewise.proof.tables import score
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
-from probewise.world.concealed import albedo_patch, ambient_step, halo, hysteresis, saturation
+from probewise.world.concealed import ambient_step, halo, hysteresis
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -39,12 +39,6 @@ def refit(clean):
 
 def changed(clean, change):
     return Recording(clean.plan, clean.readings + change)
-
-
-def test_a_sensor_of_one_gaussian_is_taken_for_one(refit, clean):
-    null = refit.null_fit(clean)
-    assert null.model.sensor.n_gaussians == 1
-    assert np.abs(null.residuals).max() < 0.05
 
 
 def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
@@ -83,13 +77,6 @@ def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan,
     alone = replace(world, concealed=hidden[1:]).simulate(plan, rng=None)
     left = residual_norms_with_one_named(refit, clean, both, ["ambient_step"])
     assert left["ambient_step"] == pytest.approx(refit(clean, alone), rel=0.1)
-
-
-def test_a_ceiling_hides_what_is_above_it(refit, world, plan, clean):
-    patch = albedo_patch(0.05, 10.0, 0.0, 4.0)
-    alone = replace(world, concealed=(patch,)).simulate(plan, rng=None)
-    both = replace(world, concealed=(patch, saturation(45.0))).simulate(plan, rng=None)
-    assert residual_norms_with_one_named(refit, clean, both, ["saturation"])["saturation"] < 0.3 * refit(clean, alone)
 
 
 def test_an_alarm_is_due_on_physics_alone(make):

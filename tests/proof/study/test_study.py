@@ -1,11 +1,8 @@
 """A study is the same whoever does it: here, processes, or machines of which one is lost."""
 
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-
 import pytest
 
-from probewise.errors import FileError, ParameterError
+from probewise.errors import ParameterError
 from probewise.proof.configurations import REFERENCE, SearchConfiguration, paper_comparison_rows
 from probewise.proof.study import study as campaign_of
 from probewise.proof.study import summaries, trials_by_row
@@ -78,29 +75,6 @@ def test_rows_that_cannot_be_are_refused(changes, named):
     assert caught.value.name == named
 
 
-def test_rows_that_differ_have_names_that_differ():
-    rows = [
-        SearchConfiguration(**{name: value})
-        for name in ("width", "noise_sd")
-        for value in (1.254, 1.25, 1.3, 1.3000001, 0.996, 0.7)
-    ]
-    assert len({row.name for row in rows}) == len(rows)
-    assert [rows[k].name.split(", ")[-1] for k in (0, 1, 2, 5, 9)] == [
-        "believed 1.254 times as wide",
-        "believed 25% too wide",
-        "believed 30% too wide",
-        "believed 30% too narrow",
-        "noise 1.3000001",
-    ]
-
-
-@pytest.mark.slow
-def test_other_processes_come_to_the_same(study, tmp_path):
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        other = campaign_of(ROWS, **BRIEF).run(path=tmp_path / "trials.jsonl", executor=pool)
-    assert timeless(other) == timeless(study[0])
-
-
 def test_what_a_file_holds_is_not_done_again(study):
     told = []
     one = campaign_of({REFERENCE: 1}, max_readings=3)
@@ -109,15 +83,6 @@ def test_what_a_file_holds_is_not_done_again(study):
     (trial,) = one.tasks
     assert again == {trial: study[0][trial]}
     assert summaries(again) == {}
-
-
-def test_wrong_files_and_numbers_are_refused(study):
-    with pytest.raises(FileError, match="other settings"):
-        campaign_of([REFERENCE], 1).run(path=study[1])
-    with pytest.raises(ParameterError, match="1 or more"):
-        campaign_of([REFERENCE])
-    with pytest.raises(ParameterError, match="one row or more"):
-        campaign_of([], 2)
 
 
 @pytest.mark.slow

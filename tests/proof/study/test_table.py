@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.proof.configurations import POPULATIONS, SearchConfiguration, noise_of_run_in_sds, standard_rows
+from probewise.proof.configurations import SearchConfiguration
 from probewise.proof.estimates import estimated_share
 from probewise.proof.study import summarise
 
@@ -79,27 +79,9 @@ def test_one_run_has_no_error():
         summarise([trial(8)], max_readings=100)
 
 
-def test_circles_and_noise_are_always_the_same():
-    """By the formula: a uniform number each, spread over what the circle may be."""
-    u = np.random.default_rng(2013).random((300, 3))
-    anywhere = POPULATIONS["anywhere"].circles(300)
-    np.testing.assert_allclose(anywhere, np.array([0, 0, 20]) + np.array([1048, 520, 130]) * u)
-    inside = POPULATIONS["inside"].circles(300)
-    r = 50 + 100 * u[:, 2]
-    np.testing.assert_allclose(inside, np.c_[r + (1048 - 2 * r) * u[:, 0], r + (520 - 2 * r) * u[:, 1], r])
-    np.testing.assert_array_equal(POPULATIONS["inside"].circles(7), inside[:7])
-    np.testing.assert_array_equal(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(5, 100)[:10])
-    assert not np.allclose(noise_of_run_in_sds(5, 10), noise_of_run_in_sds(6, 10))
-
-
 @pytest.mark.parametrize(
     "wrong", [{"population": "outside"}, {"model": "best"}, {"utility": "luck"}, {"noise_sd": 0.0}, {"width": -1.0}]
 )
 def test_rows_that_mean_nothing_are_refused(wrong):
     with pytest.raises(ParameterError, match=next(iter(wrong))):
         SearchConfiguration(**wrong)
-
-
-def test_every_standard_row_has_a_name_of_its_own():
-    names = [row.name for row in standard_rows()]
-    assert len(set(names)) == len(names)

@@ -4,7 +4,6 @@ import base64
 import io
 import json
 import re
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,7 +23,7 @@ from probewise.experiment import (
     samples_csv,
 )
 from probewise.inference import GaussianKnown
-from probewise.recordings import Disc, Instrumentation, read_recording, shipped
+from probewise.recordings import Disc, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
 from probewise.report.pictures import animated_gif
@@ -125,13 +124,6 @@ def test_the_page_of_a_search_gives_the_shape_with_its_errors_and_what_it_cost(r
     assert re.search(r"a circle with x [\d.]+ ± [\d.]+ mm", page)
 
 
-def test_widths_beside_a_result_that_counts_the_arms_error_say_that_they_lack_it(run):
-    assert "without the arm" not in exploration.steps_table(run)
-    last = replace(run.last, arm_error=SimpleNamespace(sd=np.ones(3)))
-    known = replace(run, steps=(*run.steps[:-1], last))
-    assert "widest sd without the arm&#x27;s own error (mm)" in exploration.steps_table(known)
-
-
 def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run):
     document = json.loads(result_json(run), parse_constant=pytest.fail)
     assert list(document) == [
@@ -185,11 +177,6 @@ def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_ze
     cells = re.search(r"A_1</td>.*?</tr>", page)[0]
     assert "0.031" in cells
     assert f"{sensor.sd()['A_1']:.3f}" not in cells
-
-
-def test_the_noise_of_a_sensor_that_reads_millivolts_is_not_written_as_zero():
-    sensor = replace(hand_made_sensor(), noise_sd=np.full(500, 0.0031), instrumentation=Instrumentation(unit="V"))
-    assert calibration_report.summary_sentence(sensor).endswith("by 2.5 mm (sd), noise 0.0031 V per reading.")
 
 
 def test_the_errors_of_a_rectangle_do_not_depend_on_which_side_is_its_width():

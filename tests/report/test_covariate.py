@@ -10,7 +10,6 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.recordings import Recording, Uniform
 from probewise.report.covariates import (
     ResidualNoise,
-    _probability_unknown_depends_on,
     covariate_in_words_and_unit,
     views_of_place,
 )
@@ -59,17 +58,6 @@ def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, v
     assert view.category_names_on_axis == names
     assert view.window == ((-0.5, 0.5) if scan else (-0.5, len(names) - 0.5))
     assert ("scan one" if scan else ", ".join(names)) in _place_caption(diagnosis, place)
-
-
-def test_an_unknown_effect_that_depends_on_the_run_is_found_by_its_run():
-    """A whole run of a table is a place without "within scans", as a whole scan is."""
-    place = Place("run", "third", None, None, 0.001, 5.0, np.zeros(2), np.zeros(2))
-    diagnosis = SimpleNamespace(
-        verdict="unknown",
-        judged=SimpleNamespace(unknown_shares={"run, by group": 0.7, "time, smooth": 0.2}),
-        apparatus=SimpleNamespace(words=SimpleNamespace(run="run")),
-    )
-    assert _probability_unknown_depends_on(diagnosis, place) == 0.7
 
 
 def test_the_band_of_chance_is_as_wide_as_each_readings_own_noise():

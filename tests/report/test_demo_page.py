@@ -19,13 +19,10 @@ from probewise.recordings import Disc, read_recording, shipped
 from probewise.report.demo import doubt_section, doubt_sentence
 from probewise.report.plots import PAGE_IN, grid_of_axes, png
 from probewise.report.searches import (
-    HEADER,
     RobotSearch,
     draw_effect_probabilities,
     draw_final_posteriors,
-    fine_entropy_map,
     paper_view,
-    search_comparison_lines,
     window_around_runs_mm,
 )
 from probewise.scene import Circle, HypothesisScene
@@ -51,11 +48,6 @@ def searched(max_readings):
 @pytest.fixture(scope="module")
 def found():
     return searched(2)
-
-
-def test_the_fine_map_agrees_with_the_robots_own_where_both_have_a_place(found):
-    drawn = fine_entropy_map(found, 1)
-    np.testing.assert_allclose(drawn.image[::2, ::2], found.steps[0].map.image, atol=1e-9)
 
 
 def test_the_view_shows_the_fifty_circles_and_the_place_chosen_from_them(found):
@@ -88,18 +80,6 @@ def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(m
     assert main(["diagnose", str(recording), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert len(states) == 3
     assert states[0] == states[1] == states[2]
-
-
-def test_the_demos_comparison_is_two_tables_each_with_its_caption(monkeypatch):
-    rows = [("naive", "30", "9", "20.1", "0.67", "0.83", "12.5 mm", "x 1 mm"), ("SSF", *"12345", "2 mm", "x 2 mm")]
-    monkeypatch.setattr("probewise.report.searches.search_comparison_rows", lambda searches: rows)
-    first, second = "\n".join(search_comparison_lines([])).rstrip().split("\n\n")
-    for text, header in ((first, HEADER[:-2]), (second, (HEADER[0], *HEADER[-2:]))):
-        caption, names, *lines = text.splitlines()
-        assert "(" in caption or "±" in caption
-        assert all(name in names for name in header)
-        assert [line.split()[0] for line in lines] == ["naive", "SSF"]
-        assert max(map(len, text.splitlines())) <= 120
 
 
 def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):

@@ -10,14 +10,12 @@ from mixtures import fixed_mixture
 
 from probewise.diagnosis import EffectFound, ParameterFound, Place, audit_plan_of_diagnosis, diagnose
 from probewise.diagnosis.advice import NextMeasurement
-from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.recordings import HalfPlane, Plan, Recording, Uniform, paper_plan, read_plan, shipped
+from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariates
 from probewise.report import diagnosis as page
-from probewise.report.covariates import axis_label, category_name_by_value, covariate_values, is_scan_along_line
+from probewise.report.covariates import category_name_by_value, covariate_values, is_scan_along_line
 from probewise.report.diagnosis_figures import rows_of_scan_changed_most
-from probewise.report.plots import heldout_gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels
@@ -100,14 +98,6 @@ def test_a_repair_that_does_not_predict_is_said_not_to():
     assert page._heldout_gain_in_words(0.1, 0.1).startswith("No better than before")
 
 
-def test_labels_carry_units():
-    recording = SimpleNamespace(plan=paper_plan())
-    found = SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())
-    assert axis_label(found, "level") == "predicted reading (LEGO units)"
-    assert axis_label(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
-    assert axis_label(found, "battery_mv") == "battery (mV)"
-
-
 def test_residuals_are_averaged_in_even_steps_with_their_chance():
     """Ten thousand readings of a step of two: the means stand at 0 and 2 in steps of the covariate."""
     x = np.linspace(0.0, 1.0, 10_000)
@@ -115,16 +105,6 @@ def test_residuals_are_averaged_in_even_steps_with_their_chance():
     np.testing.assert_allclose(np.diff(means.at), 1 / 24, rtol=0.01)
     np.testing.assert_allclose(means.before, 2.0 * (means.at > 0.5), atol=0.01)
     np.testing.assert_allclose(means.chance, 1.96 / np.sqrt(means.size))
-
-
-def test_a_window_is_a_step_of_its_own():
-    """Three readings of 55 stand out: averaged with their neighbours nobody would see them."""
-    x = np.arange(55.0)
-    residuals = np.where((x >= 25) & (x <= 27), -3.0, 0.0)
-    means = mean_residuals(x, residuals, None, sd=1.0, window=(25.0, 27.0))
-    (own,) = np.flatnonzero(means.at == 26.0)
-    assert (means.before[own], means.size[own]) == (-3.0, 3)
-    assert np.all(np.delete(means.before, own) == 0.0)
 
 
 @pytest.mark.slow
@@ -146,20 +126,6 @@ def test_the_band_of_chance_holds_ninety_five_of_a_hundred_means_after_a_fit():
     assert by_step.max() < 0.985
 
 
-def test_noise_that_remembers_widens_the_band():
-    """The variance of the mean of n values of AR(1) approaches (1 + rho) / (1 - rho) / n."""
-    x = np.arange(4800.0)
-    plain, lasting = (mean_residuals(x, 0 * x, None, sd=1.0, rho=rho) for rho in (0.0, 0.6))
-    np.testing.assert_allclose(lasting.chance / plain.chance, np.sqrt(1.6 / 0.4), rtol=0.02)
-
-
-def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
-    ax = heldout_gain_by_scan([(f"scan_{k}", float(k)) for k in range(40)], 19.5, 1.9)
-    lengths = [bar.get_width() for bar in ax.containers[0]]
-    np.testing.assert_allclose(lengths, [*range(39, 33, -1), *range(5, -1, -1)])
-    assert ax.get_yticklabels()[0].get_text() == "scan 39"
-
-
 def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
     plan = read_plan(shipped("concealed"))
     assert {name for rows, name in scans_of(plan) if not is_scan_along_line(plan, rows)} == {"quadrants"}
@@ -173,22 +139,8 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     assert not is_scan_along_line(plan, np.arange(1))
 
 
-def test_a_scan_whose_name_returns_is_shown_each_time():
-    plan = Plan.from_arrays(x_mm=[0, 1, 2] * 3, y_mm=0, patterns=HalfPlane(0.0, 0.0), unit="V", scan=list("aaabbbaaa"))
-    shown = covariates.view_along_scan(SimpleNamespace(recording=SimpleNamespace(plan=plan)), "a")
-    np.testing.assert_array_equal(shown.at, [0, 1, 2, np.nan, np.nan, np.nan, 0, 1, 2])
-
-
 def scans_of(plan):
     return [(rows, plan.scan_names[plan.scan[rows[0]]]) for rows in plan.rows_by_scan()]
-
-
-def test_readings_on_no_line_are_not_joined():
-    x, y = np.arange(4.0), np.array([10.0, 50.0, 20.0, 30.0])
-    for joined in (True, False):
-        axes = scan_with_residuals(x, y, [("as calibrated", y + 1)], joined=joined, label="time (s)", unit="V")
-        curve = next(line for line in axes[0].lines if line.get_label().startswith("predicted"))
-        assert (curve.get_linestyle() != "None") is joined
 
 
 def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatch):
@@ -210,25 +162,10 @@ def place_of(covariate, start):
     return Place(covariate, None, start, start + 1.0, 0.004, 4.0, *[np.zeros(0)] * 2, values=np.arange(3.0))
 
 
-def test_a_columns_values_are_no_categories_though_it_is_called_as_those_of_a_light_sensor():
-    words = Words(null="the oven", find_signal="", settles_nothing="", run="run", covariates={})
-    plan = SimpleNamespace(scan_names=("1", "2"))
-    found = SimpleNamespace(apparatus=SimpleNamespace(words=words), recording=SimpleNamespace(plan=plan))
-    for name in ("scan", "direction", "orientation"):
-        assert category_name_by_value(found, place_of(name, 0.0)) is None
-    assert category_name_by_value(found, place_of("run", 0.0)) == {0.0: "1", 1.0: "2"}
-
-
 def test_an_effect_that_is_there_twice_has_the_name_of_diagnosis_json_in_the_table():
     parameter = ParameterFound("amp", "V", 1.0, 0.1, (0.8, 1.2))
     twice = EffectFound("ambient_step~again", 0.9, 9.0, "a step", (parameter,))
     assert "(ambient_step)</td>" in page._effect_table([twice])
-
-
-def test_the_page_of_a_long_recording_counts_the_readings_that_were_diagnosed():
-    readings = np.append(np.full(4999, 7.0), np.nan)
-    recording = Recording.from_arrays(x_mm=np.arange(5000), y_mm=0, readings=readings, patterns=Uniform(0.5), unit="V")
-    assert page._n_readings_used(SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())) < 2600
 
 
 def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
@@ -250,11 +187,3 @@ def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
     assert " or " in one
     assert " or " not in other
     assert other.endswith("by 12 nats.")
-
-
-def test_a_range_far_narrower_than_all_values_is_one_number():
-    values = np.append(np.linspace(10.0, 60.0, 9), [57.636938104, 57.636938115])
-    place = dataclasses.replace(place_of("level", 0.0), start=57.636938104, end=57.636938115, values=values)
-    plan = SimpleNamespace(instrumentation=SimpleNamespace(unit="LEGO"))
-    found = SimpleNamespace(apparatus=LightSensorApparatus(), recording=SimpleNamespace(plan=plan))
-    assert "predicted reading, 57.64 LEGO units (p" in page._place_caption(found, place)

@@ -205,13 +205,3 @@ def test_drawing_on_given_axes_opens_no_figure():
     assert plt.get_fignums() == [sheet.number]
     plots.png(one, dpi=20)
     assert plt.get_fignums() == [sheet.number]
-
-
-@pytest.mark.slow
-def test_the_arms_reach_is_the_same_grey_in_both_drawings():
-    view = plots.playing_field(**field())
-    check = plots.reach_map(field()["utility"], X, Y, axis_mm=(524.0, 580.0))
-    assert view.get_facecolor() == check.get_facecolor()
-    for ax in (view, check):
-        image = ax.images[0].get_array()
-        assert np.ma.getmaskarray(image).tolist() == np.isnan(field()["utility"]).tolist()

@@ -5,8 +5,7 @@ import pytest
 from matplotlib.patches import Circle, Rectangle
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.errors import ParameterError
-from probewise.recordings import Recording, read_recording, shipped, two_way_plan
+from probewise.recordings import read_recording, shipped
 from probewise.report import plots
 from probewise.report.plots.apparatus import draw_sensor_face
 
@@ -53,35 +52,3 @@ def test_each_quadrant_holds_its_reading_and_its_corner(recording):
     texts = [text.get_text() for ax in axes.flat for text in ax.texts]
     assert [t for t in texts if t.startswith("(")] == ["(0, 0) mm", "(0, 0) mm", "(4, 4) mm", "(−4, 4) mm"]
     assert [float(t) for t in texts if not t.startswith("(")] == pytest.approx(recording.readings[-4:], abs=0.05)
-
-
-def test_patterns_that_a_recording_does_not_have_are_refused(recording):
-    edges = recording.take(np.arange(404))
-    with pytest.raises(ParameterError, match="quadrant"):
-        plots.quadrant_patterns(edges)
-    with pytest.raises(ParameterError, match="half_plane"):
-        plots.sensor_orientations(recording.take(np.arange(404, 408)))
-
-
-def two_models():
-    """Readings of a plan by one model, and another that is 2 units off within 6 mm of every edge."""
-    plan = two_way_plan()
-    after = np.full(len(plan), 30.0)
-    before = np.where((np.abs(plan.x_mm) < 6) & (plan.pattern == 0), 32.0, 30.0)
-    return Recording(plan, after), before, after
-
-
-def test_scans_that_the_repair_changes_are_drawn_on_the_same_axes():
-    recording, before, after = two_models()
-    axes = plots.residuals_by_scan(recording, before, after, most=8)
-    shown = [ax for ax in axes.flat if ax.get_visible()]
-    assert [ax.get_title(loc="left")[:4] for ax in shown] == ["edge"] * 8
-    assert len({ax.get_ylim() for ax in shown}) == 1
-
-
-@pytest.mark.parametrize("lego_scale", [False, True])
-def test_lego_units_stand_over_the_field_only_where_they_are_asked_for(lego_scale):
-    ax = plots.playing_field(np.ones((3, 4)), np.arange(4.0), np.arange(3.0), lego_scale=lego_scale)
-    assert [axis.get_xlabel() for axis in ax.child_axes if axis.get_xlabel()] == [
-        "LEGO distance units (8 mm)"
-    ] * lego_scale

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from probewise._words import count_with_noun
-from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, slideshow, table
+from probewise.report.html import Section, figure, page, paragraph, slideshow, table
 from probewise.report.words import number_text, number_unsigned_zero, probability_text
 
 
@@ -70,11 +70,6 @@ def test_a_page_needs_nothing_from_outside():
     assert 'name="viewport"' in made
 
 
-def test_markup_is_not_escaped_twice():
-    assert fragment(Markup("<b>x</b>"), "<") == "<b>x</b>&lt;"
-    assert element("td", "a", class_="number") == '<td class="number">a</td>'
-
-
 def test_numbers_are_written_as_people_read_them():
     assert number_text(-1.25, 1) == "−1.2"
     assert number_text(float("nan"), 1) == "–"
@@ -104,10 +99,3 @@ def test_a_slideshow_shows_its_last_picture_where_scripts_are_off():
     assert "<label hidden>" in made
     assert made.count("<script>") == 1
     assert "<script>" not in page("t", answer="a", key_figure=figure(PNG, "key"), sections=())
-
-
-def test_on_a_narrow_screen_a_picture_stays_large_enough_to_be_read():
-    """Drawn seven inches wide it is never shown narrower than nine tenths of that: it scrolls in its frame."""
-    assert "--least: 605px" in figure(png((770, 50), dpi=110), "seven inches")
-    style = page("t", answer="a", key_figure=figure(PNG, "k"), sections=[]).split("<style>")[1]
-    assert "min-width: var(--least" in style.partition("@media (max-width")[2]

@@ -12,7 +12,6 @@ from probewise.errors import ParameterError
 from probewise.nested import NestedResult, run
 from probewise.priors import Product, Uniform
 from probewise.report import plots
-from probewise.report.plots.nested import _centres_and_smoothed_density, _new_points_per_bar
 
 
 class Bell:
@@ -130,12 +129,6 @@ def test_a_parameter_that_does_not_vary_is_drawn_too(result):
     assert plots.png(plots.trace_plot(still), dpi=30).startswith(b"\x89PNG")
 
 
-def test_a_flat_posterior_stays_flat_up_to_the_priors_edge():
-    values = (np.arange(8000) + 0.5) / 8000
-    _, density = _centres_and_smoothed_density(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
-    assert density == pytest.approx(np.full(80, 1 / 80))
-
-
 def test_insertion_ranks_are_counted_against_a_band_of_all_bars(result):
     ax = plots.insertion_plot(result)
     bars = [p for p in ax.patches if p.get_width() < 0.5]
@@ -150,13 +143,6 @@ def test_insertion_ranks_are_counted_against_a_band_of_all_bars(result):
     assert left < 40
     assert binom.cdf(low - 1, n, 1 / n_bars) < 0.01 / n_bars
     assert "p = " in ax.get_title(loc="left")
-
-
-def test_ranks_are_spread_over_their_share_of_the_axis():
-    """One of three ranks in two bars: the first rank in the first bar, the middle one half in each."""
-    edges = np.array([0.0, 0.5, 1.0])
-    assert _new_points_per_bar(np.array([0]), np.array([2]), edges) == pytest.approx([1.0, 0.0])
-    assert _new_points_per_bar(np.array([1]), np.array([2]), edges) == pytest.approx([0.5, 0.5])
 
 
 def test_the_course_of_a_run_ends_at_its_evidence(result):

@@ -38,11 +38,3 @@ def test_a_value_without_a_renderer_shows_its_escaped_summary():
     assert Plain()._repr_html_() == "<pre>a &lt; b\nand more</pre>"
     assert repr(Plain()) == "<Plain: a < b>"
     assert render_html(3) == "<pre>3</pre>"
-
-
-def test_the_repr_of_a_result_is_one_short_line():
-    values = (run(Bell(), rng=np.random.default_rng(0), n_live=50), Recording(paper_plan(), np.linspace(10, 60, 408)))
-    for value in (*values, SSFField(np.ones((5, 5)), 1.0, (-2.0, -2.0))):
-        assert repr(value).startswith(f"<{type(value).__name__}")
-        assert "\n" not in repr(value)
-        assert len(repr(value)) < 200

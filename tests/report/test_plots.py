@@ -1,38 +1,16 @@
 """Figures show the data that they are given, and leave nothing behind."""
 
-import re
-
 import numpy as np
 import pytest
 
-from probewise.recordings import HalfPlane, Plan, Recording, paper_plan, read_recording, shipped
+from probewise.recordings import Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
-from probewise.report.plots.canvas import label_axes, legend_above, set_plain_tick_labels, stack_of_axes, svg
 from probewise.report.plots.readings import tracks_and_single_rows
-from probewise.sensor import SSFField
 
 
 @pytest.fixture(scope="module")
 def recording():
     return read_recording(shipped("paper"))
-
-
-def test_more_runs_than_colours_are_all_drawn():
-    widths = {f"run {k}": np.array([9.0, 4.0]) for k in range(10)}
-    assert len([line for line in plots.posterior_widths(widths).lines if line.get_marker() == "o"]) == 10
-    assert len(plots.information_gained(widths).lines) == 10
-
-
-def test_the_distance_from_an_edge_grows_towards_its_brighter_side():
-    edge = HalfPlane(0.0, 0.0, inside=0.0, outside=1.0)
-    plan = Plan.from_arrays(x_mm=np.arange(-3.0, 4.0), y_mm=np.zeros(7), patterns=edge, unit="V")
-    (track,), _ = tracks_and_single_rows(plan)
-    np.testing.assert_allclose(track.along_mm, -plan.x_mm[track.rows])
-
-
-def blob():
-    x = np.arange(-20.0, 21.0)
-    return SSFField(np.exp(-(x[None, :] ** 2) / 32 - x[:, None] ** 2 / 18), 1.0, (-20.0, -20.0))
 
 
 def test_the_papers_plan_has_four_lines_and_four_readings_alone():
@@ -80,41 +58,9 @@ def test_the_field_shows_readings_by_brightness_and_the_next_place():
     assert "mm" in ax.get_xlabel()
 
 
-def test_the_label_of_an_axis_whose_ticks_become_finer_in_the_layout_is_within_the_drawing():
-    ax = stack_of_axes([2.6])[0]
-    for name in ("mean, the model as calibrated", "one reading", "95 % of the means lie here by chance"):
-        ax.plot([-0.05, 0.07], [-0.005, 0.005], label=name)
-    label_axes(ax, x="u_v (V)", y="residual (V)")
-    set_plain_tick_labels(ax)
-    legend_above(ax)
-    drawn = svg(ax).decode()
-    found = re.search(r"<!-- residual \(V\) -->\s*<g transform=\"translate\(([0-9.]+)", drawn)
-    assert found is not None
-    assert float(found[1]) > 7.6  # the height of the text, which is turned by a right angle
-
-
-def test_a_long_label_of_a_bar_is_broken_into_lines_within_the_axes():
-    long = "a cubic term of x in the rate of v, noise that grows with the signal and an offset of u_v"
-    ax = plots.hypothesis_probabilities([f"{long} and {long}", "b", f"{long}, {long}"], [0.6, 0.3, 0.1])
-    ax.figure.canvas.draw()
-    frame = ax.figure.bbox
-    texts = [text.get_window_extent() for text in ax.texts]
-    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in texts)
-    bars = [bar.get_window_extent() for bar in ax.patches]
-    assert not any(box.overlaps(bar) for box in texts for bar in bars)
-
-
 @pytest.mark.slow
 def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     ax = plots.hypothesis_probabilities([str(k) for k in range(20)], np.full(20, 0.05), most=8)
     widths = [bar.get_width() for bar in ax.patches]
     assert len(widths) == 9
     assert sum(widths) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("repeats", [1, 2, 5])
-def test_many_long_names_above_a_single_round_leave_room_for_its_bar(repeats):
-    """Warnings are errors: matplotlib warns where a legend leaves its axes no width or no height."""
-    long = " and ".join(["noise that grows with the signal and an effect with a long name"] * repeats)
-    names = [f"{long}, number {k}" for k in range(9)]
-    assert plots.png(plots.probabilities_by_round({"round 1: 30 readings": dict.fromkeys(names, 1 / 9)}), dpi=30)

@@ -11,8 +11,8 @@ from matplotlib.backends.backend_pdf import PdfPages
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.errors import ParameterError
-from probewise.recordings import paper_plan, two_way_plan
-from probewise.recordings.patterns import HalfPlane, Image, Quadrant, Stripes, Uniform, where_white_in_words
+from probewise.recordings import paper_plan
+from probewise.recordings.patterns import Image, Stripes, Uniform
 from probewise.report.plots.sheets import sheets_pdf
 from probewise.report.sheets import (
     BOTTOM_MM,
@@ -23,7 +23,6 @@ from probewise.report.sheets import (
     field_sheet,
     marks_sheet,
     pattern_sheets,
-    points_of_lines,
     target_sheet,
     tiles_of,
 )
@@ -131,17 +130,6 @@ def test_every_cut_has_its_marks_in_the_margin():
                 assert len(hits) >= 2, (tile, axis, at)
 
 
-def test_a_sheet_is_as_large_as_its_readings_need():
-    plan = two_way_plan()
-    sheets = {sheet.name: sheet for sheet in pattern_sheets(plan.patterns, plan)}
-    assert (sheets["boundary"].low_mm, sheets["boundary"].high_mm) == ((-90.0, -40.0), (90.0, 40.0))
-    assert np.degrees(sheets["boundary"].orientations_rad) == pytest.approx([0, 90, 180, 270])
-    turned = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + 2 * np.pi * (plan.scan % 2))
-    again = pattern_sheets(plan.patterns, turned)
-    assert [sheet.orientations_rad for sheet in again] == [sheet.orientations_rad for sheet in sheets.values()]
-    assert set(sheets) == set(plan.pattern_names)
-
-
 def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
     picture = Image(np.linspace(0, 1, 20).reshape(4, 5), 10.0, (0.0, 0.0), "x.npy")
     sheets = pattern_sheets({"a": Stripes(0.3, 8.0, 0.5, 1.0), "b": picture, "c": Uniform(0.5)})
@@ -198,17 +186,6 @@ def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is
     assert side.low_mm[1] == 0.0  # the cut stands on the table
 
 
-def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
-    side, above = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
-    pages = pages_of(sheets_pdf([side, above], paper="a4", title="t"))
-    assert len(pages) == 1 + len(tiles_of(side, "a4")) + len(tiles_of(above, "a4"))
-    assert len(tiles_of(side, "a4")) == 4  # of six: two pages between the links are blank
-    beam = side.strokes_mm[0]
-    assert np.ptp(beam, axis=0) == pytest.approx([8.0, 358.0])
-    for _, paths in pages:
-        assert any(how == "S" and np.ptp(points, axis=0) == pytest.approx([100, 0], abs=0.01) for how, points in paths)
-
-
 def texts_of(figures, monkeypatch):
     """Texts of each page, with their places: those drawn while the PDF is made."""
     drawn = []
@@ -229,26 +206,6 @@ def test_the_cover_tells_of_the_origin_and_the_sensor_only_what_a_pattern_needs(
     ]
     assert ["arm record" in cover for cover in covers] == [True, False, False]
     assert ["several pages" in cover for cover in covers] == [False, True, False]
-
-
-def test_no_label_of_a_glue_strip_lies_over_a_line_of_the_jig(monkeypatch):
-    side, _ = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
-    labels = 0
-    for tile, texts in zip(tiles_of(side, "a4"), texts_of([side], monkeypatch)[1:], strict=True):
-        lines = tile.on_page_mm(points_of_lines(side))
-        for text in texts:
-            if text.get_text().endswith("lies here"):
-                labels += 1
-                half = (3.0, 12.0) if text.get_rotation() else (12.0, 3.0)
-                assert not (np.abs(lines - text.get_position()) < half).all(axis=1).any()
-    assert labels
-
-
-def test_words_say_which_side_is_white():
-    assert where_white_in_words(HalfPlane(0.0, 0.0)).startswith("white on the right, x > 0 mm")
-    assert where_white_in_words(HalfPlane(np.pi, 5.0)).startswith("white on the left, x < -5 mm")
-    assert where_white_in_words(HalfPlane(np.pi / 2, 3.0, 0.0, 1.0)) == "black on top, y > 3 mm, white elsewhere"
-    assert where_white_in_words(Quadrant((-4.0, 4.0), (-1, 1))).startswith("white above y = 4 mm and left of x = -4 mm")
 
 
 def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, capsys):

@@ -17,7 +17,7 @@ from probewise.calibration.about_peaks import (
     _StudentTDensity,
 )
 from probewise.calibration.coordinates import WholeFootprintCoordinates
-from probewise.calibration.peaks import _split, climb, starts_of_climbs
+from probewise.calibration.peaks import climb, starts_of_climbs
 from probewise.calibration.quick import (
     _NearPosterior,
     fit_orders_quickly,
@@ -56,22 +56,6 @@ def test_two_lobes_are_climbed(two_lobes: Recording) -> None:
     assert climbed(two_lobes, 2, 13)[1][0] > climbed(two_lobes, 1, 13)[1][0] + 50
     centres = climbed(two_lobes, 2, 13)[0][0, [1, 2, 7, 8]].reshape(2, 2)
     np.testing.assert_allclose(np.abs(centres), [[3.5, 2.0], [3.5, 2.0]], atol=0.4)
-
-
-def test_a_split_keeps_light_centre_and_covariance(recording: Recording) -> None:
-    rng = np.random.default_rng(10)
-    prior = default_prior(recording, 1)
-    theta = prior.from_unit_cube(rng.uniform(0.05, 0.95, (30, 8)))
-
-    def moments(rows: np.ndarray) -> np.ndarray:
-        g = rows[:, :-2].reshape(len(rows), -1, 6)
-        det = g[..., 3] * g[..., 4] - g[..., 5] ** 2
-        light = g[..., 0] / np.sqrt(det)
-        u, v = g[..., 1], g[..., 2]
-        second = [0.5 * g[..., 4] / det + u * u, 0.5 * g[..., 3] / det + v * v, -0.5 * g[..., 5] / det + u * v]
-        return np.stack([(light * part).sum(axis=1) for part in (np.ones_like(u), u, v, *second)], axis=1)
-
-    np.testing.assert_allclose(moments(_split(theta, rng)), moments(theta), rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("n", [1, 2])

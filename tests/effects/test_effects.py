@@ -9,12 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.findings import parameters_found
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior, LogHeavyTailedPrior
-from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
-from probewise.effects.noise import dropouts
+from probewise.effects.effect import sentence_from_samples
 from probewise.effects.optics import distinct_scan_lines
-from probewise.effects.reference import Origin, orientation_deg, sign_of_motion
+from probewise.effects.reference import Origin, orientation_deg
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
@@ -200,17 +198,6 @@ def test_a_heavy_tail_is_exact_at_both_ends():
     assert prior.log_prob(np.array([12.5]))[0] > -8
     assert LogHeavyTailedPrior(0.1).from_unit(np.array([0.5]))[0] == pytest.approx(1.0)
     np.testing.assert_allclose(LogHeavyTailedPrior(0.1).to_unit(np.array([-1.0, 0.0, 1.0])), [0.0, 0.0, 0.5])
-
-
-def test_a_wider_heavy_tailed_prior_reaches_farther_and_loses_little_density_near_zero():
-    plain, wide = HeavyTailedPrior(0.5), HeavyTailedPrior(0.5, largest=25_000.0)
-    u = np.array([0.01, 0.3, 0.5, 0.9, 0.9999])
-    np.testing.assert_allclose(wide.to_unit(wide.from_unit(u)), u, atol=1e-8)
-    z = np.concatenate([[0.0], np.geomspace(1e-6, 1e6, 4001)])
-    assert 2 * np.trapezoid(np.exp(wide.log_prob(z)), z) == pytest.approx(1.0, abs=1e-3)
-    assert wide.from_unit(np.array([1 - 1e-6]))[0] > 500 * plain.from_unit(np.array([1 - 1e-6]))[0]
-    lost = plain.log_prob(np.array([0.5])) - wide.log_prob(np.array([0.5]))
-    assert 0.0 < lost[0] < 1.0
 
 
 def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
@@ -494,19 +481,6 @@ def test_places_that_differ_in_the_last_digit_are_one_place():
     np.testing.assert_allclose([v.bank()[0, 0] for v in there], [v.bank()[0, 0] for v in here], atol=1e-12)
 
 
-def test_rest_is_rest_whatever_the_last_digit_of_a_place():
-    """Y wavers in its last digit while X goes forth and back; then nothing moves but last digits."""
-    y_mm = 0.3 + np.tile([0.0, np.spacing(0.3)], 20)
-    exact, x_mm = np.full(40, 0.3), np.append(np.arange(20.0), np.arange(20.0)[::-1])
-    moving, exactly = (plan_along(x_mm, y, np.repeat([0, 1], 20)) for y in (y_mm, exact))
-    np.testing.assert_array_equal(moving.direction_of_motion, exactly.direction_of_motion)
-    along_y = plan_along(y_mm, x_mm, np.repeat([0, 1], 20))
-    np.testing.assert_array_equal(sign_of_motion(along_y), np.repeat([1.0, -1.0], 20))
-    at_rest = Extent(0.0, 1.0, plan_along(exact, y_mm))
-    assert at_rest.length_mm == 1.0
-    assert VOCABULARY["ambient_gradient"].for_extent(at_rest) is None
-
-
 def test_times_that_differ_in_the_last_digit_are_one_time():
     plan = there_and_back()
     time_s = np.repeat([0.1, 0.2, 0.3], 2)
@@ -570,13 +544,6 @@ def test_nonlinearity_keeps_black_and_white():
     np.testing.assert_allclose(out, [[0.0, 0.0, 0.5, 1.0, 1.0]])
 
 
-def test_a_battery_that_is_not_known_changes_nothing():
-    effect = VOCABULARY["battery_sag"].for_extent(EXTENT)
-    for covariates in ({}, {"battery_mv": np.full(len(PLAN), np.nan)}):
-        plan = replace(PLAN, covariates=covariates)
-        np.testing.assert_allclose(effect.apply(np.full((1, len(PLAN)), 40.0), np.array([[0.1]]), plan), 40.0)
-
-
 def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():
     """At 8 V the gain would jump where the logging stops, and that jump would be the range of the voltages."""
     plan = plan_along(np.arange(8.0), np.zeros(8))
@@ -601,29 +568,6 @@ def test_the_extent_of_a_recording_is_its_range_length_and_duration():
         Extent.of(Recording(plan, np.full(6, np.nan)))
     with pytest.raises(ParameterError, match="low < high"):
         Extent(2.0, 2.0, plan)
-
-
-def test_the_extent_of_a_recording_does_not_depend_on_the_unit():
-    readings = np.array([1.0, 2.0, 5.0, np.nan, 3.0, 2.0])
-    spans = [Extent.of(Recording(there_and_back(), unit * readings)).span / unit for unit in (1e-9, 1.0, 1e9)]
-    np.testing.assert_allclose(spans, 4.0)
-    assert Extent.of(Recording(there_and_back(), np.zeros(6))).span == 1e-6
-
-
-def test_what_all_samples_have_in_common_is_written_as_it_is():
-    """The mean of 500 times 0.1 is not 0.1 in the last digit, and their sd not 0."""
-    samples = np.stack([np.linspace(0.02, 0.04, 500), np.full(500, 0.1)], axis=1)
-    assert samples.std(axis=0)[1] > 0
-    mean, sd = mean_and_sd_of_samples(samples)
-    assert (mean[1], sd[1]) == (0.1, 0.0)
-    assert (mean[0], sd[0]) == (samples.mean(axis=0)[0], samples.std(axis=0)[0])
-    in_volts = replace(PLAN, instrumentation=replace(PLAN.instrumentation, unit="V"))
-    lost = dropouts.for_extent(replace(EXTENT, plan=in_volts))
-    said = sentence_from_samples(lost, samples)
-    assert said == "readings are lost: 3.00 ± 0.58 % of them read 0.1 V, whatever the true value"
-    (share, value) = parameters_found(lost, samples, "V")
-    assert (value.mean, value.sd) == (0.1, 0.0)
-    assert share.sd == pytest.approx(sd[0])
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """The table of what a sensor reads of a disc, against the sensor model itself."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +17,6 @@ from probewise.inquiry import (
     TabulatedChain,
     UtilityInput,
     forecast_of,
-    utility_map,
 )
 from probewise.inquiry.forecast import MOST_LEVELS
 from probewise.scene import Circle, HypothesisScene, Rectangle
@@ -118,18 +116,6 @@ def test_the_information_of_the_table_is_that_of_asking(made):
     bits = InformationGain()(quick)
     np.testing.assert_allclose(bits, InformationGain()(slow), atol=0.01)
     assert bits.max() > 0.3
-
-
-def test_the_whole_map_of_3000_hypotheses_is_quick(made):
-    """Aim: 0.1 s of one core; three times that leaves room for a busy machine."""
-    utility_input = made.over_discs(made.chain(20), made.circles(3000))
-    utility_map(utility_input, InformationGain())
-    again = type(utility_input)(
-        **{k: v for k, v in vars(utility_input).items() if k in utility_input.__dataclass_fields__}
-    )
-    start = time.process_time()
-    utility_map(again, InformationGain())
-    assert time.process_time() - start < 0.3
 
 
 def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError
 from probewise.inquiry import Design, Designs, Grid
 
 SMALL = Grid(2.0, 1.0, 3, 2)
@@ -28,12 +28,6 @@ def test_the_default_is_one_reading_a_place():
     designs = Designs(SMALL)
     assert designs[4] == Design(1.0, 1.0)
     assert len(designs) == 6
-
-
-def test_repeats_cost_their_reading_time():
-    designs = Designs(SMALL, repeats=(1, 5))
-    cost = designs.cost_s(np.arange(6.0), 1.2).reshape(2, 6)
-    np.testing.assert_allclose(cost, [np.arange(6.0), np.arange(6.0) + 4.8])
 
 
 @pytest.mark.parametrize(
@@ -68,8 +62,3 @@ def test_the_places_of_a_plan_are_alternatives_without_a_direction():
 def test_a_grid_without_extent_is_refused(change):
     with pytest.raises(ParameterError):
         Grid(**change)
-
-
-def test_values_of_another_grid_are_refused():
-    with pytest.raises(ShapeError):
-        Grid().image(np.zeros(5))

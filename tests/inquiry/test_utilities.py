@@ -84,13 +84,6 @@ def test_information_about_a_label_leaves_the_rest_out(made):
     np.testing.assert_allclose(InformationAbout(label)(made.listed(APART)), [0.0, 0.0, 1.0], atol=1e-3)
 
 
-def test_information_about_everything_is_the_information(made):
-    table = np.random.default_rng(5).normal(0.0, 3.0, (16, 8))
-    utility_input = made.listed(table)
-    about = InformationAbout(ParameterValue("row", n_bins=16))(utility_input)
-    np.testing.assert_allclose(about, InformationGain()(utility_input), atol=1e-3)
-
-
 def test_information_about_a_parameter_is_never_more_than_about_all(made):
     utility_input = made.over_discs(made.chain(20), made.circles(400), grid=Grid(n_x=27, n_y=14))
     about = InformationAbout(ParameterValue("radius_mm"))(utility_input)
@@ -131,18 +124,9 @@ def test_readings_chosen_together_do_not_repeat_each_other(made):
     assert set(chosen) in ({0, 1}, {1, 2})
 
 
-def test_a_single_reading_chosen_together_is_the_best_one(made):
-    assert choose_several(made.listed(APART), 1, rng=np.random.default_rng(7)) == (2,)
-
-
 def test_a_reading_chosen_is_the_best_one_that_is_likely_not_to_be_missing(made):
     chance = np.array([1.0, 1.0, 1e-3])
     assert choose_several(made.listed(APART), 1, rng=np.random.default_rng(7), chance=chance) == (1,)
-
-
-def test_a_flat_map_says_so(made):
-    assert utility_map(made.listed([[3.0, 3.0], [3.0, 3.0]]), InformationGain()).is_flat
-    assert not utility_map(made.listed(APART), InformationGain()).is_flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,13 +196,6 @@ def test_four_readings_end_a_run_as_one_of_half_the_noise_does(made):
     np.testing.assert_allclose(
         _probability_of_ending(each, each.goal, designs), _probability_of_ending(near, near.goal, designs), atol=1e-9
     )
-
-
-def test_the_label_of_a_map_names_the_one_quantity_that_it_shows(made):
-    """Near the end the default utility shows a probability, before that bits; a colour bar carries one of them."""
-    near = narrow(made, Goal((2,), 5.0))
-    assert utility_map(near, Finishing()).label == "probability that a reading there ends the run"
-    assert utility_map(replace(near, goal=None), Finishing()).label == InformationGain().label
 
 
 def by_importance(made, utility_input, goal, design, n=4000):

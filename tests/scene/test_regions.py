@@ -79,14 +79,6 @@ def test_the_inner_pentagon_of_a_star_is_outside_by_the_even_odd_rule():
     assert area.sum() == pytest.approx(shoelace, rel=1e-9)
 
 
-def test_an_edge_traced_twice_bounds_nothing():
-    """A square with a whisker out and back: the whisker has the inside on neither side."""
-    vertices = np.array([[0.0, 0.0], [2.0, 0.0], [5.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-    region = PolygonRegion.from_even_odd_vertices(vertices)
-    assert region.edges_mm.shape[1] == 4
-    assert region.albedo(np.array([[1.0, 1.0], [3.0, 0.1]])).tolist() == [[1.0, 0.0]]
-
-
 def test_vertices_in_either_sense_make_the_same_polygon():
     corners = np.array([[[0.0, 0], [5, 0], [5, 3], [0, 3]]])
     points = np.random.default_rng(0).uniform(-2, 7, (100, 2))
@@ -102,13 +94,6 @@ def test_quadrant_and_half_plane_follow_the_format_at_the_edge():
     quadrant = region_of(kinds.Quadrant((0.0, 0.0), (1, -1)))
     assert half.albedo(np.array([[1.0, 0.0], [1.0001, 0.0]])).tolist() == [[0.0, 1.0]]
     assert quadrant.albedo(np.array([[1.0, -1.0], [1.0, 1.0], [0.0, -1.0]])).tolist() == [[1.0, 0.0, 0.0]]
-
-
-def test_inside_and_outside_albedo_are_kept():
-    region = region_of(kinds.Disc((0.0, 0.0), 5.0, inside=0.2, outside=0.9))
-    assert region.albedo(np.array([[0.0, 0.0], [9.0, 0.0]])).tolist() == [[0.2, 0.9]]
-    covered = region.coverage(np.array([[0.0, 0.0], [9.0, 0.0]]), 1.0, np.zeros(2))
-    assert covered == pytest.approx(np.array([[0.2, 0.9]]))
 
 
 def test_stripes_that_fill_the_field_or_none_of_it_have_no_edge():

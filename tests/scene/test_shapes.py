@@ -201,8 +201,3 @@ def test_parameters_outside_the_prior_have_no_density(shape):
     theta = draws(shape, 3)
     theta[:, -1] = -5.0
     assert np.isneginf(shape.prior.log_prob(theta)).all()
-
-
-def test_the_weights_of_shapes_may_be_an_array():
-    of = {"circle": Circle(), "rectangle": Rectangle()}
-    assert AnyOf(of, np.array([1.0, 3.0])).weights == AnyOf(of, (1.0, 3.0)).weights == (0.25, 0.75)

@@ -50,23 +50,6 @@ def test_the_sensor_may_be_learnt_along(explore, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "utility"),
-    [
-        ((), "Finishing(of=InformationGain(), least=0.25)"),
-        (("--utility", "entropy"), "ReadingEntropy(bin_width=1.0)"),
-        (("--utility", "about:radius_mm"), "InformationAbout(of=ParameterValue(name='radius_mm', n_bins=16))"),
-    ],
-)
-def test_the_journal_names_the_utility(explore, options, utility):
-    status, lines = explore("--max-readings", 1, *options)
-    assert status == 0
-    assert lines[0]["utility"] == utility
-    assert lines[0]["options"]["step"] == 1.0
-    assert lines[0]["options"]["reading_range"] == [1.0, 100.0]
-
-
-@pytest.mark.slow
 def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, monkeypatch, tmp_path):
     """The naive model left, as in the paper, whichever chooses; the run itself is the same as without."""
     drawn, quick = [], exploration.robot_views_by_model_png

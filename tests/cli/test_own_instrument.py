@@ -7,7 +7,6 @@ import re
 import numpy as np
 import pytest
 
-from probewise.arm import shipped_geometry_path
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
 from probewise.experiment import read_journal
@@ -173,27 +172,6 @@ def test_tasks_of_the_bench_that_need_the_lego_arm_say_so(words, message, arm_fi
     monkeypatch.chdir(tmp_path)
     assert run("arm", *words, "--arm", arm_file()) == 2
     assert re.search(message, capsys.readouterr().err)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("quick_frames")
-def test_a_run_is_not_resumed_with_another_geometry(sensor_file, tmp_path, capsys):
-    out, built = tmp_path / "out", shipped_geometry_path().read_text()
-    mine, other = tmp_path / "mine.toml", tmp_path / "other.toml"
-    mine.write_text(built)
-    other.write_text(built.replace("read_height_mm = 14 ", "read_height_mm = 15 "))
-    words = ["explore", "--sensor", sensor_file, "--out", out, "--quiet", "--max-readings"]
-    assert run(*words, 1, "--geometry", mine) == 0
-    assert run(*words, 2, "--geometry", other, "--resume") == 2
-    assert "another geometry of the arm" in capsys.readouterr().err
-    assert run(*words, 2, "--geometry", mine, "--resume") == 0
-    # A journal of an earlier version says nothing of the geometry.
-    journal = out / "journal.jsonl"
-    first, *rest = journal.read_text().splitlines(keepends=True)
-    settings = json.loads(first)
-    del settings["geometry_sha256"]
-    journal.write_text(json.dumps(settings) + "\n" + "".join(rest))
-    assert run(*words, 2, "--geometry", other, "--resume") == 0
 
 
 @pytest.mark.slow

@@ -40,8 +40,6 @@ FILES = {
     ),
     "no number at all": (("return p", 'return np.nan * data["t_s"]\n    return p'), "not finite at any of the"),
     "a prior without mass": (("(0, 10)", "(10, 10)"), "parameters['gain'] is (10, 10)"),
-    "a prior of nothing": (("(0, 10)", "()"), "parameters['gain'] is ()"),
-    "a run that the table lacks": (('"run"\n', '"pass"\n'), "column pass: no such column; the header has 'run', 't_s'"),
     "a reading that the table lacks": (('"temp_c"', '"temp"'), "reading is 'temp'; allowed: a column of the table"),
     "a name that is misspelt": (("\nparameters", "\nparameter"), "was parameter meant to be parameters?"),
     "an error at every place": (
@@ -51,24 +49,12 @@ FILES = {
         ('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'; allowed: a column that can be set: power_w",
     ),
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
-    "a zero that is no number": (('"sd": 0.05', '"zero": "0.5"'), "noise[\"zero\"] is '0.5'; allowed: a finite number"),
     "a zero that is NaN": (('"sd": 0.05', '"zero": float("nan")'), 'noise["zero"] is nan; allowed: a finite number'),
     "a range that ends at no number": (('"sd": 0.05', '"range": (0, "5")'), "noise[\"range\"] is (0, '5')"),
-    "a range that ends at NaN": (('"sd": 0.05', '"range": (float("nan"), None)'), 'noise["range"] is (nan, None)'),
-    "an sd that is a list": (('"sd": 0.05', '"sd": [0.05]'), 'noise["sd"] is [0.05]'),
-    "a negative sd of NumPy": (('"sd": 0.05', '"sd": np.int64(-1)'), 'noise["sd"] is'),
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "line 9: is no Python"),
-    "8,000 minus signs": (("noise =", f"sign = {8000 * '-'}1\nnoise ="), "too long or too deeply nested"),
     "100,000 pluses": (("noise =", f"sum = 1{100000 * '+1'}\nnoise ="), "too long or too deeply nested"),
-    "100,000 dots": (("noise =", f"name = a{100000 * '.a'}\nnoise ="), "too long or too deeply nested"),
     "an end": (("noise =", "raise BaseException('over')\nnoise ="), "line 7: stops with BaseException: over"),
-    "an exit": (("noise =", "raise GeneratorExit\nnoise ="), "line 7: stops with GeneratorExit; allowed"),
     "an error that cannot be shown": (("noise =", f"{MUTE}raise Mute\nnoise ="), "its message raises ValueError"),
-    "an end at every place": (("return p", "raise GeneratorExit\n    return p"), "10: simulate raises GeneratorExit;"),
-    "a mute error at every place": (
-        ("def simulate(p, data):", f"{MUTE}def simulate(p, data):\n    raise Mute"),
-        "simulate raises Mute: its message raises ValueError",
-    ),
     "a prior beyond floats": (("(0, 10)", "(0, 10**400)"), "OverflowError"),
     "a prior that cannot be shown": (
         ("noise =", "class Odd:\n    def __repr__(self): 1 / 0\nparameters['gain'] = Odd()\nnoise ="), "is a Odd",
@@ -121,13 +107,10 @@ def test_a_mistake_in_the_table_is_one_line(capsys, tmp_path, table, said):
 
 HEADER = FILE.partition("def simulate")[0]
 LAWS = {
-    **{
-        f"a state that starts at {start}": (
-            f'{HEADER}states = {{"temp_c": {start}}}\n\ndef rates(s, p, u):\n    return {{"temp_c": -s["temp_c"]}}\n',
-            "states['temp_c'] is ",
-        )
-        for start in ("None", "float('nan')", "[20.0, 21.0]")
-    },
+    "a state that starts nowhere": (
+        f'{HEADER}states = {{"temp_c": None}}\n\ndef rates(s, p, u):\n    return {{"temp_c": -s["temp_c"]}}\n',
+        "states['temp_c'] is ",
+    ),
     "another state": (
         law_whose_rates('return {"temp_c": p["gain"] * s["heat"]}'), "line 12: rates raises KeyError: 'heat'",
     ),

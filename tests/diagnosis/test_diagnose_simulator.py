@@ -17,7 +17,7 @@ from probewise.diagnosis.evidence import log_probability_effects_detectable
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.templates import templates_of_effect
-from probewise.systems import Law, Noise, Simulator, predict_system, table_for
+from probewise.systems import Noise, Simulator, predict_system, table_for
 
 _N, _SD, _STEP, _WAVE = 150, 0.1, 0.05, 0.25
 
@@ -84,48 +84,6 @@ def test_residuals_count_from_the_walk_and_the_lines_contain_it(diagnosis):
 
 MASS, VISCOUS, DRY, OFFSET = 95.0, 200.0, 20.0, -3.0  # kg, N s/m, N, N
 GAP, SD, N_ROWS, FINE = 0.05, 1e-4, 200, 1e-4  # s, m, rows, s
-
-
-@pytest.fixture(scope="module")
-def positioning():
-    """A drive with dry friction and an offset of its force, moved in a loop; small explicit steps."""
-    q = v = 0.0
-    time, force, position = GAP * np.arange(N_ROWS), [], []
-    for t in time:
-        wanted = 0.12 * math.sin(2 * math.pi * t / 5) + 0.05 * math.sin(2 * math.pi * t / 1.9)
-        push = 1500.0 * (wanted - q) - 100.0 * v
-        force.append(push)
-        position.append(q)
-        for _ in range(round(GAP / FINE)):
-            v += FINE * (push - VISCOUS * v - DRY * math.tanh(v / 1e-5) - OFFSET) / MASS
-            q += FINE * v
-    noise = np.random.default_rng(4).normal(0.0, SD, N_ROWS)
-    return {"t_s": time, "force_n": np.array(force), "q_m": np.array(position) + noise}
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-def test_friction_and_an_offset_are_found_in_a_positioning_system_that_runs_away_without_them(positioning):
-    bare = Simulator(
-        "q_m",
-        "m",
-        {"mass": ("log", 20, 500), "viscous": ("log", 20, 1000)},
-        law=Law(
-            {"q": 0.0, "v": 0.0},
-            lambda s, p, u: {"q": s["v"], "v": (u["force_n"] - p["viscous"] * s["v"]) / p["mass"]},
-        ),
-        time="t_s",
-    )
-    found = diagnose_system(bare, positioning, rng=np.random.default_rng(1))
-    # A constant term of the rate and an offset of the force are the same thing.
-    named = {effect.name: effect.parameters[0] for effect in found.effects}
-    leading = {name for hypothesis in found.hypotheses[:2] for name in hypothesis.effects}
-    assert leading == {"friction:v", "forcing:v", "input_offset:force_n"}
-    friction, offset = named["friction:v"], named["input_offset:force_n"]
-    assert friction.mean == pytest.approx(DRY / MASS, abs=4 * friction.sd)
-    assert offset.mean == pytest.approx(-OFFSET, abs=4 * offset.sd)
-    assert found.improvement.rms_before > 100 * SD
-    assert found.improvement.rms_after < 1.2 * SD
 
 
 N, SD_OF_IMPOSSIBLE = 50, 0.02
@@ -230,21 +188,6 @@ def test_a_walk_is_named_and_predicted_beyond_its_end():
 
 
 @pytest.mark.slow
-def test_runs_of_another_noise_are_named_and_a_run_that_was_not_seen_gets_one_like_theirs():
-    rng = np.random.default_rng(5)
-    loud = np.repeat([0.5, 1.0, 3.0, 0.5, 1.0, 3.0], _N_OF_NOISE // 6)
-    table = _table(0.1 * loud * rng.standard_normal(_N_OF_NOISE))
-    diagnosis = diagnose_system(_line(run="run"), table, rng=rng)
-    assert diagnosis.combination == ("noise_per_run",)
-    later = {name: np.append(values, 9.0 if name == "run" else values[-1]) for name, values in table.items()}
-    several = [predict_system(repaired_of(diagnosis), later, rng=np.random.default_rng(seed)).sd for seed in range(8)]
-    np.testing.assert_allclose([sd[100] for sd in several], 0.3, rtol=0.3)
-    np.testing.assert_allclose([sd[0] for sd in several], 0.05, rtol=0.3)
-    # Three sds of runs leave a heavy tail: a single draw of samples may have a mean far out.
-    assert 0.05 < np.median([sd[-1] for sd in several]) < 2.0
-
-
-@pytest.mark.slow
 def test_known_sds_are_noise_of_the_rows_and_no_outliers():
     """Without the column the loud readings are outliers; with it nothing is wrong."""
     rng = np.random.default_rng(6)
@@ -255,20 +198,6 @@ def test_known_sds_are_noise_of_the_rows_and_no_outliers():
     assert known.verdict == "clean"
     predicted = predict_system(repaired_of(known), {**table, "sigma_v": sigma}, rng=rng)
     np.testing.assert_allclose(predicted.sd, sigma, rtol=0.2)
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-def test_three_faults_of_the_noise_are_each_given_a_size():
-    rng = np.random.default_rng(7)
-    memory = np.zeros(_N_OF_NOISE)
-    for k in range(_N_OF_NOISE):
-        fresh = rng.standard_normal() * (8.0 if rng.random() < 0.06 else 1.0)
-        memory[k] = fresh + (0.6 * memory[k - 1] if k % (_N_OF_NOISE // 6) else 0.0)
-    table = _table(0.05 * memory * np.sqrt(1 + 20 * np.tile(np.linspace(0.0, 1.0, _N_OF_NOISE // 6), 6)))
-    diagnosis = diagnose_system(_line(run="run"), table, rng=rng)
-    assert set(diagnosis.combination) <= {"correlated_noise", "outliers", "signal_dependent_noise"}
-    assert all(np.isfinite(effect.size_lambda) for effect in diagnosis.effects)
 
 
 EPOCH = 1.7e9

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.special import gammaln, logsumexp
 
-from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.noise_law import (
     NoiseLaw,
     n_rows_since_previous_usable,
@@ -173,20 +172,3 @@ def test_the_memory_of_mixed_runs_is_along_each_run():
             np.hstack(own.take_entries(np.flatnonzero(alone)).templates),
         )
         np.testing.assert_array_equal(columns[scan == k], others)
-
-
-@pytest.mark.slow
-def test_correlated_noise_of_mixed_runs_is_found():
-    """Development seed; before, it was hidden: successive rows of the file are of different runs."""
-    rng = np.random.default_rng(7)
-    run, x = np.tile([0.0, 1.0, 2.0], 100), rng.normal(size=300)
-    table = {"run": run, "x": x, "y": 1.0 + 2.0 * x + 0.1 * _ar1(run, 0.7, rng)}
-    rows = np.argsort(run, kind="stable")
-    mixed, apart = (
-        diagnose_system(SIMULATOR, {k: v[at] for k, v in table.items()}, rng=np.random.default_rng(1))
-        for at in (np.arange(300), rows)
-    )
-    assert mixed.verdict == apart.verdict == "noise"
-    assert "correlated_noise" in mixed.noise.model
-    rho = [next(p.mean for p in d.noise.parameters if "rho" in p.name) for d in (mixed, apart)]
-    assert rho[0] == pytest.approx(rho[1], abs=0.02)

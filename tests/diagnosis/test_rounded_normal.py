@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from probewise.diagnosis import diagnose, diagnose_system
+from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.noise_law import NoiseLaw, RoundedNormal
 from probewise.diagnosis.noise_models import NoiseModel, rough_sd
@@ -218,23 +218,6 @@ def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise
     assert found.p_value > 0.01  # one test; 0.09 and more in twenty others
     sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
     assert sigma == pytest.approx(noise_sd, rel=0.5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("declared", [None, 0.2])
-def test_a_column_of_sds_beside_coarse_rounding_is_no_physics(declared):
-    """Readings of a tenth of the others' noise had as narrow a flat top as they, so far too narrow a one."""
-    rng, n = np.random.default_rng(1), 120
-    x, sd = np.sin(np.arange(n) / 11), np.where(rng.random(n) < 0.5, 0.015, 0.15)
-    noise = Noise(sd="sd") if declared is None else Noise(sd="sd", step=declared)
-    line = Simulator(
-        "y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t", noise=noise
-    )
-    readings = 0.2 * np.round((1 + 2 * x + sd * rng.standard_normal(n)) / 0.2)
-    table = {"t": np.arange(float(n)), "x": x, "sd": sd, "y": readings}
-    found = diagnose_system(line, table, rng=np.random.default_rng(1))
-    assert found.combination == (("quantisation",) if declared is None else ())
-    assert found.p_value > 0.05
 
 
 @pytest.mark.slow

@@ -18,16 +18,6 @@ def watched(small, other):
 
 
 @pytest.mark.slow
-def test_the_same_model_comes_to_believe_the_same(small):
-    """Two routes to one posterior: along the run's own choices, and by looking on; 600 samples each."""
-    own, other = watched(small, small.experiment(grid=COARSE))[-1]
-    assert other.mean == pytest.approx(own.mean, abs=6 * float(own.sd.max()) / np.sqrt(300))
-    assert other.log_z == pytest.approx(
-        own.log_z, abs=6 * np.hypot(own.posterior.log_z_error, other.posterior.log_z_error)
-    )
-
-
-@pytest.mark.slow
 def test_the_run_goes_its_way_whoever_looks_on(small):
     alone = list(steps_of(small))
     pairs = watched(small, small.experiment(grid=COARSE, blur_mm=0.0, doubt_p=0.0))

@@ -14,7 +14,7 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariates
 from probewise.report import diagnosis as page
-from probewise.report.covariates import category_name_by_value, covariate_values, is_scan_along_line
+from probewise.report.covariates import is_scan_along_line
 from probewise.report.diagnosis_figures import rows_of_scan_changed_most
 from probewise.report.residual_means import mean_residuals
 from probewise.scene import KnownScene
@@ -60,16 +60,6 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated, drawn):
 
 
 @pytest.mark.slow
-def test_every_place_has_its_covariate_row_by_row(saturated):
-    for place in saturated.where:
-        values = covariate_values(saturated, place)
-        rows = np.isfinite(values)
-        assert rows.any()
-        if place.start is not None and category_name_by_value(saturated, place) is None:
-            assert values[rows].min() <= place.start <= place.end <= values[rows].max()
-
-
-@pytest.mark.slow
 def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     """Its mean says nothing where the residual changes its sign within the scan."""
     plan, usable = saturated.recording.plan, saturated.recording.usable
@@ -79,18 +69,6 @@ def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     shown = page.figure_drawers(dataclasses.replace(saturated, where=(place,)))[place.figure_name]().decode()
     assert shown.count("<!-- one reading -->") == 2
     assert f"(mm), scan {scan}" in shown
-
-
-@pytest.mark.slow
-def test_scans_that_an_effect_is_bound_to_are_named(saturated, drawn):
-    bound = ParameterFound("scans", "scan", 5.5, 1.1, (4.0, 7.0))
-    effect = dataclasses.replace(
-        saturated.effects[0], probability=0.9, parameters=(bound,), scans=("edge_90_out", "edge_90_back")
-    )
-    found = dataclasses.replace(saturated, effects=(effect,))
-    html = page.page_html(found, drawn, source="some.csv", seed=1)
-    assert "edge_90_out, edge_90_back" in html
-    assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]
 
 
 def test_a_repair_that_does_not_predict_is_said_not_to():

@@ -87,14 +87,6 @@ def test_a_difference_of_two_columns_is_found_where_neither_column_explains_anyt
     assert _probability_of_both_columns(columns) > 0.9
 
 
-@pytest.mark.slow
-def test_it_is_found_where_a_walk_of_the_noise_hides_it_and_seven_other_columns_explain_more_alone():
-    rng = np.random.default_rng(4)
-    columns, own = _readings_and_columns(rng, slow=True, amplitude=0.05)
-    others = {f"column_{k}": own + np.cumsum(rng.normal(0, 0.12, N_ROWS)) for k in range(7)}
-    assert _probability_of_both_columns(columns | others) > 0.9
-
-
 N = 50
 NAME, PUSH = ("sensor_tilt",), ("arm_knock",)
 

@@ -25,13 +25,3 @@ def test_a_case_is_diagnosed_from_its_files_and_the_campaign_goes_on(tmp_path):
 def test_a_case_is_the_same_each_time():
     one, again = (run_system_case(Task(5, 0)) | {"cpu_s": 0.0} for _ in range(2))
     assert json.dumps(one) == json.dumps(again)
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-def test_a_slow_wave_is_not_left_to_a_walk_of_the_noise():
-    """A case that was `unknown` at .71: fitted beside a walk alone, a wave of a run and a half had no amplitude."""
-    found = run_system_case(Task(60353, 2))
-    assert found["truth"] == ["interference"]
-    assert found["hypotheses"][0][0] == ["interference"]
-    assert found["hypotheses"][0][1] > 0.9

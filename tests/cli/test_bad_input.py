@@ -93,7 +93,7 @@ def test_options_that_contradict_each_other_are_refused_before_any_work(
     assert says in refused(capsys, tmp_path / "out", *words, "--out", "out")
 
 
-@pytest.mark.parametrize("value", ["1" * 5000, "1e400", "0"], ids=lambda value: value[:6])
+@pytest.mark.parametrize("value", ["9" * 30, "1" * 5000, "0"], ids=lambda value: value[:6])
 @pytest.mark.parametrize(
     "words",
     [

@@ -54,6 +54,7 @@ FILES = {
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "line 9: is no Python"),
     "100,000 pluses": (("noise =", f"sum = 1{100000 * '+1'}\nnoise ="), "too long or too deeply nested"),
     "an end": (("noise =", "raise BaseException('over')\nnoise ="), "line 7: stops with BaseException: over"),
+    "an exit": (("noise =", "raise GeneratorExit\nnoise ="), "line 7: stops with GeneratorExit; allowed"),
     "an error that cannot be shown": (("noise =", f"{MUTE}raise Mute\nnoise ="), "its message raises ValueError"),
     "a prior beyond floats": (("(0, 10)", "(0, 10**400)"), "OverflowError"),
     "a prior that cannot be shown": (

@@ -10,6 +10,7 @@ import pytest
 
 from probewise.diagnosis import diagnose_system, fit_json, fit_simulator
 from probewise.diagnosis.diagnose_simulator import prepare_system
+from probewise.errors import ParameterError
 from probewise.systems import Noise, Simulator, table_for
 
 X = np.linspace(-1.0, 1.0, 60)
@@ -124,6 +125,13 @@ def test_the_noise_of_rounded_readings_has_the_rounding_in_it_whichever_way_they
         given = line(simulate=way, noise={"sd": 0.1, "step": 1.0})
         fit = fit_simulator(given, {"x": x, "y": readings}, rng=np.random.default_rng(1))
         assert np.median(fit.fitted.noise_sd) == pytest.approx(np.hypot(0.1, 1 / np.sqrt(12)), rel=0.1)
+
+
+def test_one_reading_more_than_parameters_is_enough():
+    fit = fit_simulator(line(), {"x": X[::25], "y": Y[::25]}, rng=np.random.default_rng(1))
+    assert fit.fitted.mode() == pytest.approx({"a": 1.0, "b": 2.0}, abs=0.3)
+    with pytest.raises(ParameterError, match="usable readings is 2; allowed: 3 or more in column y"):
+        fit_simulator(line(), {"x": X[:2], "y": Y[:2]}, rng=np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("n", [2, 3, 6, 11])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,6 +37,21 @@ def test_a_repair_that_predicts_the_same_changes_nothing():
 def test_what_samples_lack_is_left_open_in_its_share():
     marks = {"lag": np.array([False, False, True, False]), "step": np.array([True, True, True, False])}
     assert repair(marks).combination_shares == {("lag",): 0.5, (): 0.25, ("lag", "step"): 0.25}
+
+
+def test_a_model_with_a_formula_in_half_of_its_samples_is_not_said_to_lack_the_correction():
+    assert repair().not_in_model("repaired.json") == "repaired.json does not contain it"
+    formula = "formula:reading:y:x^2"
+    marks = {formula: np.array([True, False, True, False])}
+    own = repair(marks)
+    model = SimpleNamespace(absent=marks, effects=("lag", formula))
+    said = replace(own, model=model).not_in_model("repaired.json")
+    assert said == "of the samples in repaired.json, 50 % contain a formula for it instead"
+
+
+def test_what_is_corrected_row_by_row_is_not_called_repaired():
+    assert repair().after_in_words == "repaired"
+    assert replace(repair(), by_rows=True).after_in_words == "corrected in these readings"
 
 
 def test_what_is_carried_and_not_stated_is_said_of_the_samples_that_hold_it():

@@ -144,6 +144,7 @@ def test_two_columns_of_one_name_but_for_blanks_are_refused():
         ({"unit": None}, "unit is None; allowed: a text"),
         ({"x_mm": ["a", "b", "c"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [0, 1, 10**400]}, "x_mm is .*; allowed: numbers, in an array or a list"),
+        ({"x_mm": [[0], [1, 2], 3]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"readings": [0, 1, 1j]}, "readings is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [0, 1], "y_mm": [0, 1, 2]}, r"x_mm has shape \(2,\); allowed: \(3,\), one per reading"),
         ({"pattern": ["edge", None, "edge"]}, r"pattern\[1\] is None; allowed: a name in every row"),

@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -122,6 +123,13 @@ def test_the_page_of_a_search_gives_the_shape_with_its_errors_and_what_it_cost(r
     assert "95 % interval" in text
     assert "600" in text
     assert re.search(r"a circle with x [\d.]+ ± [\d.]+ mm", page)
+
+
+def test_widths_beside_a_result_that_counts_the_arms_error_say_that_they_lack_it(run):
+    assert "without the arm" not in exploration.steps_table(run)
+    last = replace(run.last, arm_error=SimpleNamespace(sd=np.ones(3)))
+    known = replace(run, steps=(*run.steps[:-1], last))
+    assert "widest sd without the arm&#x27;s own error (mm)" in exploration.steps_table(known)
 
 
 def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run):

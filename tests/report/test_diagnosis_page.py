@@ -14,7 +14,7 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariates
 from probewise.report import diagnosis as page
-from probewise.report.covariates import is_scan_along_line
+from probewise.report.covariates import axis_label, is_scan_along_line
 from probewise.report.diagnosis_figures import rows_of_scan_changed_most
 from probewise.report.residual_means import mean_residuals
 from probewise.scene import KnownScene
@@ -74,6 +74,14 @@ def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
 def test_a_repair_that_does_not_predict_is_said_not_to():
     assert page._heldout_gain_in_words(-1.0, 0.1).startswith("Worse than before")
     assert page._heldout_gain_in_words(0.1, 0.1).startswith("No better than before")
+
+
+def test_labels_carry_units():
+    recording = SimpleNamespace(plan=paper_plan())
+    found = SimpleNamespace(recording=recording, apparatus=LightSensorApparatus())
+    assert axis_label(found, "level") == "predicted reading (LEGO units)"
+    assert axis_label(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
+    assert axis_label(found, "battery_mv") == "battery (mV)"
 
 
 def test_residuals_are_averaged_in_even_steps_with_their_chance():
@@ -165,3 +173,11 @@ def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
     assert " or " in one
     assert " or " not in other
     assert other.endswith("by 12 nats.")
+
+
+def test_a_range_far_narrower_than_all_values_is_one_number():
+    values = np.append(np.linspace(10.0, 60.0, 9), [57.636938104, 57.636938115])
+    place = dataclasses.replace(place_of("level", 0.0), start=57.636938104, end=57.636938115, values=values)
+    plan = SimpleNamespace(instrumentation=SimpleNamespace(unit="LEGO"))
+    found = SimpleNamespace(apparatus=LightSensorApparatus(), recording=SimpleNamespace(plan=plan))
+    assert "predicted reading, 57.64 LEGO units (p" in page._place_caption(found, place)

@@ -1,10 +1,13 @@
 """Figures show the data that they are given, and leave nothing behind."""
 
+import re
+
 import numpy as np
 import pytest
 
 from probewise.recordings import Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
+from probewise.report.plots.canvas import label_axes, legend_above, set_plain_tick_labels, stack_of_axes, svg
 from probewise.report.plots.readings import tracks_and_single_rows
 
 
@@ -58,9 +61,41 @@ def test_the_field_shows_readings_by_brightness_and_the_next_place():
     assert "mm" in ax.get_xlabel()
 
 
+def test_the_label_of_an_axis_whose_ticks_become_finer_in_the_layout_is_within_the_drawing():
+    ax = stack_of_axes([2.6])[0]
+    for name in ("mean, the model as calibrated", "one reading", "95 % of the means lie here by chance"):
+        ax.plot([-0.05, 0.07], [-0.005, 0.005], label=name)
+    label_axes(ax, x="u_v (V)", y="residual (V)")
+    set_plain_tick_labels(ax)
+    legend_above(ax)
+    drawn = svg(ax).decode()
+    found = re.search(r"<!-- residual \(V\) -->\s*<g transform=\"translate\(([0-9.]+)", drawn)
+    assert found is not None
+    assert float(found[1]) > 7.6  # the height of the text, which is turned by a right angle
+
+
+def test_a_long_label_of_a_bar_is_broken_into_lines_within_the_axes():
+    long = "a cubic term of x in the rate of v, noise that grows with the signal and an offset of u_v"
+    ax = plots.hypothesis_probabilities([f"{long} and {long}", "b", f"{long}, {long}"], [0.6, 0.3, 0.1])
+    ax.figure.canvas.draw()
+    frame = ax.figure.bbox
+    texts = [text.get_window_extent() for text in ax.texts]
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in texts)
+    bars = [bar.get_window_extent() for bar in ax.patches]
+    assert not any(box.overlaps(bar) for box in texts for bar in bars)
+
+
 @pytest.mark.slow
 def test_probabilities_that_are_not_drawn_one_by_one_are_added_up():
     ax = plots.hypothesis_probabilities([str(k) for k in range(20)], np.full(20, 0.05), most=8)
     widths = [bar.get_width() for bar in ax.patches]
     assert len(widths) == 9
     assert sum(widths) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("repeats", [1, 2, 5])
+def test_many_long_names_above_a_single_round_leave_room_for_its_bar(repeats):
+    """Warnings are errors: matplotlib warns where a legend leaves its axes no width or no height."""
+    long = " and ".join(["noise that grows with the signal and an effect with a long name"] * repeats)
+    names = [f"{long}, number {k}" for k in range(9)]
+    assert plots.png(plots.probabilities_by_round({"round 1: 30 readings": dict.fromkeys(names, 1 / 9)}), dpi=30)

@@ -51,6 +51,11 @@ def test_every_axis_says_what_it_carries(figures):
         assert np.atleast_1d(drawing)[-1].get_xlabel(), name
 
 
+def test_readings_without_a_unit_have_no_empty_brackets():
+    ax = plots.mean_residuals_along(means(), label="time (s)", unit="")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "mean residual")
+
+
 @pytest.mark.slow
 def test_no_legend_lies_over_data(figures, images):
     for name, drawing in figures.items():
@@ -65,6 +70,13 @@ def test_no_legend_lies_over_data(figures, images):
 def test_the_same_drawing_gives_the_same_bytes():
     first, second = (plots.svg(plots.heldout_gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
     assert first == second
+
+
+@pytest.mark.parametrize(("window", "shaded"), [((2.0, 3.0), True), ((0.5, 9.5), False)])
+def test_only_a_part_of_the_axis_stands_out(window, shaded):
+    x = np.linspace(0.0, 10.0, 200)
+    ax = plots.mean_residuals_along(mean_residuals(x, np.sin(x), None, sd=1.0), label="X", unit="V", window=window)
+    assert ("stands out here" in ax.get_legend_handles_labels()[1]) is shaded
 
 
 def test_rounded_readings_lie_on_their_lattice(figures):

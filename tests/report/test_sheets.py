@@ -23,6 +23,7 @@ from probewise.report.sheets import (
     field_sheet,
     marks_sheet,
     pattern_sheets,
+    points_of_lines,
     target_sheet,
     tiles_of,
 )
@@ -206,6 +207,19 @@ def test_the_cover_tells_of_the_origin_and_the_sensor_only_what_a_pattern_needs(
     ]
     assert ["arm record" in cover for cover in covers] == [True, False, False]
     assert ["several pages" in cover for cover in covers] == [False, True, False]
+
+
+def test_no_label_of_a_glue_strip_lies_over_a_line_of_the_jig(monkeypatch):
+    side, _ = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
+    labels = 0
+    for tile, texts in zip(tiles_of(side, "a4"), texts_of([side], monkeypatch)[1:], strict=True):
+        lines = tile.on_page_mm(points_of_lines(side))
+        for text in texts:
+            if text.get_text().endswith("lies here"):
+                labels += 1
+                half = (3.0, 12.0) if text.get_rotation() else (12.0, 3.0)
+                assert not (np.abs(lines - text.get_position()) < half).all(axis=1).any()
+    assert labels
 
 
 def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, capsys):

@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 
 from probewise._words import unit_of_name
 from probewise.report.words import (
+    digits_of_range,
     interval_text,
+    range_text,
     value_and_interval_texts,
     value_with_error,
     words_without_unit,
@@ -41,6 +43,14 @@ def test_an_interval_is_written_to_the_third_figure_of_its_width():
     assert interval_text(-0.020431, 5.4e-06) == "−0.0204 to 0.0000"
     assert value_and_interval_texts(0.032489, 0.030724, 0.035694) == ("0.03249", "0.03072 to 0.03569")
     assert value_and_interval_texts(3.0, 3.0, 3.0) == ("3", "3")
+
+
+def test_ends_that_lie_close_together_are_written_with_the_digits_that_tell_them_apart():
+    assert range_text(10.0213, 10.5641) == "10.02 to 10.56"
+    assert range_text(36052.31, 36060.12) == "36052.3 to 36060.1"
+    assert range_text(1764127000.0, 1764128500.0) == "1.764127e+09 to 1.7641285e+09"
+    assert (range_text(50.0, 50.0 + 1e-14), range_text(0.0, 0.0)) == ("50", "0")
+    assert digits_of_range(9.80664, 9.80666, 5) == 7
 
 
 def test_a_parameters_unit_is_told_once():

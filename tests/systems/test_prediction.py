@@ -346,6 +346,14 @@ def test_later_rows_of_a_recorded_run_go_on_from_its_recorded_state(rows):
     assert (len(found.table), found.notes) == (len(part), ())
 
 
+def test_later_rows_are_said_to_start_again_where_the_model_has_no_recorded_rows():
+    model, whole = _decaying((), known=False)
+    found = predicted(model, whole.take(np.arange(20, 40)))
+    np.testing.assert_allclose(found.mean[0], 8.0)
+    assert "note: run a: started again at its first row here" in found.summary()
+    assert predicted(model, whole).notes == ()  # it begins at 0
+
+
 def test_an_infinite_reading_is_refused_with_its_row():
     """The table keeps a column with such a cell as text; its first cells are numbers all the same."""
     table = RunTable({"power_w": [1.0, 2.0, 3.0], "temp_c": ["20.1", "", "inf"]}, time=None, run=None)

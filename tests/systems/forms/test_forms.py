@@ -463,6 +463,17 @@ def test_a_fast_wave_in_times_that_come_in_clusters_is_tried_where_the_residuals
     assert not FORMS["interference"].suggested.size
 
 
+def test_what_a_parameter_jumps_by_has_its_unit():
+    def decay(p, u):
+        return p["gain"] * np.exp(-u["t_s"] / p["tau_s"])
+
+    forms = bind_forms(_about(_simulator(parameters={"tau_s": (1, 5), "gain": (0, 4)}, simulate=decay)))
+    said = forms["steps:tau_s"].sentence(np.array([-2.0, 3.0]), np.array([0.1, 0.2]))
+    assert said == "tau_s jumps by -2.00 ± 0.10 s at 3.00 ± 0.20 s and stays there"
+    said = forms["sensitivity:room_c"].sentence(np.array([0.5]), np.array([0.1]))
+    assert said == "y changes by 0.50 ± 0.10 V per °C of room_c"
+
+
 def test_a_jump_of_the_gain_may_go_back_as_a_block_of_rows_in_another_unit_does():
     form = FORMS["gain_step"]
     assert form.prior.names == ("a", "until_s", "at_s")

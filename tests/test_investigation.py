@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import sensor_of
 
 from probewise.arm import carry_out
-from probewise.calibration import FittedSensor, posterior_mean_ssf_field
+from probewise.calibration import posterior_mean_ssf_field
 from probewise.diagnosis import Hypothesis
 from probewise.errors import FileError, ParameterError
 from probewise.investigation import (
@@ -20,7 +21,6 @@ from probewise.investigation import (
     reason_if_settled,
 )
 from probewise.recordings import Instrumentation, Recording, paper_plan
-from probewise.sensor import mixture_parameter_names
 from probewise.world import World
 from probewise.world.concealed import backlash, lag, saturation
 from probewise.world.shipped import BLOB, true_world
@@ -139,14 +139,8 @@ def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to
     truth = np.array([1.0, 0.0, 1.5, inverse[0, 0], inverse[1, 1], inverse[0, 1], 10.0, 60.0])
     sd = np.array([0.0, 0.03, 0.03, 6e-4, 2e-3, 3e-4, 0.1, 0.1])
     samples = truth + sd * np.random.default_rng(1).standard_normal((500, 8))
-    sensor = FittedSensor(
-        names=(*mixture_parameter_names(1), "I_min", "I_max"),
-        samples=samples,
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.6),
-        field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
-        instrumentation=Instrumentation(unit="LEGO", height_mm=16.0),
-    )
+    field = posterior_mean_ssf_field(samples, 1, pixel_mm=0.5)
+    sensor = sensor_of(samples, field=field, instrumentation=Instrumentation(height_mm=16.0))
     world = World(gaussian_spot([BLOB]), height_mm=16.0, concealed=(backlash(1.0),))
 
     def record_at_20_mm(number, plan, asked):

@@ -7,14 +7,14 @@ import signal
 
 import numpy as np
 import pytest
+from hand_made import TRUTH, sensor_of
 
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.calibration import FittedSensor, write_sensor
+from probewise.calibration import write_sensor
 from probewise.cli import _bench, main
 from probewise.errors import LinkError
-from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
-from probewise.sensor import footprint_of, mean_ssf_field
+from probewise.recordings import paper_plan, read_recording, write_plan, write_recording
 
 DARK_COUNTS = 826  # 10 %
 
@@ -59,17 +59,8 @@ def plan_file(tmp_path):
 
 @pytest.fixture
 def sensor_file(tmp_path):
-    truth = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
-    axis = np.arange(-20.0, 20.5)
-    sensor = FittedSensor(
-        names=("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max"),
-        samples=truth + 1e-4 * np.random.default_rng(0).standard_normal((500, 8)),
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.6),
-        field=mean_ssf_field(footprint_of(truth[None, :6], 1), u_mm=axis, v_mm=axis),
-        instrumentation=Instrumentation(),
-    )
-    write_sensor(sensor, tmp_path / "sensor.json")
+    samples = TRUTH + 1e-4 * np.random.default_rng(0).standard_normal((500, 8))
+    write_sensor(sensor_of(samples), tmp_path / "sensor.json")
     return tmp_path / "sensor.json"
 
 

@@ -26,17 +26,8 @@ def _chain(plan: Plan) -> Chain:
 def _disc_plan() -> Plan:
     """A pattern, angles and scans that no calibration had."""
     x = np.linspace(-30, 30, 21)
-    return Plan(
-        x_mm=x,
-        y_mm=np.full(21, 4.0),
-        orientation_rad=np.linspace(0, 1, 21),
-        time_s=np.arange(21.0),
-        scan=np.zeros(21, dtype=int),
-        scan_names=("new",),
-        pattern=np.zeros(21, dtype=int),
-        pattern_names=("disc",),
-        patterns={"disc": Disc((0.0, 0.0), 15.0)},
-    )
+    patterns = {"disc": Disc((0.0, 0.0), 15.0)}
+    return Plan.from_arrays(x_mm=x, y_mm=4.0, orientation_rad=np.linspace(0, 1, 21), patterns=patterns, unit="LEGO")
 
 
 @pytest.mark.parametrize("plan", [paper_plan(), _disc_plan()])

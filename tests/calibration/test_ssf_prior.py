@@ -81,27 +81,6 @@ def test_rows_without_a_reading_say_nothing_of_what_the_scans_resolve(lost: str)
     assert scan_geometry(with_gaps) == scan_geometry(without)
 
 
-def test_scans_at_rest_say_nothing_of_what_the_others_resolve() -> None:
-    """Their places differ in the last digit alone, and they are more than the scans that move."""
-    moving = _edge_recording()
-    plan = moving.plan
-    rests = plan.scan >= 1
-    rest_mm = np.where(np.arange(len(plan)) % 2, 7.1, np.nextafter(7.1, 8.0))
-    some = replace(plan, x_mm=np.where(rests, rest_mm, plan.x_mm), y_mm=np.where(rests, 0.0, plan.y_mm))
-    g = scan_geometry(_recording(some, moving.readings))
-    assert (g.span_mm, g.step_mm) == (100.0, 1.0)
-
-
-def test_the_prior_scales_with_the_recording() -> None:
-    near, far = default_prior(_edge_recording(), 1), default_prior(_edge_recording(0.05), 1)
-    u = np.random.default_rng(4).random((100, 8))
-    theta, small = near.from_unit_cube(u), far.from_unit_cube(u)
-    np.testing.assert_allclose(small[:, 0], theta[:, 0])
-    np.testing.assert_allclose(small[:, 1:3], 0.05 * theta[:, 1:3])
-    np.testing.assert_allclose(small[:, 3:6], theta[:, 3:6] / 0.05**2)
-    np.testing.assert_allclose(small[:, 6:], theta[:, 6:], rtol=1e-6)
-
-
 def test_levels_are_scaled_from_grey_patterns_to_black_and_white() -> None:
     plan = paper_plan()
     grey = dict.fromkeys(plan.pattern_names, HalfPlane(0.0, 0.0, inside=0.8, outside=0.3))

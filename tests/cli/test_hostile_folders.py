@@ -170,9 +170,7 @@ def record(sensor_file, recording_file, out):
     return main(["arm", "record", str(recording_file), "--arm", "simulated", "--quiet", "--out", str(out)])
 
 
-@pytest.mark.parametrize(
-    "run", [predict, check, *(pytest.param(each, marks=pytest.mark.slow) for each in (sheets, record))]
-)
+@pytest.mark.parametrize("run", [predict, check])
 def test_a_pipe_and_a_device_are_written_to_a_link_is_followed_and_a_folder_is_refused(
     run, sensor_file, recording_file, tmp_path, capsys
 ):

@@ -12,7 +12,7 @@ from probewise.cli import main
 from probewise.cli._journal import find_journal_sensor_file
 from probewise.errors import FileError
 from probewise.experiment import experiment_for, sensor_entry
-from probewise.recordings import Disc, Instrumentation, Plan
+from probewise.recordings import Disc, Plan
 from probewise.scene import Circle, Field, KnownScene
 from probewise.sensor import Chain, FixedLevels
 
@@ -38,18 +38,12 @@ def journal_file(sensor_file, tmp_path):
     experiment = experiment_for(sensor, Circle(Field()), Field())
     x_mm, y_mm = poses()
     n = len(x_mm)
-    one = np.zeros(n, dtype=int)
-    plan = Plan(
+    plan = Plan.from_arrays(
         x_mm=x_mm,
         y_mm=y_mm,
-        orientation_rad=np.zeros(n),
         time_s=5.0 * np.arange(n),
-        scan=one,
-        scan_names=("field",),
-        pattern=one,
-        pattern_names=("field",),
         patterns={"field": Disc(CENTRE_MM, RADIUS_MM)},
-        instrumentation=Instrumentation(),
+        unit="LEGO",
     )
     ssf = fixed_mixture(sensor.samples.mean(axis=0)[:6])
     exact = Chain(ssf, FixedLevels(10.0, 60.0), KnownScene(plan.patterns)).predict(np.empty((1, 0)), plan)[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -27,8 +26,6 @@ from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.light_sensor import (
     LightSensorApparatus,
-    candidate_scans,
-    excerpts_of_scan,
     target_swaps,
 )
 from probewise.diagnosis.locate import Place
@@ -152,13 +149,6 @@ def laid(plan: Plan, scan: str) -> Plan:
     return next(command.plan for command in target_swaps(plan) if command.plan.scan_names == (scan,))
 
 
-def test_a_sheet_turned_half_round_swaps_black_and_white():
-    plan = paper_plan()
-    turned = laid(plan, "boundary_half_round_4")
-    at = np.searchsorted(plan.x_mm[:101], turned.x_mm)
-    np.testing.assert_allclose(read_by(turned), 1 - read_by(plan)[:101][at], atol=1e-12)
-
-
 @pytest.mark.parametrize("edge", [HalfPlane(0.0, 7.0), HalfPlane(0.4, -3.0, inside=0.2, outside=0.9)])
 def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
     """A round spot cannot tell that both were turned."""
@@ -170,29 +160,6 @@ def test_a_sheet_turned_by_a_quarter_reads_the_same_along_the_other_axis(edge):
     (pattern,) = (turned.patterns[name] for name, _ in turned.rows_by_pattern())
     assert pattern.normal_rad == pytest.approx(edge.normal_rad + math.pi / 2)
     np.testing.assert_allclose(read_by(turned), read_by(plan)[at], atol=1e-12)
-
-
-def test_short_scans_are_taken_whole():
-    plan = paper_plan().take(np.arange(45, 57))
-    assert {command.kind for command in candidate_scans(plan, strides=(2, 4))} == {
-        "repeat",
-        "reverse",
-        "respeed",
-        "rotate",
-    }
-    assert all(len(command.plan) == 12 for command in candidate_scans(plan, strides=(2, 4)))
-    tiny = replace(plan, x_mm=plan.x_mm / 10)
-    assert not any(re.search("by -?0 mm", command.description) for command in target_swaps(tiny))
-
-
-def test_excerpts_hold_the_step_and_every_so_many_readings():
-    scan = np.arange(100, 201)
-    level = np.where(np.arange(101) < 60, 10.0, 50.0) + np.linspace(0, 1, 101)
-    every, fourth, near = excerpts_of_scan(scan, strides=(1, 4), level=level)
-    assert len(every.rows) == 101
-    assert fourth.rows[:3].tolist() == [100, 104, 108]
-    assert near.rows[0] <= 159 < 160 <= near.rows[-1]
-    assert len(excerpts_of_scan(scan, strides=(1, 4), level=np.ones(101))) == 2  # nothing changes anywhere
 
 
 def searched(probabilities, plan, fits):

@@ -131,15 +131,6 @@ def test_a_commanded_height_widens_the_footprint_and_dims_the_signal():
     assert np.ptp(raised[middle]) == pytest.approx(np.ptp(usual[middle]) / 8, rel=0.02)
 
 
-def test_without_the_led_only_what_is_no_signal_is_read():
-    plan = paper_plan().take(np.arange(101))
-    dark = replace(plan, covariates={"led": np.r_[np.zeros(50), np.full(51, np.nan)]})
-    chain = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
-    usual, unlit = (chain.predict(np.empty((1, 0)), p)[0] for p in (plan, dark))
-    assert (unlit[:50] == 10.0).all()
-    np.testing.assert_array_equal(unlit[50:], usual[50:])
-
-
 def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
     plan = thinned(two_way_plan(), 8)
     names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
@@ -149,22 +140,3 @@ def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
     audit = audit_plan(plan, sensor=sensor, effects={"backlash": VOCABULARY["backlash"]})
     assert audit.effects[0].detectability == "fine"
     assert "noise 0.47 LEGO" in audit.assumed
-
-
-@pytest.mark.parametrize("calibrated", [False, True])
-def test_an_audit_does_not_depend_on_the_unit_of_the_readings(calibrated):
-    """A photodiode of 10 to 60 pA, in picoamperes and in amperes."""
-    names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
-    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 10.0, 60.0])
-    samples = theta * (1 + 1e-3 * np.random.default_rng(0).standard_normal((500, 8)))
-    shares = []
-    for unit in (1.0, 1e-12):
-        plan = thinned(two_way_plan(), 8)
-        plan = replace(plan, instrumentation=replace(plan.instrumentation, min=0.0, max=100 * unit, step=None))
-        in_unit = SimpleNamespace(names=names, samples=samples * np.array([1.0] * 6 + [unit] * 2))
-        audit = audit_plan(plan, sensor=in_unit if calibrated else None, effects=TWO)
-        shares.append([effect.share for effect in audit.effects])
-        assert (
-            f"noise {(0.5 if calibrated else 0.8) * unit:.3g} " in audit.assumed
-        )  # a hundredth of the span between the levels
-    np.testing.assert_allclose(shares[1], shares[0], rtol=1e-4)

@@ -121,13 +121,6 @@ def test_the_repaired_model_is_mixed_by_the_probabilities_of_the_verdict():
     assert by_mean == pytest.approx({("lag",): 0.75, ("drift",): 0.1875, (): 0.0625})
 
 
-def test_a_users_own_effect_is_mixed_in_only_where_the_best_has_it():
-    said = {(("lag",), ()): 0.6, (("drift",), ()): 0.4}
-    cached, fits = samples(said, own=frozenset({"drift"}))
-    assert ("drift",) not in cached.compatible_probabilities(fits[0, ("lag",)])
-    assert cached.compatible_probabilities(fits[0, ("drift",)])["drift",] == pytest.approx(0.4)
-
-
 _DIAGNOSIS_OF_EQUAL_RIVALS = """
 import numpy as np
 from probewise.diagnosis import diagnose_system, repaired_of

@@ -104,18 +104,6 @@ def test_medians_and_sds_are_those_of_a_long_chain(name):
     np.testing.assert_allclose(found.samples.std(axis=0) / certified, sd, rtol=0.15)  # some have heavy tails
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-9])
-def test_the_noise_is_in_the_unit_of_the_readings(scale):
-    """And so small that nothing but the unit makes it so: readings in amperes may have noise of a picoampere."""
-    simulator = Simulator(
-        "y", "A", {"a": ("normal", 0, 3 * scale), "b": ("normal", 0, 3 * scale)},
-        simulate=lambda p, data: p["a"] + p["b"] * data["x"], noise={"sd": 1e-4 * scale},
-    )  # fmt: skip
-    readings = scale * (1 + 2 * X + 1e-4 * np.random.default_rng(2).standard_normal(60))
-    found = fit_simulator(simulator, {"x": X, "y": readings}, rng=np.random.default_rng(1)).fitted
-    assert np.median(found.noise_sd) / scale == pytest.approx(1e-4, rel=0.3)
-
-
 @pytest.mark.slow
 def test_the_noise_of_rounded_readings_has_the_rounding_in_it_whichever_way_they_are_fitted():
     """Sd 0.1 and rounded to whole numbers: by quadrature 0.1 and 1 / sqrt(12) add up to 0.305."""

@@ -77,11 +77,3 @@ def test_a_part_held_out_of_noise_with_memory_has_its_density_given_the_rest(kin
     )
     alone = predictive_log_densities(law, out, readings, slopes, mean, spread, sigma**2, sequential=False)
     np.testing.assert_allclose(alone, -0.5 * (np.log(2 * np.pi * variance) + left**2 / variance), rtol=1e-6)
-
-
-def test_what_comes_next_is_held_out_alone():
-    """The readings numbered -1 are never held out; seven readings are too few."""
-    part = np.where(np.arange(40) < 32, -1, 0)
-    held = mean_gain_over_parts(part, lambda out: np.full(out.sum(), 0.25), ("the last fifth",))
-    assert (held.per_reading, held.n_readings, held.by_scan) == (0.25, 8, (("the last fifth", 0.25),))
-    assert mean_gain_over_parts(part[:-1], lambda out: np.ones(out.sum())).n_readings == 0

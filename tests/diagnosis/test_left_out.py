@@ -14,13 +14,12 @@ from probewise.diagnosis.diagnose_simulator import prepare_system, recording_fro
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
-from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent
 from probewise.effects.noise import Dropouts
 from probewise.errors import ParameterError
-from probewise.systems import FittedSystem, RunTable, Simulator, System, predict_system, table_for
+from probewise.systems import RunTable, Simulator, System, predict_system, table_for
 
 TRUE = {"tau_s": 40.0, "gain": 55.0, "start_c": 20.0}
 OVEN = Simulator(
@@ -192,34 +191,12 @@ def test_a_prediction_beyond_an_end_is_limited_unless_a_reading_within_was_recor
     np.testing.assert_allclose(predicted, [[expected, BACK + FULL / 4]])
 
 
-def test_a_predicted_mean_is_within_the_range_and_a_reading_at_its_end_is_sure_there():
-    samples = np.tile(TRUE_LIMITED, (500, 1))
-    model = FittedSystem(LAMP, ("full", "back", "expo"), samples, np.full(500, SD))
-    table = RunTable({"d_m": np.array([0.8, 1.0, 2.0]), "lux": np.array([HIGH, 700.0, 320.0])})
-    found = predict_system(model, table, rng=np.random.default_rng(1))
-    np.testing.assert_allclose(found.mean, [HIGH, HIGH, BACK + FULL / 4])
-    np.testing.assert_allclose(found.log_density[0], 0.0, atol=1e-9)
-    assert found.log_density[1] < -1000
-    assert (found.sd > 0).all()
-
-
 def test_a_reading_half_a_step_beyond_an_end_is_at_it_and_a_farther_one_is_an_error_code():
     lamp = replace(LAMP, noise={"range": (0, HIGH), "step": 1.0})
     table = RunTable({"d_m": np.arange(1.0, 6.0), "lux": np.array([HIGH, 1000.4, 999.4, 1001.0, 9999.0])})
     recording = recording_from_table(lamp, table)
     assert recording.usable.tolist() == [True, True, True, False, False]
     assert recording.censored.tolist() == [True, True, False, False, False]
-
-
-@pytest.mark.parametrize("carry", [0.0, 0.5], ids=["white", "correlated"])
-def test_a_held_out_reading_at_an_end_gains_nothing_by_another_noise(carry):
-    """Beyond the end the probability to read it is 1 whatever the noise."""
-    prepared, found, law = _fitted(LAMP, _lamp())
-    law = replace(law, carry=np.where(law.censored | np.append(True, law.censored[:-1]), 0.0, carry))
-    with_tail = replace(law, share=0.2, times=5.0)
-    parts = (found.residuals == 0).astype(np.int64), ("others", "at the end")
-    gain = held_out_gain(found, found, prepared.recording, with_tail, parts, law_of_null=law)
-    assert abs(dict(gain.by_scan)["at the end"]) < 1e-12
 
 
 def test_a_walk_is_no_explanation_of_readings_at_an_end_that_the_simulator_does_not_predict_there():

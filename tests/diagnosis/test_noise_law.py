@@ -15,7 +15,7 @@ from scipy.stats import norm
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit
-from probewise.diagnosis.noise_law import NoiseLaw, Tail, white_noise
+from probewise.diagnosis.noise_law import NoiseLaw, Tail
 from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value
 from probewise.effects import Extent
 from probewise.effects.noise import correlated_noise, drifting_noise, dropouts, outliers, signal_dependent_noise
@@ -51,18 +51,6 @@ def test_the_misfit_is_minus_the_log_density(share, times):
     found = heavy(share, times).minus_log_likelihood(z, sigma) + 25 * math.log(2 * math.pi)
     wanted = -np.sum(log_mixture(z / sigma, share, times) - np.log(sigma), axis=0)
     np.testing.assert_allclose(found, wanted)
-
-
-def test_a_tail_that_is_not_there_is_none():
-    """With the floor of the scale too: white and nearly white noise are to have the same evidence."""
-    z = np.random.default_rng(2).normal(size=(50, 2))
-    thin, none = heavy(1e-12, 3.0), white_noise(50)
-    for floor in (0.0, 3.0):
-        bounded, sigma = thin.with_least_sigma(floor), none.with_least_sigma(floor).likeliest_sigma(z)
-        np.testing.assert_allclose(bounded.likeliest_sigma(z), sigma, rtol=1e-6)
-        np.testing.assert_allclose(
-            bounded.minus_log_likelihood(z, sigma), none.minus_log_likelihood(z, sigma), rtol=1e-6
-        )
 
 
 @pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])

@@ -14,7 +14,6 @@ from scipy.stats import multivariate_normal
 from probewise.diagnosis.held_out import predictive_log_densities
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import innovations_given_rest, walk_given_readings, with_known_wide_readings
-from probewise.diagnosis.outlying import outlier_probabilities
 
 _N = 40
 
@@ -145,23 +144,6 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
         wanted, wide = _by_enumeration(law, residuals, float(sigma[0]))
         assert log_density - known.half_log_det() + known.log_extra == pytest.approx(wanted, abs=0.06)
         np.testing.assert_allclose(known.wide, wide, atol=0.05)
-
-
-def test_of_spikes_on_a_walk_each_is_one_reading_and_not_its_neighbours():
-    rng = np.random.default_rng(1)
-    n = 200
-    spikes = np.zeros(n)
-    spikes[[20, 21, 90, 150]] = [25.0, 30.0, -25.0, 40.0]
-    residuals = np.cumsum(0.6 * rng.normal(size=n)) + rng.normal(size=n) + spikes
-    law = with_known_wide_readings(_law(0.03, 20.0, 0.6, np.ones(n)), residuals)
-    np.testing.assert_array_equal(np.flatnonzero(outlier_probabilities(residuals, law) > 0.5), np.flatnonzero(spikes))
-    whitened = law(residuals)
-    assert float(law.likeliest_sigma(whitened[:, None])[0]) == pytest.approx(1.0, abs=0.2)  # 4 sds: 4 / sqrt(2 n)
-    assert np.abs(whitened).max() < 5
-    without = law.without_tail_or_rounding()
-    np.testing.assert_allclose(without.sd, 1.0)
-    part = np.arange(n) < 30
-    np.testing.assert_array_equal(law.take_readings(part).wide, law.wide[part])
 
 
 @pytest.mark.parametrize("far", [1e200, np.inf, np.nan])

@@ -17,10 +17,8 @@ from probewise.diagnosis.noise_law import (
     white_noise,
 )
 from probewise.diagnosis.noise_models import NoiseModel
-from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
-from probewise.effects.noise import correlated_noise, noise_of_runs, random_walk
-from probewise.effects.noise_distribution import FittedReadings, reading_variance
-from probewise.sensor import NoiseParameters
+from probewise.effects.noise import CorrelatedNoise, NoisePerRun
+from probewise.effects.noise_distribution import FittedReadings
 from probewise.systems import RunTable, Simulator, as_recording
 
 
@@ -37,15 +35,6 @@ def test_a_walk_is_whitened_as_the_root_of_its_covariance_does():
     exact = np.linalg.solve(np.linalg.cholesky(covariance), columns[~lost])
     np.testing.assert_allclose((law(columns) ** 2).sum(axis=0), (exact**2).sum(axis=0))
     assert law.half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
-
-
-def test_draws_of_a_walk_scatter_as_it_says():
-    level = replace(
-        random_walk().apply(NoiseParameters(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)),
-    )
-    white, steps = np.random.default_rng(3).standard_normal((2, 2000, 50))
-    draws = level.sd * (white + level.walk * np.cumsum(steps, axis=1))
-    np.testing.assert_allclose(draws.var(axis=0), reading_variance(level)[0], rtol=5 * math.sqrt(2 / 2000))
 
 
 def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
@@ -153,22 +142,3 @@ def test_without_the_first_reading_of_a_run_the_next_is_its_first(left_out):
     for law, at in ((mixed, np.argsort(order)), (apart, np.arange(len(order)))):
         taken = law.take_readings(kept[at])
         assert -0.5 * np.sum(taken(r[at][kept[at]]) ** 2) - taken.half_log_det() == pytest.approx(expected)
-
-
-def test_the_memory_of_mixed_runs_is_along_each_run():
-    recording = _recording()
-    order = order_by_scan(recording)
-    scan = recording.plan.scan[recording.usable]
-    signal = np.abs(np.random.default_rng(6).normal(size=len(order)))
-    mixed = bank_of_unknown_effects((), signal, signal, scan)
-    apart = bank_of_unknown_effects((), signal[order], signal[order], scan[order])
-    np.testing.assert_array_equal(np.hstack(mixed.templates)[order], np.hstack(apart.templates))
-    each = [bank_of_unknown_effects((), *(2 * [signal[scan == k]]), np.zeros(np.sum(scan == k), int)) for k in range(4)]
-    for k, own in enumerate(each):  # route two: the memory of each run, alone in its table
-        there = [label == "what was seen before" for label in mixed.labels]
-        alone = [label == "what was seen before" for label in own.labels]
-        columns, others = (
-            np.hstack(mixed.take_entries(np.flatnonzero(there)).templates),
-            np.hstack(own.take_entries(np.flatnonzero(alone)).templates),
-        )
-        np.testing.assert_array_equal(columns[scan == k], others)

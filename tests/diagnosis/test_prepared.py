@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from function_null import FunctionNull
+from hand_made import sensor_of
 
-from probewise.calibration import FittedSensor, predict
-from probewise.diagnosis import SensorAndShape, audit_plan, diagnose, findings
+from probewise.calibration import predict
+from probewise.diagnosis import SensorAndShape, audit_plan, diagnose
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import positions_in_stretches, prepare, rows_to_diagnose
 from probewise.diagnosis.samples import ModelSamples
-from probewise.diagnosis.verdict import Hypothesis
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import Normal, Product
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, paper_plan
 from probewise.report.covariates import covariate_values
 from probewise.scene import Circle
-from probewise.sensor import SSFField, mixture_parameter_names
 
 SENSOR: Apparatus = LightSensorApparatus()
 RNG = np.random.default_rng(4)
@@ -67,16 +65,10 @@ def test_too_little_is_few_readings_or_equal_ones():
 
 def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
     """As readings of the calibration's height that command it; the plan itself stays as it was declared."""
-    names, theta = (
-        (*mixture_parameter_names(1), "I_min", "I_max"),
-        np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0]),
-    )
-    sensor = FittedSensor(
-        names=names,
-        samples=theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8)),
-        n_gaussians=1,
+    theta = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
+    sensor = sensor_of(
+        theta + 1e-3 * np.random.default_rng(0).standard_normal((500, 8)),
         noise_sd=np.full(500, 0.5),
-        field=SSFField(np.ones((1, 1)), 1.0, (0.0, 0.0)),
         instrumentation=replace(paper_plan().instrumentation, height_mm=16.0),
     )
     whole = recording()
@@ -120,32 +112,14 @@ def test_a_sensor_of_another_height_reads_the_plan_at_the_height_it_declares():
 
 def long_recording(n_scans: int, per_scan: int) -> Recording:
     n = n_scans * per_scan
-    plan = Plan(
+    plan = Plan.from_arrays(
         x_mm=np.tile(np.linspace(-50, 50, per_scan), n_scans),
-        y_mm=np.zeros(n),
-        orientation_rad=np.zeros(n),
-        time_s=np.arange(n, dtype=float),
-        scan=np.repeat(np.arange(n_scans), per_scan),
-        scan_names=tuple(f"s{k}" for k in range(n_scans)),
-        pattern=np.zeros(n),
-        pattern_names=("edge",),
+        y_mm=0.0,
+        scan=[f"s{k // per_scan}" for k in range(n)],
         patterns={"edge": HalfPlane(0.0, 0.0)},
+        unit="LEGO",
     )
     return Recording(plan, np.sin(plan.x_mm))
-
-
-def test_scans_of_an_effect_have_their_numbers_in_the_whole_recording(monkeypatch):
-    prepared = prepare(long_recording(100, 40), apparatus=LightSensorApparatus())
-    assert prepared.is_thinned
-    last = next(e for e in prepared.effects["scan_angle_error"].variants() if e.scans == ("s99",))
-    samples = SimpleNamespace(effects=("scan_angle_error",), effect_samples=lambda name: np.full((500, 1), 2.0))
-    best = SimpleNamespace(fit=SimpleNamespace(found=SimpleNamespace(model=SimpleNamespace(effects=(last,)))), noise=())
-    monkeypatch.setattr(findings, "_lambda_of", lambda *_: 9.0)
-    hypotheses = (Hypothesis(("scan_angle_error",), 1.0),)
-    searched = SimpleNamespace(prepared=prepared)
-    (found,) = findings.effects_found(searched, hypotheses, best, samples, rng=np.random.default_rng(0))
-    assert found.parameters[-1].name == "scans"
-    assert found.parameters[-1].interval95 == (99.0, 99.0)
 
 
 def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_their_own_numbers():
@@ -166,18 +140,6 @@ def test_places_of_a_thinned_recording_are_drawn_over_all_of_it_and_scans_have_t
     np.testing.assert_array_equal(covariate_values(found, scan)[rows], whole.plan.scan[rows])
     assert np.isfinite(covariate_values(found, scan)).sum() == len(rows)
     np.testing.assert_array_equal(scan.curve_at, np.unique(whole.plan.scan[rows]))
-
-
-@pytest.mark.parametrize("n", [2401, 3600, 4800, 9600, 19_200, 100_003])
-def test_a_table_that_repeats_itself_is_seen_at_all_hours(n):
-    """Within a factor of two of the mean at each hour, in each half of the table."""
-    chosen = positions_in_stretches(np.zeros(n, dtype=np.int64), 2400)
-    assert len(chosen) == 2400
-    for half in (chosen[:1200], chosen[1200:]):
-        counts = np.bincount(half % 24, minlength=24)
-        assert 25 <= counts.min() <= counts.max() <= 100
-    assert np.mean(np.diff(chosen) == 1) > 0.83  # stretches of six
-    np.testing.assert_allclose(chosen, np.linspace(0, n - 1, 2400), atol=0.03 * n)  # over the whole table
 
 
 @pytest.mark.parametrize("interleaved", [False, True])

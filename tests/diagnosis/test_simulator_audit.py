@@ -54,19 +54,6 @@ def test_a_plan_that_lacks_a_cell_is_told_in_which_row():
         audit_system(simulator, {"x": x})
 
 
-def test_a_plan_by_the_epoch_shows_what_the_same_plan_from_0_shows():
-    x = np.random.default_rng(2).normal(size=40)
-    simulator = Simulator(
-        "y", "V", {"a": (0, 5), "b": (0, 3)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"], time="t"
-    )
-    near, later = (audit_system(simulator, {"t": np.arange(40.0) + shift, "x": x}) for shift in (0.0, 1.7e9))
-    expected, found = ({e.name: (e.detectability, e.share) for e in each.effects} for each in (near, later))
-    assert found.keys() == expected.keys()
-    for name, (detectability, share) in expected.items():
-        assert found[name][0] == detectability
-        assert found[name][1] == pytest.approx(share, abs=1e-3)
-
-
 @pytest.mark.parametrize("most", [100, 200])
 def test_a_part_of_a_long_table_tells_the_sizes_that_all_of_it_shows(most, monkeypatch):
     whole = audit_system(heater(), runs(n=150))

@@ -19,7 +19,6 @@ from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
 from probewise.diagnosis.simulator_rows import (
     SimulatorApparatus,
     plan_of_alternatives,
-    plan_of_sequence,
     possible_run_commands,
 )
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
@@ -65,32 +64,10 @@ def test_a_control_is_swept_held_and_switched_between_its_ends():
     assert set(power["1 power_w middle"].tolist()) == {3.0}
 
 
-def test_time_that_goes_on_is_later_than_all_that_was_recorded():
-    time = np.arange(float(len(TABLE)))
-    table = TABLE.with_columns({"t_s": time})
-    commands = list(offered((), table).values())
-    asked = cast(RunTable, plan_of_sequence(commands[:2], table))
-    assert (np.diff(asked.time_s) > 0).all()
-    assert asked.time_s[0] > time[-1]
-
-
 def test_commands_set_behind_each_other_are_runs_of_their_own():
     together = cast(RunTable, plan_of_alternatives(list(offered().values())[:3], TABLE))
     assert len(together.scan_names) == 3
     assert set(together.like.values()) <= set(TABLE.scan_names)
-
-
-def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
-    table = runs((20.0, 21.0), names=("1", "1 again"))
-    assert list(offered((), table)) == ["1 again (2)", "1 again again"]
-
-
-@pytest.mark.parametrize(("unit", "minutes"), [("s", 1 / 60), ("min.", 1.0), ("Month", 43_830.0), ("fortnight", None)])
-def test_the_time_that_runs_take_is_in_the_unit_of_the_table(unit, minutes):
-    """Half a minute before each run; of an unknown unit a second a reading."""
-    again = possible_run_commands(TABLE, "temp_c", (), unit)[0]
-    of_rows = len(again.plan) / 60 if minutes is None else np.ptp(again.plan.time_s) * minutes
-    assert again.minutes == pytest.approx(0.5 + of_rows)
 
 
 @pytest.mark.parametrize("run", [None, "run"])

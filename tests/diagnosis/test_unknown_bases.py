@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -40,21 +38,6 @@ MISMATCHES = {
     "a start of each scan": np.exp(-(np.arange(N) - np.repeat(STARTS, np.diff(STARTS, append=N))) / 2),
     "the brightest so far": np.concatenate([np.maximum.accumulate(part) for part in np.split(SIGNAL, STARTS[1:])]),
 }
-
-
-@pytest.mark.parametrize("unit", [1e-12, 1e12])
-def test_what_varies_does_not_depend_on_the_unit(unit):
-    """Readings and a column in picoamperes; a level that is constant but for its last digit does not vary."""
-    usable = np.arange(N)
-
-    def names(signal, slope, column):
-        plan = replace(PLAN, covariates={"dark": column})
-        return [covariate.name for covariate in varying_covariates(plan, usable, signal, slope)]
-
-    assert {"level", "slope", "dark"} <= set(names(SIGNAL, SLOPE, TIME))
-    assert names(unit * SIGNAL, unit * SLOPE, unit * TIME) == names(SIGNAL, SLOPE, TIME)
-    still = unit * (30.0 + np.tile([0.0, 1e-14], N)[:N])
-    assert not {"level", "slope", "dark"} & set(names(still, still - still[0], still))
 
 
 @pytest.mark.parametrize("mismatch", MISMATCHES.values(), ids=MISMATCHES)

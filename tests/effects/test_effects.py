@@ -200,17 +200,6 @@ def test_a_heavy_tail_is_exact_at_both_ends():
     np.testing.assert_allclose(LogHeavyTailedPrior(0.1).to_unit(np.array([-1.0, 0.0, 1.0])), [0.0, 0.0, 0.5])
 
 
-def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
-    """Sds from one typical size: an eighth lies below half of that, where the wide mixture has nearly a half."""
-    wide, shown = HeavyTailedPrior(0.5, positive=True), HeavyTailedPrior(0.5, positive=True, smallest=1.0)
-    u = np.linspace(0.01, 0.99, 25)
-    np.testing.assert_allclose(shown.to_unit(shown.from_unit(u)), u, atol=1e-9)
-    x = np.linspace(0.0, 120.0, 240_001)
-    assert np.trapezoid(np.exp(shown.log_prob(x)), x) == pytest.approx(1.0, abs=1e-6)
-    below = [float(prior.to_unit(np.array([0.25]))[0]) for prior in (wide, shown)]
-    assert below[0] > 2.5 * below[1]
-
-
 def test_an_effect_that_could_not_show_is_not_built():
     """The paper's plan has no battery; one scan goes one way and has no other to differ from; a spot has no X."""
     plan = replace(paper_plan(), covariates={})
@@ -348,19 +337,6 @@ def test_an_effect_means_the_same_on_a_recording_far_from_0(name):
     assert said.removeprefix(plainly).startswith(" (time" if "time" in far.covariates else " (X and Y")
 
 
-@pytest.mark.parametrize("name", [name for name in EFFECTS if name not in FROM_ORIGIN])
-def test_no_other_effect_on_the_mean_counts_from_0(name):
-    """On the far recording the readings of its bank are the same; parameters that are times and places move along."""
-    if EFFECTS[name].stage is Stage.NOISE:
-        return
-    there = moved_by(PLAN, *dataclasses.astuple(FAR))
-    near, far = (EFFECTS[name].for_extent(Extent(10.0, 60.0, plan)) for plan in (PLAN, there))
-    one, other = near.variants()[0], far.variants()[0]
-    entries, theirs = (each.bank().reshape(-1, len(near.prior.names))[:20] for each in (one, other))
-    found = over(there).with_effects(other).predict(theirs, there)
-    np.testing.assert_allclose(found, over(PLAN).with_effects(one).predict(entries, PLAN), atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("start_s", "start_mm", "origin"),
     [
@@ -479,15 +455,6 @@ def test_places_that_differ_in_the_last_digit_are_one_place():
     alone = Extent(0.0, 1.0, plan_along(out, np.zeros(1001)))
     there, here = (EFFECTS["missing_tooth"].for_extent(extent).variants() for extent in (both, alone))
     np.testing.assert_allclose([v.bank()[0, 0] for v in there], [v.bank()[0, 0] for v in here], atol=1e-12)
-
-
-def test_times_that_differ_in_the_last_digit_are_one_time():
-    plan = there_and_back()
-    time_s = np.repeat([0.1, 0.2, 0.3], 2)
-    time_s[1::2] = np.nextafter(time_s[1::2], np.inf)
-    extent = Extent(0.0, 1.0, replace(plan, time_s=time_s))
-    assert VOCABULARY["ambient_step"].for_extent(extent).change_points.at == (0.1, 0.2, 0.3)
-    assert extent.gap_s == pytest.approx(0.1)
 
 
 def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie():

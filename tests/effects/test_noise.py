@@ -106,15 +106,6 @@ def test_a_lattice_shows_through_printing(digits):
     assert missed <= 1  # a step that happens to be nearly a round number
 
 
-@pytest.mark.parametrize("unit", [1e-12, 1e-6, 1e-3])
-def test_the_error_of_a_step_does_not_depend_on_the_unit(unit):
-    """Readings of some 1e-12 A are all within 1e-6 of the integer 0, which is not their last digit."""
-    printed = np.round(0.37 * np.arange(3, 60), 2)
-    expected = sd_of_estimated_lattice_step(printed, 0.37)
-    assert expected == pytest.approx(0.01 / np.sqrt(12) / np.linalg.norm(np.arange(57) - 28))
-    assert sd_of_estimated_lattice_step(unit * printed, unit * 0.37) == pytest.approx(unit * expected)
-
-
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e9])
 def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
     lost = dropouts.for_extent(Extent(10.0 * unit, 60.0 * unit, PLAN))

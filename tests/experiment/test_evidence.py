@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import sensor_of
 
 from probewise.arm.instrument import Pose, Reading
-from probewise.calibration import FittedSensor, posterior_mean_ssf_field, read_sensor
+from probewise.calibration import posterior_mean_ssf_field, read_sensor
 from probewise.experiment import experiment_for, read_journal
 from probewise.experiment.evidence import posterior_from_prior
 from probewise.experiment.kinds import prior_posterior
@@ -17,7 +18,6 @@ from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import experiment_of
 from probewise.recordings import Instrumentation
 from probewise.scene import Circle, Field
-from probewise.sensor import mixture_parameter_names
 
 NAMES = ("", "ambient_step", "backlash", "dark_level", "dropouts", "saturation")
 STUCK = Path(__file__).parents[3] / "shared" / "faults" / "robot"
@@ -109,13 +109,11 @@ _PLAYED = (
 def test_a_search_that_ends_in_a_false_mode_is_set_right_where_the_leader_has_the_shape(seed):
     """Nested sampling with 600 live points: -23.6 +- .2. The search of these seeds ends at -400 or below."""
     samples = np.tile([1.0, 0.2716, 1.4052, 0.03227, 0.07622, -0.00658, 10.97, 58.02], (500, 1))
-    sensor = FittedSensor(
-        names=(*mixture_parameter_names(1), "I_min", "I_max"),
-        samples=samples,
-        n_gaussians=1,
+    sensor = sensor_of(
+        samples,
         noise_sd=np.full(500, 0.4478),
         field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
-        instrumentation=Instrumentation(unit="LEGO", height_mm=14.0),
+        instrumentation=Instrumentation(height_mm=14.0),
     )
     experiment = experiment_for(sensor, Circle(Field()), Field())
     places = experiment.grid.places_mm

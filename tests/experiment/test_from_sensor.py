@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exploring import run
+from hand_made import NAMES, sensor_of
 
 from probewise.arm.instrument import Reading
-from probewise.calibration import FittedSensor
 from probewise.effects import Origin
 from probewise.experiment import AdjustedMixture, experiment_for, sensor_change_prior
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
-from probewise.recordings import Instrumentation
 from probewise.scene import Circle, Field, HypothesisScene
-from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, SSFField, mixture_parameter_names
+from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels
 
 TRUE = FixedMixture([0.6, 0.4], [[0.5, 1.5], [0.0, -1.0]], [[[16.0, 2.0], [2.0, 9.0]], [[30.0, 0.0], [0.0, 12.0]]])
 SENSOR = sensor_change_prior((10.0, 60.0))
@@ -86,14 +85,9 @@ def test_a_footprint_taken_for_a_half_too_wide_is_put_right(small):
 
 
 def test_effects_of_a_sensor_from_far_away_count_from_0_in_a_run():
-    names = (*mixture_parameter_names(1), "I_min", "I_max", "gain_drift.frac", "gain_drift.tau_s")
-    sensor = FittedSensor(
-        names=names,
-        samples=np.tile([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0, 0.2, 30.0], (500, 1)),
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.5),
-        field=SSFField(np.ones((1, 1)), 1.0, (0.0, 0.0)),
-        instrumentation=Instrumentation(),
+    sensor = sensor_of(
+        np.tile([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0, 0.2, 30.0], (500, 1)),
+        names=(*NAMES, "gain_drift.frac", "gain_drift.tau_s"),
         effects=("gain_drift",),
         origins={"gain_drift": Origin(time_s=1.7e9)},
     )

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exploring import run
+from hand_made import NAMES, sensor_of
 
 from probewise.arm import Pose, Reading, as_instrument
-from probewise.calibration import FittedSensor
 from probewise.cli._bench import InstrumentWithCallbacks
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.experiment import arm_over, experiment_for, explore, read_journal, result_json
@@ -51,17 +51,9 @@ def test_world_and_chain_agree_on_what_another_height_does(height_mm):
     angle = np.linspace(0.0, 6.0, 7)
     away_mm = 60.0 + 2.0 * np.sin(3.0 * angle)
     x_mm, y_mm = 140.0 + away_mm * np.cos(angle), 100.0 + away_mm * np.sin(angle)
-    zeros = np.zeros(len(x_mm), dtype=np.int64)
-    plan = Plan(
-        x_mm,
-        y_mm,
-        *np.zeros((2, len(x_mm))),
-        zeros,
-        ("0",),
-        zeros,
-        ("field",),
-        covariates={"height_mm": np.full(len(x_mm), height_mm)},
-        instrumentation=Instrumentation(height_mm=14.0),
+    heights = {"height_mm": np.full(len(x_mm), height_mm)}
+    plan = Plan.from_arrays(
+        x_mm=x_mm, y_mm=y_mm, patterns={"field": DISC}, unit="LEGO", height_mm=14.0, covariates=heights
     )
     read = [WORLD.read(DISC, x, y, time_s=0.0, rng=None, height_mm=height_mm) for x, y in zip(x_mm, y_mm, strict=True)]
     assert CHAIN.predict(TRUTH[None], plan)[0] == pytest.approx(np.array(read), abs=0.5)
@@ -118,7 +110,6 @@ CLOSE_WORLD = World(
     height_mm=LOW_MM,
 )
 SENSOR = np.array([0.5, 1.0, 1.5, 1 / 32, 1 / 18, 0.0, 10.0, 60.0])
-NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
 SAMPLES = SENSOR + 1e-4 * np.random.default_rng(0).standard_normal((500, 8))
 
 
@@ -126,13 +117,11 @@ SAMPLES = SENSOR + 1e-4 * np.random.default_rng(0).standard_normal((500, 8))
 def close_sensor():
     """A sensor calibrated 5 mm above a table that slopes by a hundredth."""
     axis = np.arange(-20.0, 20.5, 0.5)
-    footprint = footprint_of(SENSOR[None, :6], 1)
-    return FittedSensor(
+    return sensor_of(
+        np.column_stack([SAMPLES, np.full(500, SLOPE)]),
         names=(*NAMES, "height_gradient.mm_per_mm"),
-        samples=np.column_stack([SAMPLES, np.full(500, SLOPE)]),
-        n_gaussians=1,
         noise_sd=np.full(500, 0.5),
-        field=mean_ssf_field(footprint, u_mm=axis, v_mm=axis),
+        field=mean_ssf_field(footprint_of(SENSOR[None, :6], 1), u_mm=axis, v_mm=axis),
         effects=("height_gradient",),
         instrumentation=Instrumentation(height_mm=LOW_MM),
     )

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exploring import run
+from hand_made import TRUTH, sensor_of
 
 from probewise.arm import ReadingScale
 from probewise.arm.instrument import Pose, Reading
-from probewise.calibration import FittedSensor
 from probewise.errors import FileError, NotConvergedError, ParameterError
 from probewise.experiment import (
     NestedSampling,
@@ -26,7 +26,7 @@ from probewise.experiment import (
 from probewise.inference import Naive
 from probewise.inquiry import Grid, InformationGain, ReadingEntropy
 from probewise.nested import EvidenceChange, RemainingEvidence
-from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Recording
+from probewise.recordings import Disc, HalfPlane, Plan, Recording
 from probewise.recordings import Uniform as UniformPattern
 from probewise.scene import AnyOf, Circle, Field, KnownScene
 from probewise.scene.shapes import Rectangle
@@ -190,19 +190,8 @@ def test_readings_that_nothing_explains_end_the_inference(small):
         infer(experiment, readings_at(small.arm(), PLACES[:1]))
 
 
-PARAMETERS = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
-
-
 def sensor():
-    axis = np.arange(-20.0, 20.5)
-    return FittedSensor(
-        names=("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max"),
-        samples=np.tile(PARAMETERS, (500, 1)),
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.6),
-        field=mean_ssf_field(footprint_of(PARAMETERS[None, :6], 1), u_mm=axis, v_mm=axis),
-        instrumentation=Instrumentation(unit="LEGO"),
-    )
+    return sensor_of(np.tile(TRUTH, (500, 1)))
 
 
 def test_the_paper_experiment_is_posed_as_the_paper_says():

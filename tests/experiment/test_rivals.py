@@ -8,13 +8,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import sensor_of
 from scipy.integrate import quad
 from scipy.stats import norm
 
 from probewise import scene
 from probewise.arm import Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import FITTED, Accuracy
-from probewise.calibration import FittedSensor, posterior_mean_ssf_field, predict, read_sensor, write_sensor
+from probewise.calibration import posterior_mean_ssf_field, predict, read_sensor, write_sensor
 from probewise.effects import Origin
 from probewise.errors import ParameterError
 from probewise.experiment import (
@@ -54,9 +55,8 @@ from probewise.proof.concealed_study import (
 )
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import Trial, arm_of, experiment_of, timed_steps
-from probewise.recordings import Instrumentation, Plan, Recording, Uniform
+from probewise.recordings import Plan, Recording, Uniform
 from probewise.report.exploration import page_html, robot_view_png
-from probewise.sensor import mixture_parameter_names
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +84,7 @@ def sensor():
     truth = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
     sd = np.array([0.0, 0.03, 0.03, 0.001, 0.002, 0.0005, 0.05, 0.05])
     samples = truth + sd * np.random.default_rng(11).standard_normal((500, 8))
-    return FittedSensor(
-        names=(*mixture_parameter_names(1), "I_min", "I_max"),
-        samples=samples,
-        n_gaussians=1,
-        noise_sd=np.full(500, 0.5),
-        field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5),
-        instrumentation=Instrumentation(),
-    )
+    return sensor_of(samples, noise_sd=np.full(500, 0.5), field=posterior_mean_ssf_field(samples, 1, pixel_mm=0.5))
 
 
 def rivals():

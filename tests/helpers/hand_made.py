@@ -11,14 +11,15 @@ TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
 
 
 def sensor_of(samples, **changes):
-    """A sensor with these posterior samples, (n_samples, 8), and the field of the truth."""
+    """A sensor with these posterior samples, by default (n_samples, 8), and the field of the truth."""
     axis = np.arange(-20.0, 20.5)
     known = {
+        "names": NAMES,
         "noise_sd": np.full(len(samples), 0.6),
         "field": mean_ssf_field(footprint_of(TRUTH[None, :6], 1), u_mm=axis, v_mm=axis),
         "instrumentation": Instrumentation(),
     }
-    return FittedSensor(names=NAMES, samples=samples, n_gaussians=1, **{**known, **changes})
+    return FittedSensor(samples=samples, n_gaussians=1, **{**known, **changes})
 
 
 def hand_made_sensor():

@@ -37,18 +37,3 @@ def test_the_photodiode_turns_with_the_sensor_as_the_readings_do(turned_deg, pho
     (white,) = (p for p in ax.patches if isinstance(p, Circle) and p.get_facecolor()[:3] == (1, 1, 1))
     center = ax.transData.inverted().transform(white.get_transform().transform(white.get_center()))
     np.testing.assert_allclose(center / np.hypot(*center), photodiode, atol=1e-9)
-
-
-def test_each_orientation_of_the_boundary_scans_is_drawn_with_its_symbol(recording):
-    ax = plots.sensor_orientations(recording)
-    drawn = {(line.get_marker(), line.get_color()) for line in ax.lines}
-    data = {(line.get_marker(), line.get_color()) for line in plots.readings_by_orientation(recording).lines}
-    assert drawn == data
-    assert {"0°", "90°", "180°", "270°"} <= {text.get_text() for text in ax.texts}
-
-
-def test_each_quadrant_holds_its_reading_and_its_corner(recording):
-    axes = plots.quadrant_patterns(recording)
-    texts = [text.get_text() for ax in axes.flat for text in ax.texts]
-    assert [t for t in texts if t.startswith("(")] == ["(0, 0) mm", "(0, 0) mm", "(4, 4) mm", "(−4, 4) mm"]
-    assert [float(t) for t in texts if not t.startswith("(")] == pytest.approx(recording.readings[-4:], abs=0.05)

@@ -25,13 +25,6 @@ def test_the_papers_plan_has_four_lines_and_four_readings_alone():
         np.testing.assert_allclose(np.sort(track.along_mm), np.arange(-50.0, 51.0), atol=1e-9)
 
 
-def test_every_usable_reading_on_a_line_is_drawn(recording):
-    ax = plots.readings_by_orientation(recording)
-    assert sum(len(line.get_xdata()) for line in ax.lines) == 404
-    assert "mm" in ax.get_xlabel()
-    assert "LEGO" in ax.get_ylabel()
-
-
 def test_predictions_get_a_panel_a_scan_and_one_for_the_readings_alone(recording):
     axes = plots.predicted_and_recorded_by_scan(recording, recording.readings, np.ones(len(recording)))
     assert sum(ax.get_visible() for ax in axes.flat) == 5

@@ -118,19 +118,6 @@ def test_the_fields_pages_join_without_gap_or_step():
     assert {tile.beyond_mm[0] for tile in tiles} == {0.0, OVERLAP_MM}
 
 
-def test_every_cut_has_its_marks_in_the_margin():
-    sheet = field_sheet((400.0, 200.0))
-    for tile, page in zip(
-        tiles_of(sheet, "letter"), pages_of(sheets_pdf([sheet], paper="letter", title="t"))[1:], strict=True
-    ):
-        lines = [points for how, points in page[1] if how == "S" and len(points) == 2]
-        size = np.subtract(tile.high_mm, tile.low_mm)
-        for axis, low in ((0, LEFT_MM), (1, BOTTOM_MM)):
-            for at in (low, low + size[axis]):
-                hits = [p for p in lines if np.abs(p[:, axis] - at).max() < 0.01 and np.ptp(p[:, 1 - axis]) > 2]
-                assert len(hits) >= 2, (tile, axis, at)
-
-
 def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
     picture = Image(np.linspace(0, 1, 20).reshape(4, 5), 10.0, (0.0, 0.0), "x.npy")
     sheets = pattern_sheets({"a": Stripes(0.3, 8.0, 0.5, 1.0), "b": picture, "c": Uniform(0.5)})

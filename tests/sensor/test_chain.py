@@ -26,7 +26,6 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     NaiveSensor,
-    NoiseParameters,
     SceneView,
     Stage,
     footprint_of,
@@ -109,14 +108,6 @@ def test_hypotheses_together_equal_one_by_one(model):
     assert theta.shape[1] == len(sensor.names)
     for i in range(7):
         assert sensor.predict(theta[i : i + 1], plan)[0] == pytest.approx(together[i], abs=1e-8)
-
-
-def test_readings_together_equal_one_by_one(model):
-    sensor, draw = model
-    theta, plan = draw(3), plan_of()
-    together = sensor.predict(theta, plan)
-    for j in range(0, len(plan), 5):
-        assert sensor.predict(theta, plan.take(np.array([j])))[:, 0] == pytest.approx(together[:, j], abs=1e-8)
 
 
 def test_theta_of_another_width_is_refused(model):
@@ -210,7 +201,6 @@ CURVE = Doer("curve", Stage.RESPONSE, lambda u, t: u**t)
 GAIN = Doer("gain", Stage.GAIN, lambda signal, t: signal * (1 + t))
 OFFSET = Doer("offset", Stage.OFFSET, lambda reading, t: reading + t)
 CLIP = Doer("clip", Stage.SATURATION, lambda reading, t: np.minimum(reading, t))
-LOUD = Doer("loud", Stage.NOISE, lambda noise, t: NoiseParameters(noise.sd * t, noise.rho))
 
 
 def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
@@ -295,41 +285,12 @@ def test_a_known_width_with_a_place_of_each_hypothesis_equals_one_by_one():
         assert together[0] == pytest.approx(chain.predict(np.zeros((1, 0)), plan)[0], abs=1e-8)
 
 
-def test_many_angles_and_few_give_the_same():
-    """Readings at as many angles as there are readings, and one by one: two routes to one number."""
-    base, theta = CHAINS["two_free"][0], thetas(3, 2)
-    plan = replace(plan_of(30, names=("boundary",)), orientation_rad=np.linspace(0, 6, 30))
-    together = base.predict(theta, plan)
-    for j in range(30):
-        assert base.predict(theta, plan.take(np.array([j])))[:, 0] == pytest.approx(together[:, j], abs=1e-8)
-
-
-def test_effects_on_the_noise_leave_the_prediction_alone():
-    base = CHAINS["one_free"][0]
-    plan, theta = plan_of(), np.concatenate([thetas(3, 1), [[1.0], [2.0], [3.0]]], axis=1)
-    chain = base.with_effects(LOUD)
-    assert np.array_equal(chain.predict(theta, plan), base.predict(theta[:, :-1], plan))
-    level = chain.noise_parameters(theta, plan, np.array([[0.5]]))
-    assert level.sd[:, 0].tolist() == [0.5, 1.0, 1.5]
-    assert level.rho.tolist() == [[0.0]]
-
-
 def test_effects_that_cannot_be_are_refused():
     base = CHAINS["one_free"][0]
     with pytest.raises(ParameterError, match="each name once"):
         base.with_effects(GAIN, GAIN)
     with pytest.raises(ParameterError, match="none at the footprint with a DiscreteSSF"):
         CHAINS["field"][0].with_effects(SPREAD)
-
-
-def test_predicting_twice_gives_the_same_and_leaves_the_plan_alone(model):
-    sensor, draw = model
-    plan, theta = plan_of(), draw(3)
-    before = theta.copy()
-    first = sensor.predict(theta, plan)
-    first[:] = -1
-    assert not np.any(sensor.predict(theta, plan) == -1)
-    assert np.array_equal(theta, before)
 
 
 @pytest.mark.parametrize(

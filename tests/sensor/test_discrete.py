@@ -6,7 +6,7 @@ from scipy.special import ndtr
 
 from probewise.errors import ShapeError
 from probewise.recordings import patterns as kinds
-from probewise.scene import HalfPlaneRegion, disc_region, region_of
+from probewise.scene import disc_region, region_of
 from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
 
 MIXTURE = FixedMixture([1.0], [[0.7, 1.3]], [[[20.0, 6.0], [6.0, 30.0]]])
@@ -51,9 +51,3 @@ def test_many_hypotheses_and_poses_equal_one_by_one():
     assert shared.shape == (3, 4)
     with pytest.raises(ShapeError, match="poses of 3 hypotheses, 2 regions"):
         mean_albedo_by_pixels(disc_region(np.zeros((2, 2)), np.array([5.0, 9.0])), field, poses)
-
-
-def test_poses_of_each_hypothesis_over_one_known_region():
-    half = HalfPlaneRegion(np.zeros(1), np.zeros(1))
-    poses = Poses(np.array([[-90.0], [90.0]]), np.zeros((1, 1)), np.zeros((1, 1)))
-    assert mean_albedo_by_pixels(half, pixels(2.0), poses) == pytest.approx(np.array([[0.0], [1.0]]))

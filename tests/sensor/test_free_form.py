@@ -45,10 +45,6 @@ def predicted(theta: np.ndarray) -> np.ndarray:
     return chain.predict(np.concatenate([theta, levels], axis=1), PLAN)
 
 
-def test_without_bends_it_is_the_one_gaussian():
-    np.testing.assert_allclose(predicted(free_form_theta(ONE, np.zeros((1, N_BENDS)))), predicted(ONE), atol=1e-10)
-
-
 def test_bends_leave_mean_and_covariance_alone():
     bent = free_form_theta(np.repeat(ONE, 6, axis=0), BENDS)
     np.testing.assert_allclose(moments(bent), np.repeat(moments(ONE), 6, axis=0), atol=1e-10)

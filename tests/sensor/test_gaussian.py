@@ -11,7 +11,7 @@ from scipy.integrate import dblquad
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
-from probewise.errors import ParameterError, SlowWarning
+from probewise.errors import SlowWarning
 from probewise.recordings import patterns as kinds
 from probewise.scene import (
     EllipseRegion,
@@ -266,13 +266,6 @@ def test_what_is_seen_lies_between_black_and_white(name, x, y, sd, rho):
     assert -1e-9 <= found <= 1 + 1e-9
 
 
-def test_white_inside_out_is_the_complement():
-    cov = covariance(4.0, 7.0, 0.5)
-    white = see(region_of(kinds.Disc((0.0, 0.0), 9.0)), 4.0, 5.0, cov)
-    black = see(region_of(kinds.Disc((0.0, 0.0), 9.0, inside=0.0, outside=1.0)), 4.0, 5.0, cov)
-    assert white + black == pytest.approx(1.0, abs=1e-12)
-
-
 class Checkers:
     """A user's own region without a closed form: it has albedo and coverage only."""
 
@@ -296,8 +289,3 @@ def test_a_region_without_a_closed_form_is_summed_over_pixels():
     with pytest.warns(SlowWarning, match="Checkers has no closed form"):
         found = see(Checkers(), 3.0, -2.0, np.diag([16.0, 36.0]))
     assert found == pytest.approx(wanted, abs=0.02)
-
-
-def test_an_odd_number_of_nodes_is_refused():
-    with pytest.raises(ParameterError, match="n_nodes is 15; allowed: an even number"):
-        see(region_of(PATTERNS["disc"]), 20.0, 0.0, covariance(4.0, 4.0, 0.0), n_nodes=15)

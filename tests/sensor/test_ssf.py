@@ -8,7 +8,6 @@ from mixtures import fixed_mixture, total_variation
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor import (
-    DiscreteSSF,
     FixedMixture,
     FreeMixture,
     SSFField,
@@ -80,27 +79,12 @@ def test_the_mean_field_is_a_mean_of_fields_not_of_parameters():
     assert mean.mean_mm == pytest.approx([4.0, 0.0], abs=1e-6)
 
 
-def test_a_field_is_normalised_and_knows_its_places():
-    field = SSFField(np.array([[0.0, 2.0], [0.0, 6.0]]), 2.0, (-1.0, 5.0))
-    assert field.values.tolist() == [[0.0, 0.25], [0.0, 0.75]]
-    assert field.mean_mm.tolist() == [1.0, 6.5]
-    assert field.cov_mm2 == pytest.approx(np.array([[0.0, 0.0], [0.0, 0.75]]))
-    assert not field.values.flags.writeable
-
-
 @pytest.mark.parametrize("n_gaussians", [1, 2])
 def test_the_mixture_of_a_field_keeps_its_moments(n_gaussians):
     field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
     mixture = mixture_of_field(field, n_gaussians=n_gaussians)
     assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-4)
     assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, rel=1e-4, abs=1e-3)
-
-
-def test_two_gaussians_are_recovered_from_their_field():
-    field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
-    assert total_variation(fixed_mixture(TWO[0]), field) < 1e-6
-    assert total_variation(mixture_of_field(field, n_gaussians=2), field) < 0.01
-    assert total_variation(mixture_of_field(field), field) > 0.03
 
 
 @pytest.mark.parametrize("n_gaussians", [1, 2])
@@ -146,13 +130,6 @@ def test_two_lobes_are_not_merged_into_one():
     field = mean_ssf_field(footprint_of(theta, 2), u_mm=grid(60), v_mm=grid(60))
     assert total_variation(merged_mean_mixture(footprint_of(theta, 2), n_gaussians=2), field) < 0.01
     assert len(merged_mean_mixture(footprint_of(theta[[0, 0, 0]], 2), n_gaussians=9).weights) == 2
-
-
-def test_a_known_ssf_has_no_parameters():
-    field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
-    assert DiscreteSSF(field).names == ()
-    assert mixture_of_field(field).names == ()
-    assert DiscreteSSF(field).footprint(np.zeros((1, 0))).weight.shape == (1, 1, 1)
 
 
 @pytest.mark.parametrize(

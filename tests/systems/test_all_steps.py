@@ -123,21 +123,6 @@ def test_a_sample_that_diverges_is_as_infinite_as_in_steps():
     np.testing.assert_allclose(found["phi"][0], expected[0], rtol=1e-9)
 
 
-def test_a_law_that_takes_one_column_for_each_run_alone_is_stepped():
-    of_run = np.array([1.0, 2.0])
-
-    def rates(s, p, u):
-        return {"phi": s["omega"], "omega": -of_run * s["phi"]}
-
-    case = _Case(law=Law({"phi": "phi0", "omega": 0.0}, rates))
-    theta = np.stack([MIDDLE, 1.01 * MIDDLE])
-    for refusals in (0, 0, 1, 2):  # at first no trajectory is known
-        assert case.memory.n_refused == refusals
-        found, _ = case.near(theta)
-    assert case.memory.useless
-    np.testing.assert_array_equal(found["phi"], case.stepped(theta)["phi"])
-
-
 def test_a_sample_that_a_law_refuses_does_not_slow_down_all_that_follow():
     def rates(s, p, u):
         if np.any(p["l_m"] < 0.1):

@@ -49,13 +49,6 @@ def test_a_new_run_starts_where_its_prior_says_beside_two_recorded_ones():
     np.testing.assert_allclose(found.sd[0], 5.0, rtol=0.02)
 
 
-def test_a_new_run_starts_as_three_recorded_ones_did():
-    """Starts of mean 23 and sd 1: a Student-t of four degrees of freedom, sd sqrt(2 (1 + 1/3)) about 23."""
-    found = predicted(_with_starts(22.0, 23.0, 24.0), runs((20.0,), names="9", n=4))
-    np.testing.assert_allclose(found.mean[0], 23.0, atol=0.05)
-    np.testing.assert_allclose(found.sd[0], np.sqrt(8 / 3), rtol=0.05)
-
-
 def test_a_new_run_has_an_offset_as_those_of_the_recorded_runs_differ():
     """Three runs of mean 1 and sd 1: a Student-t of four degrees of freedom, sd sqrt(2 (1 + 1/3)) about 1."""
     model = fitted(("offset_per_run",))
@@ -249,16 +242,6 @@ def test_an_effect_with_a_memory_goes_on_after_a_row_that_lacks_an_input(effect)
     np.testing.assert_allclose(found.mean[others], whole[others], rtol=1e-12)
     assert np.isfinite(found.log_density[others]).all()
     assert np.isnan(found.table.columns["power_w"][3])
-
-
-def test_a_law_has_no_prediction_from_a_missing_input_to_the_end_of_its_run():
-    """Its state is not known there; the other run is predicted."""
-    law = Law({"temp_c": "start_c"}, lambda s, p, u: {"temp_c": p["gain"] * u["power_w"] - s["temp_c"] / p["tau_s"]})
-    simulator = dataclasses.replace(SIMULATOR, simulate=None, law=law)
-    model = dataclasses.replace(fitted(), simulator=simulator)
-    with pytest.warns(DoubtfulResultWarning):
-        found = predicted(model, _with_missing_power(runs(), 3))
-    assert np.flatnonzero(np.isnan(found.mean)).tolist() == list(range(3, 12))
 
 
 def test_a_table_of_which_no_row_has_what_it_needs_is_refused():

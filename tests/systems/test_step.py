@@ -92,26 +92,6 @@ def test_the_error_falls_by_the_fourth_order_in_a_bent_law_with_an_input_in_time
     assert np.abs(error(32)).max() < 2e-5
 
 
-@pytest.mark.parametrize("rate", [1e2, 1e5, 1e9])
-def test_what_decays_within_a_step_is_gone_after_a_few(rate):
-    """L-stability: an explicit method would multiply it by (rate times step)^4 / 24."""
-    s = _after(Law({"x": 1.0}, lambda s, p, u: {"x": -rate * s["x"]}), 4)
-    assert abs(s["x"][0, 0]) < 1e-3
-
-
-def test_a_fast_state_that_follows_a_slow_one_needs_no_short_steps():
-    """Robertson's kind of stiffness in two linear states: eigenvalues near -1e6 and -1/2."""
-
-    def rates(s, p, u):
-        return {"fast": 1e6 * (s["slow"] - s["fast"]), "slow": -0.5 * s["fast"]}
-
-    s = _after(Law({"fast": 0.0, "slow": 1.0}, rates), 8)
-    # By the exponential of the matrix; the fast state lags the slow one by half a millionth of its rate.
-    slow = np.exp(-0.5 * END)
-    assert s["slow"][0, 0] == pytest.approx(slow, rel=1e-5)
-    assert s["fast"][0, 0] == pytest.approx(slow, rel=1e-5)
-
-
 def test_a_run_that_ended_stands_still_and_one_that_runs_away_leaves_the_others():
     def rates(s, p, u):
         return {"x": s["x"] ** 2 * p["k"] - s["x"]}

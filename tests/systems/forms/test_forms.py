@@ -207,21 +207,6 @@ def test_an_input_is_cut_off_below_as_well_as_above():
     assert "falls no further" in said[1]
 
 
-@pytest.mark.parametrize("wild", [1e3, -1e3])
-def test_a_wild_cell_of_an_input_moves_no_ceiling(wild):
-    """Its level is where the other values are; beside 1,000 all levels were floors, beside -1,000 ceilings."""
-    drive = TABLE.columns["drive"].copy()
-    drive[7] = wild
-    table = TABLE.with_columns({"drive": drive})
-    about = _about(_simulator(), table)
-    form = bind_forms(about)["input_saturation:drive"]
-    offset, gain = about.theta[0]
-    for level, cut in ((0.7, np.minimum), (-0.6, np.maximum), (form.nothing[0], np.minimum)):
-        theta = np.concatenate([about.theta[0], [level]])[None, :]
-        found = about.system.chain(table, [form]).predict(theta, table)[0]
-        np.testing.assert_allclose(found, offset + gain * cut(drive, level))
-
-
 @pytest.mark.parametrize(
     ("values", "ends"),
     [

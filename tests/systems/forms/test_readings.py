@@ -69,15 +69,6 @@ def test_no_lag_and_no_delay_change_nothing_also_where_rows_share_a_time(smooth)
     assert np.isfinite(delayed_readings(x, np.array([[0.3, smooth]]), table)).all()
 
 
-def test_each_sample_lags_as_it_would_alone():
-    x = _RNG.normal(size=(3, len(_T)))
-    theta = np.array([[0.2, 1.0], [1.5, 0.0], [0.7, 1.0]])
-    for act in (lagged_readings, delayed_readings):
-        together = act(x, theta, _rows())
-        for k in range(3):
-            np.testing.assert_allclose(together[k], act(x[k : k + 1], theta[k : k + 1], _rows())[0])
-
-
 def _cups(every_min, tau_min, delay_min=0.0):
     """Two cups that are stirred in a bath that swings, read every so many minutes by a thermometer."""
     t = np.arange(0.0, 60.0, every_min)

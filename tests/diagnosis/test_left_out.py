@@ -17,7 +17,7 @@ from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects import Extent
-from probewise.effects.noise import Dropouts
+from probewise.effects.noise import dropouts
 from probewise.errors import ParameterError
 from probewise.systems import RunTable, Simulator, System, predict_system, table_for
 

@@ -17,7 +17,7 @@ from probewise.diagnosis.noise_law import (
     white_noise,
 )
 from probewise.diagnosis.noise_models import NoiseModel
-from probewise.effects.noise import CorrelatedNoise, NoisePerRun
+from probewise.effects.noise import correlated_noise, noise_of_runs
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.systems import RunTable, Simulator, as_recording
 

@@ -7,7 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis.diagnosis import PredictionAndResiduals, Repair, repair_of
+from probewise.diagnosis.diagnosis import (
+    Diagnosis,
+    PredictionAndResiduals,
+    _controls_before_time,
+    predictions_before_and_after,
+)
+from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Place
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
 from probewise.recordings import Plan, Recording, Uniform
@@ -40,13 +47,13 @@ def test_what_samples_lack_is_left_open_in_its_share():
 
 
 def test_a_model_with_a_formula_in_half_of_its_samples_is_not_said_to_lack_the_correction():
-    assert repair().not_in_model("repaired.json") == "repaired.json does not contain it"
+    assert repair().not_in_model == "sensor.json does not contain it"
     formula = "formula:reading:y:x^2"
     marks = {formula: np.array([True, False, True, False])}
     own = repair(marks)
     model = SimpleNamespace(absent=marks, effects=("lag", formula))
-    said = replace(own, model=model).not_in_model("repaired.json")
-    assert said == "of the samples in repaired.json, 50 % contain a formula for it instead"
+    said = replace(own, repaired=model).not_in_model
+    assert said == "of the samples in sensor.json, 50 % contain a formula for it instead"
 
 
 def test_what_is_corrected_row_by_row_is_not_called_repaired():
@@ -94,7 +101,22 @@ def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_re
     before, after = predictions_before_and_after(prepared, best, np.full(len(rows), 2.0))
     np.testing.assert_array_equal(before.readings, 4.0)
     used = np.isin(np.arange(n), rows)
-    np.testing.assert_array_equal(found.after.readings[used], 7.0)
-    np.testing.assert_array_equal(found.after.residuals[used], 0.0)
-    np.testing.assert_array_equal(found.after.readings[~used], 5.0)
-    np.testing.assert_array_equal(found.after.residuals[~used], 2.0)
+    np.testing.assert_array_equal(after.readings[used], 7.0)
+    np.testing.assert_array_equal(after.residuals[used], 0.0)
+    np.testing.assert_array_equal(after.readings[~used], 5.0)
+    np.testing.assert_array_equal(after.residuals[~used], 2.0)
+
+
+def place(covariate, values, start, end):
+    return Place(covariate, None, start, end, 0.001, 5.0, *[np.zeros(0)] * 2, values=values)
+
+
+def test_a_control_comes_before_time_where_both_hold_the_same_rows():
+    time = np.arange(100.0)
+    power = np.minimum(time // 10, 9.0)
+    rows = [place("level", time, 0, 9), place("time", time, 50, 89), place("power_w", power, 5.0, 8.0)]
+    ordered = [p.covariate for p in _controls_before_time(rows, ("power_w",))]
+    assert ordered == ["level", "power_w", "time"]
+    assert [p.covariate for p in _controls_before_time(rows, ())] == ["level", "time", "power_w"]
+    elsewhere = [*rows[:2], place("power_w", power, 0.0, 3.0)]
+    assert [p.covariate for p in _controls_before_time(elsewhere, ("power_w",))] == ["level", "time", "power_w"]

@@ -16,11 +16,7 @@ from probewise.diagnosis.fit import Model
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
-from probewise.diagnosis.simulator_rows import (
-    SimulatorApparatus,
-    plan_of_alternatives,
-    possible_run_commands,
-)
+from probewise.diagnosis.simulator_rows import SimulatorApparatus, plan_of_alternatives, possible_run_commands
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.recordings import Plan
 from probewise.systems import (

@@ -10,7 +10,7 @@ from probewise.effects import is_out_of_vocabulary
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.reference import clipping_levels, switch_points
+from probewise.systems.forms.reference import clipping_between, switch_points
 from probewise.systems.law import LawWithEffects
 
 SD = 0.01

@@ -10,7 +10,7 @@ import pytest
 from mixtures import fixed_mixture
 
 from probewise.diagnosis import audit_plan
-from probewise.diagnosis.audit import PlanTemplates, ProjectedTemplates
+from probewise.diagnosis.audit import Expected
 from probewise.diagnosis.light_sensor import candidate_scans
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent
@@ -31,13 +31,12 @@ SD = 0.5
 
 
 def sights_of(plan: Plan):
-    """A sensor, the surviving share of backlash and its cosine to an edge that lies elsewhere, and templates."""
+    """A sensor, the surviving share of backlash, its cosine to an edge that lies elsewhere, and its smallest size."""
     extent = Extent(10.0, 60.0, plan)
     sensor, built = default_sensor(extent, 1), {name: kind.for_extent(extent) for name, kind in TWO.items()}
-    laid = PlanTemplates.of(sensor, np.full(sensor.n_params, 0.1), SD, plan, built)
-    seen = ProjectedTemplates.of(laid, np.arange(len(plan)))
-    share, like = seen.detectable_shares_and_cosines()["backlash"]
-    return sensor, share, like["edge_misplacement"], seen
+    bank = Expected(sensor, np.full(sensor.n_params, 0.1), SD, lambda _: built, "").bank(plan)
+    share, like, smallest = bank.seen_in(np.arange(len(plan)))["backlash"]
+    return sensor, share, like["edge_misplacement"], smallest
 
 
 def by_least_squares(plan: Plan, sensor) -> tuple[float, float]:
@@ -74,8 +73,8 @@ def test_share_and_cosine_are_those_of_least_squares(plan):
 def test_the_smallest_size_leaves_lambda_eight():
     """A trace of that size, from the chain, has length 8 once the fit has taken its part."""
     plan = thinned(two_way_plan(), 8)
-    sensor, share, _, seen = sights_of(plan)
-    (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"]).values()
+    sensor, share, _, smallest = sights_of(plan)
+    (width_mm,) = smallest.values()
     theta = sensor.theta(np.full((1, sensor.n_params), 0.1))
     plain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
     with_play = plain.with_effects(VOCABULARY["backlash"]())

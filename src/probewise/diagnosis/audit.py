@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, Self, TypeAlias, cast, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
@@ -62,13 +62,25 @@ ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which the evi
 _MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
 
 
+class Seen(NamedTuple):
+    """What readings show of an effect: the share of its change that no parameter absorbs, median over its settings.
+
+    `like`: cosine to the best-imitating setting of every other visible effect, by name, median over its own settings;
+    `smallest`: the value of each amplitude at which it has lambda 8, likewise; None if it has none.
+    """
+
+    share: float
+    like: dict[str, float]
+    smallest: dict[int, float | None]
+
+
 @dataclass(frozen=True, eq=False)
-class PlanTemplates:
+class EffectBank:
     """The templates of all effects under one plan: changes of its readings, in noise sds.
 
     `columns` (n_points, n_columns) are grouped in entries: one for each setting (parameter values) of an effect's
     bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `built`,
-    `settings` its parameter values. `slopes` (n_points, n_params) are those of the sensor. `built`: effects by name.
+    `settings` its parameter values. `slopes` (n_points, n_params) are those of the model. `built`: effects by name.
     """
 
     slopes: FloatArray
@@ -78,121 +90,59 @@ class PlanTemplates:
     built: Mapping[str, Effect]
     settings: tuple[FloatArray, ...]
 
-    @classmethod
-    def of(
-        cls,
-        expected: Null,
-        z: FloatArray,
-        sd: float,
-        plan: Plan,
-        built: Mapping[str, Effect],
-        *,
-        most: int | None = None,
-    ) -> Self:
-        """Build the templates, about a point z (n_params,) of a model, of effects scaled to a plan; not on the noise.
-
-        Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
-        """
-        most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
-        model = Model(expected, (), plan)
-        predicted, slopes = model.predict_and_differentiate(z)
-        found = Fit(model, z, predicted, np.zeros(len(plan)), slopes, sd=sd, objective=0.0)
-        columns, settings, owner = [np.zeros((len(plan), 0))], list[FloatArray](), list[int]()
-        for at, effect in enumerate(built.values()):
-            if effect.stage is not Stage.NOISE:
-                templates = templates_of_effect(found, effect, np.arange(len(plan)), most=most)
-                columns += templates.columns
-                settings += templates.settings
-                owner += [at] * len(templates.columns)
-        entry = np.repeat(np.arange(len(settings)), [c.shape[1] for c in columns[1:]])
-        whole = np.concatenate(columns, axis=1) / sd
-        return cls(slopes / sd, whole, entry, np.array(owner, dtype=np.int64), built, tuple(settings))
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the effects, in the order of `owner`."""
-        return list(self.built)
-
     def norms_of_entries(self, columns: FloatArray) -> FloatArray:
         """Return the root of the sum of squares of each entry's columns, (n_points, n_columns) -> (n_entries,)."""
         return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
 
+    def seen_in(self, rows: IntArray, asked: Sequence[str] | None = None) -> dict[str, Seen]:
+        """Return what the readings of these row numbers show of each effect, by name, beside the model's parameters.
 
-@dataclass(frozen=True, eq=False)
-class ProjectedTemplates:
-    """Templates on some rows with the sensor's parameters projected out, in noise sds: `left` (n_rows, n_columns).
-
-    Rows are `n_points` readings, then one for each parameter's prior. `basis` holds each entry's columns
-    orthonormalised; `raw` and `kept` (n_entries,) are the norms before and after the projection.
-    """
-
-    laid: PlanTemplates
-    left: FloatArray
-    basis: FloatArray
-    raw: FloatArray
-    kept: FloatArray
-    n_points: int
-
-    @classmethod
-    def of(cls, laid: PlanTemplates, rows: IntArray) -> Self:
-        """Project the sensor's parameters, with their prior, out of the templates on these row numbers."""
-        slopes, columns = laid.slopes[rows], laid.columns[rows]
+        Only effects in `asked` have cosines, by default all, and only between shares of 0.05 or more; sizes are
+        computed by default only.
+        """
+        # Parameters, with their priors as further rows, are projected out of the columns: `left`.
+        slopes, columns, names = self.slopes[rows], self.columns[rows], list(self.built)
         n_points, n_params = slopes.shape
         own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
         left = -own @ (own[:n_points].T @ columns)
         left[:n_points] += columns
-        basis, widths = np.zeros_like(left), np.bincount(laid.entry)
-        for width in np.unique(widths):  # all entries of one width at a time; without directions below a thousandth
-            mine = np.flatnonzero(widths[laid.entry] == width)
-            basis[:, mine], _ = orthonormalise_groups(left[:, mine], int(width), least=1e-18, share=1e-6)
-        return cls(laid, left, basis, laid.norms_of_entries(columns), laid.norms_of_entries(left), n_points)
-
-    def detectable_shares_and_cosines(
-        self, asked: Sequence[str] | None = None
-    ) -> dict[str, tuple[float, dict[str, float]]]:
-        """Return, by effect, its detectable share (of the norm), and its cosine to every other effect, by name.
-
-        Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.
-        Only effects in `asked` have cosines, by default all, and only between shares of 0.05 or more.
-        """
-        laid = self.laid
-        present = {}  # the entries of each effect that act on these rows
-        for k in np.unique(laid.owner).tolist():
-            mine = np.flatnonzero(laid.owner == k)
-            acting = self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)
-            present[laid.names[k]] = mine[acting]
-        shares = {
-            name: float(np.median(self.kept[mine] / self.raw[mine])) if mine.size else 0.0
-            for name, mine in present.items()
-        }
-        visible = [name for name, share in shares.items() if share >= LEAST_SHARE]
+        raw, kept = self.norms_of_entries(columns), self.norms_of_entries(left)
+        out, present = dict[str, Seen](), dict[str, IntArray]()  # the entries of each effect that act on these rows
+        for k in np.unique(self.owner).tolist():
+            mine = np.flatnonzero(self.owner == k)
+            acting = mine[raw[mine] > 1e-6 * max(float(raw[mine].max(initial=0.0)), 1e-6)]
+            share = float(np.median(kept[acting] / raw[acting])) if acting.size else 0.0
+            present[names[k]], smallest = acting, self._smallest(names[k], mine, left) if asked is None else {}
+            out[names[k]] = Seen(share, {}, smallest)
+        visible = [name for name, seen in out.items() if seen.share >= LEAST_SHARE]
         wanted = [name for name in (visible if asked is None else asked) if name in visible]
-        out = {name: (share, dict[str, float]()) for name, share in shares.items()}
         if not wanted:
             return out
+        basis, widths = np.zeros_like(left), np.bincount(self.entry)
+        for width in np.unique(widths):  # all entries of one width at a time; without directions below a thousandth
+            mine = np.flatnonzero(widths[self.entry] == width)
+            basis[:, mine], _ = orthonormalise_groups(left[:, mine], int(width), least=1e-18, share=1e-6)
         mine = np.concatenate([present[name] for name in wanted])
-        columns = np.flatnonzero(np.isin(laid.entry, mine))
-        onto = (self.basis.T @ self.left[:, columns]) ** 2  # of each column, on every direction of the others
-        onto = np.add.reduceat(onto, _run_start_indices(laid.entry), axis=0)
-        onto = np.add.reduceat(onto, _run_start_indices(laid.entry[columns]), axis=1)
-        mine = np.unique(laid.entry[columns])
-        best = np.maximum.reduceat(onto, _run_start_indices(laid.owner), axis=0)
-        cosines = np.sqrt(np.minimum(best / np.maximum(self.kept[mine] ** 2, 1e-300), 1.0))
-        owners = [laid.names[k] for k in laid.owner[_run_start_indices(laid.owner)]]
+        at = np.flatnonzero(np.isin(self.entry, mine))
+        onto = (basis.T @ left[:, at]) ** 2  # of each column, on every direction of the others
+        onto = np.add.reduceat(onto, _run_start_indices(self.entry), axis=0)
+        onto = np.add.reduceat(onto, _run_start_indices(self.entry[at]), axis=1)
+        mine = np.unique(self.entry[at])
+        best = np.maximum.reduceat(onto, _run_start_indices(self.owner), axis=0)
+        cosines = np.sqrt(np.minimum(best / np.maximum(kept[mine] ** 2, 1e-300), 1.0))
+        owners = [names[k] for k in self.owner[_run_start_indices(self.owner)]]
         for name in wanted:
-            typical = np.median(cosines[:, laid.owner[mine] == laid.names.index(name)], axis=1)
+            typical = np.median(cosines[:, self.owner[mine] == names.index(name)], axis=1)
             like = dict(zip(owners, typical.tolist(), strict=True))
-            out[name] = (shares[name], {other: like[other] for other in visible if other != name})
+            out[name].like.update({other: like[other] for other in visible if other != name})
         return out
 
-    def smallest_detectable_amplitudes(self, effect: Effect) -> dict[int, float | None]:
-        """Return each amplitude's value at which an effect has lambda 8, median over settings; None if it has none."""
-        at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
-        columns = np.flatnonzero(np.isin(self.laid.entry, at))
-        settings = np.concatenate([self.laid.settings[k] for k in at])
-        lengths = np.linalg.norm(self.left[:, columns], axis=0)
+    def _smallest(self, name: str, entries: IntArray, left: FloatArray) -> dict[int, float | None]:
+        columns = np.flatnonzero(np.isin(self.entry, entries))
+        settings = np.concatenate([self.settings[k] for k in entries])
+        lengths = np.linalg.norm(left[:, columns], axis=0)
         out: dict[int, float | None] = {}
-        for k in effect.amplitudes:
+        for k in self.built[name].amplitudes:
             significant = (settings[:, k] != 0) & (lengths > 1e-3)
             sizes = np.abs(settings[significant, k]) * LAMBDA / lengths[significant]
             out[k] = float(np.median(sizes)) if sizes.size else None
@@ -201,6 +151,41 @@ class ProjectedTemplates:
 
 def _run_start_indices(codes: IntArray) -> IntArray:
     return np.flatnonzero(np.diff(codes, prepend=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """The model about which a plan is audited: a null at a point z (n_params,), and the noise sd of a reading.
+
+    `effects_under`: function of a plan, the effects scaled to it, by name, without those that cannot act there;
+    `assumed`: model and noise in words.
+    """
+
+    null: Null
+    z: FloatArray
+    sd: float
+    effects_under: Callable[[Plan], Mapping[str, Effect]]
+    assumed: str
+
+    def bank(self, plan: Plan, *, most: int | None = None) -> EffectBank:
+        """Build the templates of the effects on the mean under a plan.
+
+        Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
+        """
+        most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
+        model, built, rows = Model(self.null, (), plan), self.effects_under(plan), np.arange(len(plan))
+        predicted, slopes = model.predict_and_differentiate(self.z)
+        found = Fit(model, self.z, predicted, np.zeros(len(plan)), slopes, sd=self.sd, objective=0.0)
+        columns, settings, owner = [np.zeros((len(plan), 0))], list[FloatArray](), list[int]()
+        for at, effect in enumerate(built.values()):
+            if effect.stage is not Stage.NOISE:
+                templates = templates_of_effect(found, effect, rows, most=most)
+                columns += templates.columns
+                settings += templates.settings
+                owner += [at] * len(templates.columns)
+        entry = np.repeat(np.arange(len(settings)), [c.shape[1] for c in columns[1:]])
+        whole = np.concatenate(columns, axis=1) / self.sd
+        return EffectBank(slopes / self.sd, whole, entry, np.array(owner, dtype=np.int64), built, tuple(settings))
 
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
@@ -213,6 +198,7 @@ _READING_GUIDE = (
     "(fine: detected, and told from every other effect. aliased (X c): detected, but X can imitate it, with a cosine",
     " of c; the reverse need not hold. invisible: not detected.)",
 )
+_AS_CALIBRATED = "the sensor as calibrated"
 _NOISE = 0.01  # noise as a share of the span between the levels, likewise
 # Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
 _TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.2, 0.0, 0.0])
@@ -383,24 +369,23 @@ def audit_plan(
         require_same_unit(sensor, plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):
         noise_sd = float(sensor.noise_sd.mean())
-    templates_on, said = _expected_templates_and_description(plan, sensor, noise_sd, effects)
-    unit = plan.instrumentation.unit
+    expected, unit = _expected_sensor(plan, sensor, noise_sd, effects), plan.instrumentation.unit
     progress("judging the plan")
-    before, cosines = audits_and_cosines(templates_on(plan), list(effects), unit)
+    before, cosines = audits_and_cosines(expected.bank(plan), list(effects), unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
-    chosen = choose_cure_scans(plan, templates_on, ailing, progress)
+    chosen = choose_cure_scans(plan, expected, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
         current = join_plans([current, command.plan])
-        steps.append(audits_and_cosines(templates_on(current), list(effects), unit)[0])
+        steps.append(audits_and_cosines(expected.bank(current), list(effects), unit)[0])
     cured = _curing_step_by_effect(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
         Cure(**vars(command), cured=tuple(name for name, step in cured.items() if step == k))
         for k, command in enumerate(chosen[:n_kept], start=1)
     )
-    return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])
+    return PlanAudit(plan, expected.assumed, before, cosines, cures, steps[n_kept])
 
 
 def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
@@ -438,11 +423,11 @@ def audit_plan_of_diagnosis(
         null = with_free_form(default_sensor(extent, 1))
     else:
         null = default_sensor(extent, known.n_gaussians)
-    z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
-    sd = float(known.noise_sd.mean())
-    laid = _templates_of_sensor(null, z, sd, _levels(known.chain.names, mean), effects, plan, most=_SETTINGS)
-    effects_seen, cosines = audits_and_cosines(laid, list(effects), plan.instrumentation.unit)
-    return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
+    z, sd = np.clip(null.z(own)[0], -FARTHEST, FARTHEST), float(known.noise_sd.mean())
+    scaled, assumed = partial(_effects_under, effects, _levels(known.chain.names, mean)), _AS_CALIBRATED
+    expected = Expected(null, z, sd, scaled, f"{assumed} from these readings")
+    seen, cosines = audits_and_cosines(expected.bank(plan, most=_SETTINGS), list(effects), plan.instrumentation.unit)
+    return PlanAudit(plan, expected.assumed, seen, cosines, (), seen)
 
 
 def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
@@ -450,28 +435,21 @@ def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
     return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
 
 
-def _templates_of_sensor(
-    sensor: CalibratedSensor,
-    z: FloatArray,
-    sd: float,
-    levels: tuple[float, float],
-    kinds: Mapping[str, LightEffect],
-    plan: Plan,
-    *,
-    most: int | None = None,
-) -> PlanTemplates:
-    """Build the templates of effects scaled to the low and high level and to a plan, without those that cannot act."""
+def _effects_under(
+    kinds: Mapping[str, LightEffect], levels: tuple[float, float], plan: Plan
+) -> dict[str, Effect]:
+    """Scale effects to the low and high level and to a plan, without those that cannot act."""
     maybe = {name: kind.for_extent(Extent(*levels, plan)) for name, kind in kinds.items()}
-    able = {name: effect for name, effect in maybe.items() if effect is not None}
-    return PlanTemplates.of(sensor, z, sd, plan, able, most=most)
+    return {name: effect for name, effect in maybe.items() if effect is not None}
 
 
-def _expected_templates_and_description(
+def _expected_sensor(
     plan: Plan, sensor: SensorPrior | None, noise_sd: float | None, effects: Mapping[str, LightEffect]
-) -> tuple[Callable[..., PlanTemplates], str]:
-    """Return a function of a plan, the templates about the expected sensor, and that in words with its noise sd."""
+) -> Expected:
+    """Return a sensor as calibrated, or a typical one, of a noise sd or that expected of it."""
+    null: CalibratedSensor
     if sensor is not None:
-        null, said = sensor_from_samples(sensor), "the sensor as calibrated"
+        null, said = sensor_from_samples(sensor), _AS_CALIBRATED
         low, high = _levels(sensor.names, np.asarray(sensor.samples, dtype=np.float64).mean(axis=0))
         z = np.zeros(null.n_params)
     else:
@@ -479,33 +457,30 @@ def _expected_templates_and_description(
         bottom, top = (0.0 if inst.min is None else inst.min), (100.0 if inst.max is None else inst.max)
         span = top - bottom if top > bottom else 1e-6
         low, high = (bottom + share * span for share in _LEVELS)
-        null = default_sensor(Extent(low, high, plan), 2)
-        z = _TYPICAL.copy()
+        null, z = default_sensor(Extent(low, high, plan), 2), _TYPICAL.copy()
         said = f"a typical sensor of {low:g} to {high:g}"
     sd = _NOISE * (high - low) if noise_sd is None else noise_sd
     if not sd > 0:
         raise ParameterError("noise_sd", sd, "greater than 0")
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
-    return partial(_templates_of_sensor, null, z, sd, (low, high), effects), said
+    return Expected(null, z, sd, partial(_effects_under, effects, (low, high)), said)
 
 
-def audits_and_cosines(
-    laid: PlanTemplates, names: Sequence[str], unit: str
-) -> tuple[tuple[EffectAudit, ...], FloatArray]:
+def audits_and_cosines(bank: EffectBank, names: Sequence[str], unit: str) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column; shares on the diagonal)."""
-    seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
-    detectability = seen.detectable_shares_and_cosines()
+    n_points = len(bank.slopes)
+    every = bank.seen_in(np.arange(n_points))
     cosines, out = np.zeros((len(names), len(names))), list[EffectAudit]()
     for own, name in enumerate(names):
-        effect = laid.built.get(name)
+        effect = bank.built.get(name)
         if effect is None:
             out.append(EffectAudit(name, "invisible", 0.0, reason="its covariate does not vary here"))
         elif effect.stage is Stage.NOISE:
-            enough = seen.n_points >= LEAST_READINGS
-            reason = "" if enough else f"{seen.n_points} readings do not show the scatter; {LEAST_READINGS} would"
+            enough = n_points >= LEAST_READINGS
+            reason = "" if enough else f"{n_points} readings do not show the scatter; {LEAST_READINGS} would"
             out.append(EffectAudit(name, "fine" if enough else "invisible", float(enough), reason=reason))
         else:
-            share, like = detectability[name]
+            share, like, sizes = every[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
             if share < LEAST_SHARE:
@@ -515,7 +490,7 @@ def audits_and_cosines(
                 alike = sorted(((other, c) for other, c in like.items() if c >= ALIAS), key=lambda pair: -pair[1])
                 smallest = tuple(
                     DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
-                    for k, amount in seen.smallest_detectable_amplitudes(effect).items()
+                    for k, amount in sizes.items()
                 )
                 out.append(EffectAudit(name, "aliased" if alike else "fine", share, tuple(alike), smallest))
         cosines[own, own] = out[-1].share
@@ -529,7 +504,7 @@ _STRIDES = (1, 4)
 
 
 def choose_cure_scans(
-    plan: Plan, templates_on: Callable[..., PlanTemplates], ailing: Sequence[str], progress: Progress = silent
+    plan: Plan, expected: Expected, ailing: Sequence[str], progress: Progress = silent
 ) -> list[Command]:
     """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
 
@@ -546,12 +521,12 @@ def choose_cure_scans(
         if not options:
             break
         together = join_plans([current, *(option.plan for option in options)])
-        laid = templates_on(together, most=_SETTINGS)
+        bank = expected.bank(together, most=_SETTINGS)
         now = np.arange(len(current))
-        trouble = _total_detectability_deficit(laid, now, ailing)
+        trouble = _total_detectability_deficit(bank, now, ailing)
         worth = []
         for start, end in itertools.pairwise(np.cumsum([len(current), *(len(o.plan) for o in options)]).tolist()):
-            gained = trouble - _total_detectability_deficit(laid, np.concatenate([now, np.arange(start, end)]), ailing)
+            gained = trouble - _total_detectability_deficit(bank, np.concatenate([now, np.arange(start, end)]), ailing)
             readings = end - start
             worth.append(gained / readings if gained >= max(_WORTHWHILE, _WORTHWHILE_EACH * readings) else 0.0)
         best = int(np.argmax(worth))
@@ -562,12 +537,11 @@ def choose_cure_scans(
     return chosen
 
 
-def _total_detectability_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
+def _total_detectability_deficit(bank: EffectBank, rows: IntArray, ailing: Sequence[str]) -> float:
     """Return the summed deficit of the ailing effects on these rows: 0 fine, up to 1 aliased, 1 to 2 invisible."""
-    detectability = ProjectedTemplates.of(laid, rows).detectable_shares_and_cosines(ailing)
-    total = 0.0
+    every, total = bank.seen_in(rows, ailing), 0.0
     for name in ailing:
-        share, like = detectability.get(name, (0.0, {}))
+        share, like, _ = every.get(name, (0.0, {}, {}))
         if share < LEAST_SHARE:
             total += 2.0 - share / LEAST_SHARE
         else:
@@ -680,21 +654,22 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     built = cast(dict[str, Effect], {**forms, **on_noise})
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
-    laid = PlanTemplates.of(cast(Null, system), z, sd, cast(Plan, own), built, most=_SETTINGS_OF_TABLE)
+    assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
+    expected = Expected(cast(Null, system), z, sd, lambda _: built, assumed)
+    bank = expected.bank(cast(Plan, own), most=_SETTINGS_OF_TABLE)
     rows = np.arange(len(own))
     if len(own) > _MOST_ROWS:  # one in each of as many stretches; by the golden ratio, so that no column keeps step
         stretch = np.arange(_MOST_ROWS)
         rows = np.asarray((stretch + stretch * _GOLDEN % 1.0) * len(own) / _MOST_ROWS, dtype=np.int64)
     each = math.sqrt(len(own) / len(rows))  # every row taken stands for several, with as much information as they have
-    laid = replace(laid, slopes=each * laid.slopes[rows], columns=each * laid.columns[rows])
-    found, cosines = audits_and_cosines(laid, list(names), simulator.unit)
+    bank = replace(bank, slopes=each * bank.slopes[rows], columns=each * bank.columns[rows])
+    found, cosines = audits_and_cosines(bank, list(names), simulator.unit)
     effects = tuple(
         replace(e, reason=e.reason if e.share > 0 else reasons.get(e.name, e.reason))
         if e.detectability == "invisible"
         else replace(e, rows=math.ceil((LAMBDA / e.share) ** 2))
         for e in found
     )
-    assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words
     return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _alias_classes(effects))
 

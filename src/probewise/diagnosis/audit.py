@@ -333,29 +333,9 @@ def audit_plan(
 ) -> PlanAudit:
     """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
 
-    Parameters
-    ----------
-    plan
-        The plan to be measured, or that of a recording.
-    sensor
-        A calibrated sensor, whose posterior becomes the prior; None: a typical one.
-    noise_sd
-        Noise of one reading, in its unit; None: the calibrated sensor's, or a hundredth of the span between black and
-        white.
-    effects
-        The vocabulary, by name.
-    progress
-        Called for the plan, before each choice of a cure, and for the plan with each cure.
-
-    Returns
-    -------
-    PlanAudit
-        Detectability of every effect, and up to five scans to add.
-
-    Raises
-    ------
-    ParameterError
-        If the plan has no row, or an undescribed pattern, or another unit than the sensor, or the noise is not above 0.
+    Arguments and result, with up to five scans to add, are those of `probewise.audit`; and `noise_sd` of one reading,
+    in its unit (by default the calibrated sensor's, or a hundredth of the span between black and white), and the
+    vocabulary `effects`, by name. Raises ParameterError as that, and if units differ or the noise is not above 0.
     """
     if isinstance(plan, Recording):
         plan = plan.plan
@@ -435,9 +415,7 @@ def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
     return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
 
 
-def _effects_under(
-    kinds: Mapping[str, LightEffect], levels: tuple[float, float], plan: Plan
-) -> dict[str, Effect]:
+def _effects_under(kinds: Mapping[str, LightEffect], levels: tuple[float, float], plan: Plan) -> dict[str, Effect]:
     """Scale effects to the low and high level and to a plan, without those that cannot act."""
     maybe = {name: kind.for_extent(Extent(*levels, plan)) for name, kind in kinds.items()}
     return {name: effect for name, effect in maybe.items() if effect is not None}
@@ -613,28 +591,15 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
 
     The simulator is evaluated at the middle of its prior. If the readings there are constant, as those of a pendulum at
     rest, or not finite, another point of the prior is taken, and `assumed` says so. The column of readings is not used.
-
-    Parameters
-    ----------
-    simulator
-        The simulator.
-    table
-        Its input columns, row by row: a table, a dict of arrays, or a DataFrame.
-
-    Returns
-    -------
-    PlanAudit
-        Without cures; of each effect with the rows that it needs, and groups of aliased effects.
+    The audit has no cures, but of each effect the rows that it needs, and groups of aliased effects.
 
     Raises
     ------
     ParameterError
         If the table lacks a column that the simulator reads, time falls within a run, or the predicted readings are
         constant, or not finite in some row, at all points of the prior that are tried.
-    FileError
-        If `simulate`, `rates` or `observe` raises an error at every point of the prior that is tried.
-    ShapeError
-        If `simulate` or `observe` does not return one reading per row.
+    FileError, ShapeError
+        As `diagnose_system`.
     """
     table = table_for(simulator, table)
     table.require_rising_time()

@@ -227,27 +227,10 @@ def diagnose_system(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Diagnosis:
-    """Diagnose which physics a simulator leaves out, from a table of readings.
+    """Diagnose which physics a simulator leaves out, from a table of readings, as `probewise.diagnose` does.
 
-    Parameters
-    ----------
-    simulator
-        The model that predicts the readings.
-    table
-        The recorded rows, with the predicted column: a table, a dict of arrays, or a DataFrame.
-    source, notes
-        Name of the table, and notes on it for the report.
-    thorough
-        As in `diagnose`.
-    rng
-        Source of randomness.
-    progress
-        Called with each stage, and with the number of calls of `simulate`.
-
-    Returns
-    -------
-    Diagnosis
-        As that of `diagnose`.
+    `source`, `notes`: name of the table, and notes on it for the report; `thorough` as in `diagnose`; `progress` is
+    also called with the number of calls of `simulate`.
 
     Raises
     ------

@@ -61,15 +61,13 @@ def diagnose(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Diagnosis:
-    """Diagnose what physics the sensor model leaves out of these recordings.
+    """Diagnose what physics the sensor model leaves out of these recordings, as `probewise.diagnose` does.
+
+    Of more than 2,400 readings, about that many are used, in scans spread over all of them; residuals and predictions
+    cover every row. Arguments, result and errors are those of `probewise.diagnose`, and:
 
     Parameters
     ----------
-    recordings
-        One recording, or the first with those taken on its advice. Of more than 2,400 readings, about that many are
-        used, in scans spread over all of them; residuals and predictions cover every row.
-    sensor
-        An earlier posterior of the sensor, used as the prior; without it, the null is calibrated here.
     null
         Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape.
     effects
@@ -81,24 +79,11 @@ def diagnose(
     hands
         Whether a person can exchange or turn sheets for the next readings; if not, the next scans are over the sheet in
         place.
-    rng
-        Random generator, for the null distributions of the tests and the posterior samples.
-    progress
-        Called for every step, and for the refits within.
-
-    Returns
-    -------
-    Diagnosis
-        Verdict, probabilities, places (where each effect or residual shows: ranges of covariates), gain, aliases, the
-        repaired model and the next measurement.
 
     Raises
     ------
     ParameterError
-        If there is no usable reading, or units differ, or two recordings are the same, or both a sensor and a null are
-        given.
-    NotConvergedError
-        If the fit of the null did not converge.
+        As `probewise.diagnose`, and if both a sensor and a null are given.
     """
     require_rng(rng)
     require_progress(progress)

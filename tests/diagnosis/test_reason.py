@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 
 from probewise.diagnosis.apparatus import Words
-from probewise.diagnosis.reason import Grounds, covariate_of_unknown, reason_of
-from probewise.diagnosis.verdict import Hypothesis, Judged
+from probewise.diagnosis.verdict import Grounds, Hypothesis, Judged, covariate_of_unknown, reason_of
 
 OVEN = Words(null="the oven's law", find_signal="switch the heater on", settles_nothing="no reading tells them apart")
 GROUNDS = Grounds(OVEN, 100, 24, sentences={"lag": "the probe follows with 8 s", "step": "it jumps by 2 at 40 s"})

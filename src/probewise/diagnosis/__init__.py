@@ -5,6 +5,8 @@ finds a poor likelihood: it tests and locates residuals, explains them by named 
 the gain on held-out readings.
 """
 
+from __future__ import annotations
+
 from probewise.diagnosis.advice import Alias, NextMeasurement
 from probewise.diagnosis.apparatus import MOST_READINGS, SETTLED
 from probewise.diagnosis.audit import (
@@ -24,21 +26,22 @@ from probewise.diagnosis.diagnosis import (
     NEXT_PLAN,
     Diagnosis,
     PredictionAndResiduals,
+    Thorough,
+    diagnose,
     diagnosis_json,
     diagnosis_schema,
+    model_with,
 )
-from probewise.diagnosis.engine import Thorough, diagnose, model_with
 from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
 from probewise.diagnosis.fit import Null
 from probewise.diagnosis.fit_simulator import Evidence, SystemFit, calibrated_of, fit_json, fit_simulator, repaired_of
 from probewise.diagnosis.locate import ALARM, Place
 from probewise.diagnosis.prepared import join
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.reason import TO_SEPARATE
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.search.thorough import Weighing, weigh_thoroughly
 from probewise.diagnosis.sensors import SensorAndShape, SensorPrior
-from probewise.diagnosis.verdict import Hypothesis, Judged, Verdict
+from probewise.diagnosis.verdict import TO_SEPARATE, Hypothesis, Judged, Verdict
 from probewise.diagnosis.words import p_in_words
 
 __all__ = [

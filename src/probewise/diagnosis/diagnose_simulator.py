@@ -16,8 +16,7 @@ from scipy.special import ndtr
 from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._kinds import require_progress, require_rng
 from probewise._words import count_with_noun
-from probewise.diagnosis.diagnosis import Diagnosis
-from probewise.diagnosis.engine import Thorough, diagnose_prepared, diagnosis_of_search
+from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared, diagnosis_of_search
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording

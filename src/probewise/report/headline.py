@@ -8,8 +8,8 @@ import numpy as np
 
 from probewise._words import count_with_noun
 from probewise.diagnosis import ALARM, Diagnosis
-from probewise.diagnosis.reason import covariate_of_unknown
 from probewise.diagnosis.unknown_bases import MEMORY, PRODUCTS, SCAN_ENDS
+from probewise.diagnosis.verdict import covariate_of_unknown
 from probewise.diagnosis.words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
 from probewise.effects import PROPOSAL, RARE_EFFECTS
 from probewise.report.covariates import covariate_in_words_and_unit

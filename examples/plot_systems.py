@@ -130,7 +130,7 @@ for ax, (name, (own, _, covariate, label)) in zip(axes, systems.items(), strict=
     ax.axhline(0.0, color="0.8", linewidth=1)
     ax.plot(covariate, found[name].before.residuals, "o", markersize=3, color="tab:orange", label="as written down")
     ax.plot(covariate, found[name].after.residuals, "o", markersize=3, color="tab:blue", label="repaired")
-    ax.set_title(f"{name}: {' or '.join(found[name].judged.credible[:2])}", loc="left", fontsize=10)
+    ax.set_title(f"{name}: {' or '.join(found[name].credible[:2])}", loc="left", fontsize=10)
     ax.set_xlabel(label)
     ax.set_ylabel(f"residual ({own.unit})")
 axes[-1].legend(frameon=False, loc="lower right")

@@ -133,7 +133,7 @@ simulator = Simulator(
     "y", "V", dict.fromkeys("abcd", (-5, 5)), simulate=lambda p, u: sum(map(p.get, "abcd")) + u["x"], vectorized=True
 )
 found = diagnose_system(simulator, table, rng=np.random.default_rng(1))
-print(sorted(h.probability for h in found.judged.hypotheses)[-5:])
+print(sorted(h.probability for h in found.hypotheses)[-5:])
 print(repaired_of(found).to_json())
 """
 

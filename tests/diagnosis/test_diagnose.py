@@ -92,7 +92,7 @@ def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value
     left = list(seen)
     monkeypatch.setattr("probewise.diagnosis.verdict.bayes_factor_p_value", lambda *_: left.pop(0))
     found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
-    assert sorted(found.judged.order_probabilities) == [1, 2, 3, N_FREE_FORM]
+    assert sorted(found.order_probabilities) == [1, 2, 3, N_FREE_FORM]
     assert found.p_value == p_value
     assert len(seen) - len(left) == n_asked
 
@@ -103,7 +103,7 @@ def test_what_is_not_to_be_told_from_a_name_is_no_unknown():
     found = diagnose(recording("two_way", hidden.gain_drift(-0.03, 1600.0), seed=3), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"  # a battery that tires as the lamp does
     assert found.combination in (("gain_drift",), ("battery_sag",))
-    assert found.judged.unknown_probability < 0.05
+    assert found.unknown_probability < 0.05
 
 
 @pytest.mark.slow
@@ -167,7 +167,7 @@ def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     strict(found)
     assert found.verdict == "cannot_tell"
     assert found.p_value < 1e-6
-    cosines = {alias.effects: alias.cosine for alias in found.judged.aliases}
+    cosines = {alias.effects: alias.cosine for alias in found.aliases}
     assert cosines["backlash", "edge_misplacement"] > 0.99
     assert cosines["edge_misplacement", "sensor_tilt"] > 0.99
     # The repaired sensor holds what is left open, each in its share: no prediction is surer than the verdict.

@@ -106,7 +106,7 @@ def diagnosis_of_impossible():
 
 @pytest.mark.slow
 def test_every_probability_and_size_is_a_number(diagnosis_of_impossible):
-    assert sum(h.probability for h in diagnosis_of_impossible.judged.hypotheses) == pytest.approx(1.0)
+    assert sum(h.probability for h in diagnosis_of_impossible.hypotheses) == pytest.approx(1.0)
     # Not the size of readings a thousand noise sds off, which stands for an impossible one.
     assert diagnosis_of_impossible.effects
     assert all(effect.size_lambda < 200 for effect in diagnosis_of_impossible.effects)

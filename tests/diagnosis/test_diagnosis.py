@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis import Diagnosis, Judged, NextMeasurement
+from probewise.diagnosis import Diagnosis, NextMeasurement
 from probewise.diagnosis.diagnosis import PredictionAndResiduals, _public_names
 from probewise.diagnosis.findings import EffectFound
 from probewise.diagnosis.light_sensor import LightSensorApparatus
@@ -16,11 +16,11 @@ from probewise.diagnosis.verdict import Hypothesis
 from probewise.recordings import Plan, Uniform
 from probewise.scene import Circle
 
-JUDGED = Judged("clean", (), 0.4, (Hypothesis((), 1.0),))
 PREDICTED = PredictionAndResiduals(np.zeros(2), np.zeros(2))
 FOUND = Diagnosis(
-    None, LightSensorApparatus(), JUDGED, "All is explained.", (), None, *[None] * 3, PREDICTED, PREDICTED
-)
+    "clean", (), 0.4, (Hypothesis((), 1.0),), apparatus=LightSensorApparatus(), reason="All is explained.", effects=(),
+    before=PREDICTED, after=PREDICTED, **dict.fromkeys(("recording", "noise", "null", "repaired", "improvement")),
+)  # fmt: skip
 
 
 def test_an_effect_that_is_there_twice_is_written_twice_by_its_name():

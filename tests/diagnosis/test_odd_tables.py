@@ -42,7 +42,7 @@ def test_an_odd_table_gets_a_verdict(name):
     simulator, table = _TABLES[name]
     diagnosis = diagnose_system(simulator, table, rng=np.random.default_rng(1))
     assert diagnosis.verdict in ("clean", "named", "noise", "cannot_tell", "unknown")
-    assert sum(h.probability for h in diagnosis.judged.hypotheses) == pytest.approx(1.0)
+    assert sum(h.probability for h in diagnosis.hypotheses) == pytest.approx(1.0)
 
 
 def _table_with_a_gap(*, law):

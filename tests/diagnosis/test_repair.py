@@ -33,7 +33,10 @@ def repair(absent=None, residuals=(1.0, np.nan)):
     )
     before = PredictionAndResiduals(np.zeros(2), np.array([1.0, np.nan]))
     after = PredictionAndResiduals(np.zeros(2), np.array(residuals))
-    return Diagnosis(None, LightSensorApparatus(), None, "", (), None, model, model, None, before, after)
+    return Diagnosis(
+        "clean", (), 1.0, (), recording=None, apparatus=LightSensorApparatus(), reason="", effects=(), noise=None,
+        null=model, repaired=model, improvement=None, before=before, after=after,
+    )  # fmt: skip
 
 
 def test_a_repair_that_predicts_the_same_changes_nothing():

@@ -133,10 +133,10 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     """The knife edge: the smallest p-value is seen in no mean, and the place is what the headline names."""
     sizes = {"slope": 1.0, "time": 5.0, "place": 3.0}
     where = [place_of(name, start) for name, start in (("slope", 0.0), ("time", 1.0), ("place", 2.0))]
-    judged = SimpleNamespace(unknown_shares={"place, smooth": 0.9})
     apparatus = SimpleNamespace(words=SimpleNamespace(run="scan"))
     where.append(dataclasses.replace(where[2], scan="s"))
-    found = SimpleNamespace(verdict="unknown", judged=judged, where=tuple(where), apparatus=apparatus)
+    shares = {"place, smooth": 0.9}
+    found = SimpleNamespace(verdict="unknown", unknown_shares=shares, where=tuple(where), apparatus=apparatus)
     monkeypatch.setattr(covariates, "covariate_values", lambda d, place: np.arange(3.0))
     monkeypatch.setattr(covariates, "views_of_place", lambda d, place: [place])
     chance = SimpleNamespace(largest_mean_in_sds=lambda d, view: sizes[view.covariate])
@@ -164,7 +164,6 @@ def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
         next_measurement=plan,
         apparatus=LightSensorApparatus(),
         hypotheses=(),
-        judged=SimpleNamespace(unknown_shares={}),
         repaired=SimpleNamespace(effects=()),
     )
     said = page._next_readings_in_words(found)

@@ -33,15 +33,13 @@ def found(
         effects=tuple(named) if combination != ("unknown",) else (),
         where=(),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
-        judged=SimpleNamespace(
-            unknown_shares=shares or {},
-            too_little=few,
-            withdrawn=withdrawn,
-            shared=shared,
-            leader=leader,
-            stated=shared if leader else tuple(combination),
-            beside_shared=tuple(Hypothesis(tuple(names), p) for names, p in open_beside),
-        ),
+        unknown_shares=shares or {},
+        too_little=few,
+        withdrawn=withdrawn,
+        shared=shared,
+        leader=leader,
+        stated=shared if leader else tuple(combination),
+        beside_shared=tuple(Hypothesis(tuple(names), p) for names, p in open_beside),
     )
 
 

@@ -47,9 +47,7 @@ from probewise.diagnosis.verdict import (
     N_DRAWS,
     GlobalTest,
     Grounds,
-    Hypothesis,
     Judged,
-    Verdict,
     judge,
     reason_of,
     run_global_test,
@@ -199,9 +197,9 @@ def _place_in_everything(place: Place, prepared: Prepared) -> Place:
     return replace(place, values=everywhere, curve_at=at)
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis(ShowsItself):
-    """The result of a diagnosis: the content of diagnosis.json, and the arrays for its figures.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Diagnosis(Judged, ShowsItself):
+    """The result of a diagnosis, which is the verdict and more: all of diagnosis.json, and the arrays for its figures.
 
     `recording` is what was diagnosed (several are joined). `reason`: the verdict and its reason, in a sentence or two.
     `effects`: findings on those of probability above 0.001, most probable first. `null`, `repaired`: posterior samples
@@ -218,7 +216,6 @@ class Diagnosis(ShowsItself):
 
     recording: Recording
     apparatus: Apparatus
-    judged: Judged
     reason: str
     effects: tuple[EffectFound, ...]
     noise: NoiseFound
@@ -234,26 +231,6 @@ class Diagnosis(ShowsItself):
     weighings: tuple[Weighing, ...] = ()
     remainder: Remainder | None = None
     formula: Formula | None = None
-
-    @property
-    def verdict(self) -> Verdict:
-        """The verdict: clean, named, cannot_tell, unknown or noise."""
-        return self.judged.verdict
-
-    @property
-    def p_value(self) -> float:
-        """p-value of the global test of the calibrated model: small if an effect on the mean is missing."""
-        return self.judged.p_value
-
-    @property
-    def combination(self) -> tuple[str, ...]:
-        """Most probable set of effects; () if clean or none is named, ("unknown",) if unknown."""
-        return self.judged.combination
-
-    @property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """All hypotheses (sets of effects) with their probabilities, most probable first."""
-        return self.judged.hypotheses
 
     @property
     def repair_changes_predictions(self) -> bool:
@@ -381,8 +358,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     Figures of places (`where`) and the next plan are given by file name; the report and the command line write them.
     """
     require_kind("diagnosis", diagnosis, Diagnosis, "a Diagnosis, as diagnose and diagnose_system return it")
-    judged, plan = diagnosis.judged, diagnosis.next_measurement
-    remainder, formula = diagnosis.remainder, diagnosis.formula
+    plan, remainder, formula = diagnosis.next_measurement, diagnosis.remainder, diagnosis.formula
     document: dict[str, Any] = {
         "format": "diagnosis/1",
         "verdict": diagnosis.verdict,
@@ -393,12 +369,12 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "effects": [
             _without_empty_formula(e, "scans") | {"name": name_without_copy_suffix(e.name)} for e in diagnosis.effects
         ],
-        "unknown_probability": judged.unknown_probability,
-        "clean_probability": judged.clean_probability,
+        "unknown_probability": diagnosis.unknown_probability,
+        "clean_probability": diagnosis.clean_probability,
         "unknown_candidates": [
-            {"name": name, "probability": probability} for name, probability in judged.unknown_candidates
+            {"name": name, "probability": probability} for name, probability in diagnosis.unknown_candidates
         ],
-        "credible_set": judged.credible,
+        "credible_set": diagnosis.credible,
         "where": [
             {
                 "covariate": place.covariate,
@@ -411,7 +387,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
             for place in diagnosis.where
         ],
         "improvement": _as_dict(diagnosis.improvement, "heldout_by_scan", "comes_next"),
-        "aliases": [asdict(a) for a in judged.aliases],
+        "aliases": [asdict(a) for a in diagnosis.aliases],
         "noise": _as_dict(diagnosis.noise, "nuisances"),
         "next_measurement": None
         if plan is None
@@ -568,7 +544,7 @@ def diagnosis_of_search(
     return Diagnosis(
         recording=prepared.everything,
         apparatus=prepared.apparatus,
-        judged=judged,
+        **vars(judged),
         reason=reason,
         effects=found,
         noise=noise,

@@ -299,7 +299,7 @@ def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
         "hypotheses": [
             [list(h.effects), h.probability] for h in diagnosis.hypotheses if h.probability > _LEAST_PROBABILITY
         ],
-        "credible_set": list(diagnosis.judged.credible),
+        "credible_set": list(diagnosis.credible),
     }
 
 

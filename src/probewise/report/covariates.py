@@ -264,7 +264,7 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
 
     It is 0 unless the verdict is `unknown` and the most probable form of the effect is a family of bases.
     """
-    shares = diagnosis.judged.unknown_shares
+    shares = diagnosis.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in RARE_EFFECTS:
         return 0.0
     within = " within scans" if place.scan is not None and place.covariate != diagnosis.apparatus.words.run else ""

@@ -145,7 +145,7 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         facts.append(("As a formula", _formula_in_words(diagnosis.formula)))
     if diagnosis.remainder is not None:
         facts.append(("Beside that", _as_sentence(diagnosis, diagnosis.remainder.sentence)))
-    if not diagnosis.judged.too_little:
+    if not diagnosis.too_little:
         facts.append(("Could it be chance?", _could_be_chance_in_words(diagnosis)))
     if gain.heldout_by_scan and changes:
         predicts = _heldout_gain_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd)
@@ -219,7 +219,7 @@ def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
 
 def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     plan = diagnosis.next_measurement
-    if plan is None and diagnosis.judged.too_little:
+    if plan is None and diagnosis.too_little:
         cure = diagnosis.apparatus.words.find_signal
         return f"{cure[:1].upper()}{cure[1:]}, and take more readings."
     if plan is None and diagnosis.is_settled:
@@ -239,7 +239,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
-    credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.judged.credible]
+    credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.credible]
     likely = [e for e in diagnosis.effects if e.probability > _LIKELY]
     told = [f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}" for e in likely]
     listed = [h for h in diagnosis.hypotheses[:8] if h.probability > 1e-3]
@@ -269,7 +269,7 @@ def _unknown_effect_candidates(diagnosis: Diagnosis) -> Sequence[str]:
     """Write a sentence on the likely candidates for an unknown effect; empty if none is likely."""
     candidates = ", ".join(
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
-        for name, p in diagnosis.judged.unknown_candidates
+        for name, p in diagnosis.unknown_candidates
         if p > _LIKELY
     )
     opening = "Candidates for the unknown effect (a covariate that it depends on, or a form)"
@@ -413,8 +413,8 @@ def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> t
 
 def _alias_elements(diagnosis: Diagnosis) -> Sequence[str]:
     """List the aliased pairs, those with effects of the credible set first; all but the first eight are folded away."""
-    credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
-    ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
+    credible = {name for label in diagnosis.credible for name in label.split("+")}
+    ranked = sorted(diagnosis.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
     if not ranked:
         return ("None: these readings tell apart all effects of the vocabulary that they can detect.",)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]

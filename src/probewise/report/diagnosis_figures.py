@@ -69,7 +69,7 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
 
     For the verdict `noise` it is the name of the largest noise effect, else a view of residuals along a covariate.
     """
-    if diagnosis.judged.too_little:
+    if diagnosis.too_little:
         return "readings"
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}

@@ -30,7 +30,7 @@ def headline(diagnosis: Diagnosis) -> str:
 def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
     """List wordings of a diagnosis's verdict, the most complete first; the last always has at most twenty words."""
     n = int(diagnosis.recording.usable.sum())
-    if diagnosis.judged.too_little:
+    if diagnosis.too_little:
         return [_too_few_readings_sentence(diagnosis, n)]
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
@@ -55,7 +55,7 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
 
 def _with_rivals(diagnosis: Diagnosis, versions: Sequence[tuple[str, str]]) -> list[str]:
     """Add the hypotheses that remain possible to the first sentence of each version; without them where none fits."""
-    stated = frozenset(diagnosis.judged.stated)
+    stated = frozenset(diagnosis.stated)
     rivals = [
         h.effects
         for h in diagnosis.hypotheses
@@ -70,9 +70,9 @@ def _with_rivals(diagnosis: Diagnosis, versions: Sequence[tuple[str, str]]) -> l
 def _told_with_sizes(diagnosis: Diagnosis) -> list[str]:
     """Return the sentence on the effects that the verdict states, with sizes and dates; none if one lacks it."""
     told = {effect.name: effect.sentence for effect in diagnosis.effects if effect.sentence}
-    if not all(name in told for name in diagnosis.judged.stated):
+    if not all(name in told for name in diagnosis.stated):
         return []
-    joined = diagnosis.apparatus.words.as_sentence("; ".join(told[name] for name in diagnosis.judged.stated))
+    joined = diagnosis.apparatus.words.as_sentence("; ".join(told[name] for name in diagnosis.stated))
     return [typeset_numbers(f"{joined}.")]
 
 
@@ -85,7 +85,7 @@ def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
 
 def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
     sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
-    names = effects_in_words(sorted(diagnosis.judged.stated, key=lambda k: -sizes.get(k, 0.0)))
+    names = effects_in_words(sorted(diagnosis.stated, key=lambda k: -sizes.get(k, 0.0)))
     if len(names) == 1:
         return [f"{opening} {names[0]}.", f"{opening} one effect."]
     return [
@@ -96,7 +96,7 @@ def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
 
 
 def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
-    shares = diagnosis.judged.unknown_shares
+    shares = diagnosis.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
     family = top.partition(", ")[0].removesuffix(" within scans")
     shows_in = covariate_of_unknown(top, [place.covariate for place in diagnosis.where])
@@ -133,13 +133,13 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
         return [*(f"{plain}; if so, {most}{either}." for either in _rival_versions(likely)), f"{plain}."]
     said = []
     something = "Something is missing"
-    if diagnosis.judged.shared:
-        something = f"Beside {join_names(effects_in_words(diagnosis.judged.shared))}, something is missing"
+    if diagnosis.shared:
+        something = f"Beside {join_names(effects_in_words(diagnosis.shared))}, something is missing"
     if len(rivals) > 1:
         every, *cut = _rival_versions(rivals)
         said = [f"{something}: {every}; these readings cannot tell which.", f"{something}: {every}."]
         said += [f"{something}: {some}." for some in cut]
-    elif diagnosis.judged.withdrawn:
+    elif diagnosis.withdrawn:
         leader = hypothesis_in_words(diagnosis.hypotheses[0].effects)
         said = [f"Something is missing; {leader} fits best, but predicts new readings worse."]
     return [*said, f"{something}, but these readings cannot tell what.", _CANNOT_TELL]
@@ -147,9 +147,9 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
 
 def _open_beside_shared(diagnosis: Diagnosis) -> list[str]:
     """List wordings of what may act beside named effects that all rivals share, the most complete first."""
-    if not diagnosis.judged.leader:
+    if not diagnosis.leader:
         return []
-    rivals = [h.effects for h in diagnosis.judged.beside_shared if h.probability > _RIVAL]
+    rivals = [h.effects for h in diagnosis.beside_shared if h.probability > _RIVAL]
     return [] if len(rivals) < 2 or () in rivals else _rival_versions(rivals)
 
 

@@ -173,7 +173,7 @@ def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0
         diagnose_system(simulator, {"t_s": t + shift, "u": u, "y": y}, rng=np.random.default_rng(1))
         for shift in (0.0, EPOCH)
     )
-    expected, found = ({h.effects: h.probability for h in d.judged.hypotheses} for d in (near, later))
+    expected, found = ({h.effects: h.probability for h in d.hypotheses} for d in (near, later))
     assert later.verdict == near.verdict
     assert {"drift": ("offset_drift",), "wave": ("interference",)}[kind] in list(found)[:2]
     for effects, probability in expected.items():

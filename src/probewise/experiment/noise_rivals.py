@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Self
 
 import numpy as np
@@ -81,10 +81,12 @@ class DeclaredNoise:
         sd, step = self.sd if sd is None else sd, self.step if step is None else step
         if step == 0:
             within = log_gaussian_density(readings, predicted, sd)
-        elif np.min(sd) < _SMOOTH * step:
-            within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
-        else:  # the density at the cell's middle, of the noise and a uniform cell
+        elif np.min(sd) >= _SMOOTH * step:  # the density at the cell's middle, of the noise and a uniform cell
             within = log_gaussian_density(readings, predicted, np.hypot(sd, step / math.sqrt(12.0))) + math.log(step)
+        elif np.ndim(sd) == 0:
+            within = _rounded(float(sd), step).log_cell_probability(np.abs(readings - predicted) / sd)
+        else:
+            within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
         return self._with_probability_at_ends(readings, predicted, sd, within)
 
     def log_uniform_density(self, readings: FloatArray, low: float, high: float) -> FloatArray:
@@ -104,6 +106,11 @@ class DeclaredNoise:
         if self.ends is None or inside.all():
             return within
         return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))
+
+
+@cache
+def _rounded(sd: float, step: float) -> Rounded:
+    return Rounded(sd, step)  # keeps its table
 
 
 @dataclass(frozen=True, eq=False)

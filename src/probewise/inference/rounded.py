@@ -110,17 +110,17 @@ class Rounded:
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = self.ends.end_mask(readings)
         if at_end.any():
-            within = self._log_cell_probability(away[:, ~at_end]).sum(axis=1)
+            within = self.log_cell_probability(away[:, ~at_end]).sum(axis=1)
             beyond = self.ends.log_prob_at_ends(readings[at_end], predicted[:, at_end], self.sd)
             return np.asarray(within + beyond.sum(axis=1))
-        return np.asarray(self._log_cell_probability(away).sum(axis=1))
+        return np.asarray(self.log_cell_probability(away).sum(axis=1))
 
     @cached_property
     def ends(self) -> ScaleEnds:
         """The outermost readings of the scale."""
         return ScaleEnds.from_range(self.low, self.high, self.step, whole_steps=self.whole_steps)
 
-    def _log_cell_probability(self, away: FloatArray) -> FloatArray:
+    def log_cell_probability(self, away: FloatArray) -> FloatArray:
         """Return the log probability of readings' cells from their distances to the prediction in sds, by a table."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)

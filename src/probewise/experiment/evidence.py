@@ -20,13 +20,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.experiment.kinds import KindProblem, Posterior, n_samples_of_kind
-from probewise.inquiry.smc import (
-    BRIEF,
-    LocalKernels,
-    Particles,
-    nested_sampling_from_scratch,
-    particles_from_posterior,
-)
+from probewise.inquiry.smc import BRIEF, LocalKernels, nested_sampling_from_scratch, particles_from_posterior
 from probewise.nested import Weighted
 from probewise.nested.importance import evenly_weighted, weighted_draws
 
@@ -51,14 +45,13 @@ def can_sleep_mask(now: Posterior) -> BoolArray:
     Such a kind is known to be far behind, and even if it had predicted every reading since exactly, it would be; which
     is what its evidence then says.
     """
-    raised = now.with_raised_fault_odds().probability
-    known = np.array([p.asleep or _evidence_is_known(p) for p in now.particles])
-    return np.asarray(known & (raised < _SLEEPS) & now.doubts_sensor)
+    asleep, raised = np.array([p.asleep for p in now.particles]), now.with_raised_fault_odds().probability
+    return np.asarray((asleep | _known_mask(now)) & (raised < _SLEEPS) & now.doubts_sensor)
 
 
-def _evidence_is_known(particles: Particles) -> bool:
-    """Return whether samples followed all readings without difficulty, and have many ancestors at their start."""
-    return not particles.is_doubtful and particles.log_z_error < _SURE
+def _known_mask(now: Posterior) -> BoolArray:
+    """Mark the kinds whose samples followed all readings without difficulty, and descend from many, (n_kinds,)."""
+    return np.array([not p.is_doubtful and p.log_z_error < _SURE for p in now.particles])
 
 
 def with_evidence_from_prior(
@@ -81,11 +74,10 @@ def with_evidence_from_prior(
     """
     n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
     raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
-    asleep, doubtful, strained = (
-        np.array([getattr(p, name) for p in now.particles]) for name in ("asleep", "is_doubtful", "strained")
-    )
+    names = ("asleep", "is_doubtful", "strained")
+    asleep, doubtful, strained = (np.array([getattr(p, name) for p in now.particles]) for name in names)
     searched_at, matters = np.array([p.searched_at for p in now.particles]), raised > _MATTERS
-    unsure = np.where(asleep, matters, [not _evidence_is_known(p) for p in now.particles])
+    unsure = np.where(asleep, matters, ~_known_mask(now))
     if at_end:
         unsure |= ~asleep & (searched_at < _OLD * n_readings)
         due = np.flatnonzero(unsure & (now.doubts_sensor | (raised > _HAS_A_SAY)))

@@ -229,27 +229,25 @@ class NoiseModel:
             return float(values[min(node, len(values) - 1), 0])
 
         sd = noise.sd[min(node, len(noise.sd) - 1)]
-        sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
+        sd = np.full(len(far), sd[0]) if len(sd) == 1 else sd[self.recording.usable]
         lost_share, value, lost = value_at_node(noise.lost_share), value_at_node(noise.lost_value), np.zeros_like(far)
-        if lost_share > 0:
-            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * self._span + 1e-14 * abs(value))
-        n_rows, above = self._n_rows_since_previous_in_scan, self._previous_in_scan
-        carry = np.where(n_rows > 0, value_at_node(noise.rho) ** np.maximum(n_rows, 1), 0.0)
-        # The noise of a censored reading is not known: none is correlated with it.
-        unknown = lost | self._censored
-        carry[unknown | (above >= 0) & unknown[above]] = 0.0
-        walk = np.zeros(0)
-        if np.any(noise.walk):  # from the row of the previous usable reading, even of another run
-            walk = value_at_node(noise.walk) ** 2 * np.diff(np.flatnonzero(self.recording.usable), prepend=-1.0)
         log_extra = 0.0
         if lost_share > 0:
+            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * self._span + 1e-14 * abs(value))
             n_lost, cells = int(lost.sum()), max(self._span / self._lost_value_resolution, 1.0)
             # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
             log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
             log_extra += int((lost & self._censored).sum()) * math.log(self._lost_value_resolution)
             log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
-        interleaved = np.any((above >= 0) & (above != np.arange(len(above)) - 1)) and np.any(carry)
+        rho, carry = value_at_node(noise.rho), np.zeros(len(far))
+        if rho:
+            n_rows, above = self._n_rows_since_previous_in_scan, self._previous_in_scan
+            # The noise of a censored reading is not known: none is correlated with it.
+            unknown = lost | self._censored
+            alone = (n_rows == 0) | unknown | (above >= 0) & unknown[above]
+            carry = np.where(alone, 0.0, rho ** np.maximum(n_rows, 1))
+        step = value_at_node(noise.walk)
         return NoiseLaw(
             sd,
             carry,
@@ -258,8 +256,8 @@ class NoiseModel:
             value_at_node(noise.wide_times),
             log_extra,
             least=self.least_sd,
-            walk=walk,
-            before=np.maximum(above, 0) if interleaved else np.zeros(0, dtype=np.int64),
+            walk=step**2 * self._n_rows_since_previous if step else np.zeros(0),
+            before=self._before_if_interleaved if rho else np.zeros(0, dtype=np.int64),
             censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
         )
 
@@ -272,12 +270,22 @@ class NoiseModel:
         return previous_usable(self.recording)
 
     @cached_property
+    def _before_if_interleaved(self) -> IntArray:
+        above = self._previous_in_scan
+        return np.maximum(above, 0) if np.any((above >= 0) & (above != np.arange(len(above)) - 1)) else above[:0]
+
+    @cached_property
     def _usable_readings(self) -> FloatArray:
         return self.recording.readings[self.recording.usable]
 
     @cached_property
     def _span(self) -> float:
         return float(np.ptp(self._usable_readings))
+
+    @cached_property
+    def _n_rows_since_previous(self) -> FloatArray:
+        """Number of rows back to the previous usable reading, even of another run, (n_usable,)."""
+        return np.diff(np.flatnonzero(self.recording.usable), prepend=-1.0)
 
     @cached_property
     def _n_rows_since_previous_in_scan(self) -> IntArray:

@@ -7,7 +7,8 @@ import pytest
 
 from probewise.systems import Law, RunTable
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
-from probewise.systems.law import LawWithEffects, Limit, integrate_states
+from probewise.systems.integrate import integrate_states
+from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.step import steps_for_table
 
 

@@ -12,7 +12,8 @@ from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.all_steps import TrajectoryCache
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.inputs import delayed_held_column
-from probewise.systems.law import LawWithEffects, Limit, integrate_states
+from probewise.systems.integrate import integrate_states
+from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.system import with_converged_step
 

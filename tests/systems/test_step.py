@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from probewise.systems.law import LawWithEffects, Limit, Stepper
+from probewise.systems.integrate import Stepper
+from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.simulator import Law
 from probewise.systems.step import FOURTH_ORDER, RODAS, cheapest_steps, eighth_order_method
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.systems.law import (
-    LawWithEffects,
+from probewise.systems.integrate import (
     evaluations_per_step,
     initial_states,
     integrate_states,
@@ -27,6 +26,7 @@ from probewise.systems.law import (
     step_in_part,
     time_gaps,
 )
+from probewise.systems.law import LawWithEffects
 from probewise.systems.law_inputs import LawInputs
 from probewise.systems.step import Steps
 
@@ -291,7 +291,7 @@ def _stepping_function(
     """
     motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
-    given = LawInputs.of(motion.law, steps, parameters, columns, motion.between_rows)
+    given = LawInputs.of(motion, steps, parameters, columns)
     gap = steps.gap_of_step
     passing = time_gaps(steps, columns)[:, gap]
     passing = passing.reshape(len(passing), -1)

@@ -24,6 +24,7 @@ from probewise.recordings.io import EndedByFile
 from probewise.systems.simulator import Simulate, Simulator, read_simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
+_NODES = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))  # in its range
 _MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
 _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 _WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
@@ -137,21 +138,51 @@ class Caller:
         ShapeError
             If it does not return one number per row.
         """
-        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
-        if broadcasts:
-            together = cls(simulate, broadcasts=True, name=name)
-            _require_finite_and_repeatable(together, _readings_or_nan(together, samples, columns), samples, columns)
-            return together
-        alone = one(samples, columns, strict=True)
-        _require_finite_and_repeatable(one, alone, samples, columns)
         together = cls(simulate, broadcasts=True, name=name)
+        if broadcasts:
+            together._require_finite_and_repeatable(_readings_or_nan(together, samples, columns), samples, columns)
+            return together
+        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
+        alone = one(samples, columns, strict=True)
+        one._require_finite_and_repeatable(alone, samples, columns)
+        if together._returns(alone, samples, columns):
+            return together
+        taken = set(per_run)
+        for own, values in samples.items():  # parameters that may be arrays (n_points,) in a call for one sample
+            trial = cls(simulate, broadcasts=False, by_row=frozenset({*per_run, own}))
+            if own not in per_run and trial._returns(
+                alone, {**samples, own: np.broadcast_to(values, alone.shape)}, columns
+            ):
+                taken.add(own)
+        return cls(simulate, broadcasts=False, by_row=frozenset(taken), name=name)
+
+    def _returns(
+        self, readings: FloatArray, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
+    ) -> bool:
+        """Return whether a call for samples returns these readings; False if it raises an error."""
         try:
-            if _nearly_equal(together(samples, columns, strict=True), alone):
-                return together
+            return _nearly_equal(self(samples, columns, strict=True), readings)
         except Exception:
-            pass
-        by_row = frozenset(per_run) | _parameters_accepted_by_row(one, samples, columns, alone, per_run)
-        return cls(simulate, broadcasts=False, by_row=by_row, name=name)
+            return False
+
+    def _require_finite_and_repeatable(
+        self, readings: FloatArray, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Raise ParameterError unless readings of samples hold a finite number, and another call for one returns it."""
+        sound = np.isfinite(readings).any(axis=1)
+        if not sound.any():
+            found = f"not finite at any of the {sound.size} points of the prior that were tried"
+            allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
+            raise ParameterError(self.name, found, allowed)
+        at = int(np.argmax(sound))
+        again = Caller(self.simulate, self.broadcasts, self.by_row, name=self.name)
+        if not _nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]]):
+            raise ParameterError(
+                self.name,
+                "different when it is called again with the same parameters",
+                "the same readings each time: no random numbers (declare the noise instead), no state kept between "
+                "calls",
+            )
 
     def __call__(
         self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, strict: bool = False
@@ -176,9 +207,14 @@ class Caller:
             ]
             for first in range(0, n_samples, step := max(_MOST_REMEMBERED // (2 * _N_NODES * n_points), 1)):
                 self._call_ahead(samples[first : first + step], n_points)
-                for k, (values, table) in enumerate(samples[first : first + step], start=first):
+                for k, (own, table) in enumerate(samples[first : first + step], start=first):
                     try:
-                        out[k] = self._call_for_one_sample(values, table, n_points)
+                        readings: Any = 0.0
+                        for share, fixed in self._interpolation(own, n_points):
+                            self.interpolated.update(name for name in own if np.ndim(own[name]) != np.ndim(fixed[name]))
+                            called = self._cached_call(fixed, table, n_points)
+                            readings = called if share is None else readings + share * called
+                        out[k] = readings
                     except (ShapeError, KeyboardInterrupt):
                         raise
                     except Exception as error:
@@ -225,25 +261,19 @@ class Caller:
         each set of changed columns, together and apart.
         """
         changed = frozenset(name for name, values in columns.items() if np.ndim(values) == 2)
-        if not changed:
-            return True
-        if changed not in self._taken_together:
-            trial = Caller(self.simulate, broadcasts=True, name=self.name)
+        if changed and changed not in self._taken_together:
             own = {name: values[[0, -1]] for name, values in parameters.items()}
             given = dict(columns)
             for name in changed:  # a column, and a copy raised by about 1 % of its size
-                own_column = columns[name][0]
-                size = float(np.nanmax(np.abs(own_column), initial=0.0)) or 1.0
-                given[name] = np.stack([own_column, 1.01 * own_column + 0.01 * size])
-            shape = 2, max(np.shape(v)[-1] for v in columns.values())
+                size = float(np.nanmax(np.abs(columns[name][0]), initial=0.0)) or 1.0
+                given[name] = np.stack([columns[name][0], 1.01 * columns[name][0] + 0.01 * size])
+            trial = Caller(self.simulate, broadcasts=True, name=self.name, _taken_together={changed: True})
             try:
-                together = trial._call_together(own, given, shape, strict=True)
-                each = (_values_of_sample(own, given, k) for k in range(2))
-                apart = [trial._call_together(*of_one, (1, shape[1]), strict=True) for of_one in each]
-                self._taken_together[changed] = _nearly_equal(together, np.concatenate(apart))
+                apart = [trial(*_values_of_sample(own, given, k), strict=True) for k in range(2)]
+                self._taken_together[changed] = trial._returns(np.concatenate(apart), own, given)
             except Exception:
                 self._taken_together[changed] = False
-        return self._taken_together[changed]
+        return not changed or self._taken_together[changed]
 
     def _cached_call(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
         """Return the readings of one sample, (n_points,), by a call or from an earlier one with the same arguments."""
@@ -279,17 +309,6 @@ class Caller:
         self.n_calls += 1
         self.on_call()
 
-    def _call_for_one_sample(
-        self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int
-    ) -> FloatArray:
-        out = np.zeros(n_points)
-        for share, fixed in self._interpolation(own, n_points):
-            if share is None:
-                return self._cached_call(fixed, columns, n_points)
-            self.interpolated.update(name for name in own if np.ndim(own[name]) != np.ndim(fixed[name]))
-            out += share * self._cached_call(fixed, columns, n_points)
-        return out
-
     def _interpolation(
         self, own: Mapping[str, Any], n_points: int
     ) -> Iterator[tuple[FloatArray | None, Mapping[str, Any]]]:
@@ -301,7 +320,10 @@ class Caller:
         if not vary:
             yield None, own
             return
-        nodes = [_chebyshev_nodes(own[name]) for name in vary]
+        nodes = []
+        for name in vary:  # Chebyshev's, with both ends
+            low, high = float(np.min(own[name])), float(np.max(own[name]))
+            nodes.append(low + (high - low) * _NODES if low < high else np.array([low]))
         for at in itertools.product(*(range(len(each)) for each in nodes)):
             share = np.ones(n_points)
             for name, each, i in zip(vary, nodes, at, strict=True):
@@ -386,49 +408,6 @@ def _readings_or_nan(
         return readings
 
 
-def _require_finite_and_repeatable(
-    caller: Caller, readings: FloatArray, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
-) -> None:
-    """Raise ParameterError unless readings hold a finite number, and another call with its sample returns the same."""
-    sound = np.isfinite(readings).any(axis=1)
-    if not sound.any():
-        found = f"not finite at any of the {sound.size} points of the prior that were tried"
-        allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
-        raise ParameterError(caller.name, found, allowed)
-    at = int(np.argmax(sound))
-    again = Caller(caller.simulate, caller.broadcasts, caller.by_row, name=caller.name)
-    own = _values_of_sample(samples, columns, at)
-    if not _nearly_equal(again(*own, strict=True), readings[[at]]):
-        raise ParameterError(
-            caller.name,
-            "different when it is called again with the same parameters",
-            "the same readings each time: no random numbers (declare the noise instead), no state kept between calls",
-        )
-
-
-def _parameters_accepted_by_row(
-    one: Caller,
-    samples: Mapping[str, FloatArray],
-    columns: Mapping[str, NDArray[Any]],
-    alone: FloatArray,
-    per_run: tuple[str, ...],
-) -> frozenset[str]:
-    """Find by trial the parameters, besides `per_run`, that may be arrays (n_points,) in a call for one sample."""
-    n_points = alone.shape[1]
-    taken = []
-    for name, values in samples.items():
-        if name in per_run:
-            continue
-        trial = Caller(one.simulate, broadcasts=False, by_row=frozenset({*per_run, name}))
-        spread = {**samples, name: np.broadcast_to(values, (len(values), n_points))}
-        try:
-            if _nearly_equal(trial(spread, columns, strict=True), alone):
-                taken.append(name)
-        except Exception:
-            continue
-    return frozenset(taken)
-
-
 def number_of_samples(*values: Mapping[str, Any]) -> int:
     """Return the number of samples of values by name, of which those of two axes have one row for each, or one row."""
     return max((len(v) for each in values for v in each.values() if np.ndim(v) == 2), default=1)
@@ -445,15 +424,6 @@ def _values_of_sample(
     """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
     own, table = (take_samples(each, slice(k, k + 1)) for each in (parameters, columns))
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
-
-
-def _chebyshev_nodes(values: FloatArray) -> FloatArray:
-    """Return five interpolation nodes over the range of values; one if they are equal."""
-    low, high = float(np.min(values)), float(np.max(values))
-    if low == high:
-        return np.array([low])
-    places = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))
-    return low + (high - low) * places
 
 
 def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
@@ -491,32 +461,34 @@ def user_function_error(
     if law is not None and law.observe is not None:
         raised_in = {frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)}
         what = "observe" if codes[1] in raised_in else what
-    frames = traceback.extract_tb(error.__traceback__)
+    frames, name = traceback.extract_tb(error.__traceback__), simulator.source or what
     lines = [f.lineno for f in frames if f.filename in where]
     said = message_of(error, kind=False)
-    found = f"{what} raises {said if isinstance(error, EndedByFile) else message_of(error)}"
+    states = "" if law is None else ", ".join(law.states)
     if law is not None and (not frames or frames[-1].filename not in where):
-        by_name = f"a dict with a rate for each state, under its name: {', '.join(law.states)}"
+        by_name = f"a dict with a rate for each state, under its name: {states}"
         if isinstance(error, KeyError) and error.args and error.args[0] in law.states:
-            return FileError(simulator.source or what, f"rates returns no {error.args[0]!r}", by_name)
+            return FileError(name, f"rates returns no {error.args[0]!r}", by_name)
         if isinstance(error, TypeError) and ("list indices" in said or "tuple indices" in said):
-            return FileError(simulator.source or what, "rates returns a list or a tuple", by_name)
+            return FileError(name, "rates returns a list or a tuple", by_name)
     is_of_values = isinstance(error, TypeError | ValueError)
     way_out = next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), "")
-    texts = [name for name, values in columns.items() if values.dtype != np.float64]
+    texts = {name: values.tolist() for name, values in columns.items() if values.dtype != np.float64}
     if isinstance(error, KeyError):
-        states = "" if law is None else f", states {', '.join(law.states)}"
         parameters = ", ".join((*simulator.parameters, *simulator.extra))
-        allowed = f"columns {', '.join(columns) or 'none'}, parameters {parameters}{states}"
+        allowed = (
+            f"columns {', '.join(columns) or 'none'}, parameters {parameters}{f', states {states}' if law else ''}"
+        )
     elif is_of_values and way_out:
         allowed = way_out
     elif is_of_values and texts:
-        cells = {name: columns[name].tolist() for name in texts[:4]}
-        shown = ", ".join(f"{name} ({v[first_cell_without_number(v) or 0]!r})" for name, v in cells.items())
-        allowed = f"calculations with numeric columns; these contain text: {shown}"
+        some = list(texts.items())[:4]
+        cells = ", ".join(f"{column} ({v[first_cell_without_number(v) or 0]!r})" for column, v in some)
+        allowed = f"calculations with numeric columns; these contain text: {cells}"
     elif law is not None and what == "rates":
-        allowed = f"a function that returns a rate for each state somewhere in the prior: {', '.join(law.states)}"
+        allowed = f"a function that returns a rate for each state somewhere in the prior: {states}"
     else:
         n_rows = max((np.shape(values)[-1] for values in columns.values()), default=0)
         allowed = f"a function that returns a reading for each of the {n_rows} rows somewhere in the prior"
-    return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
+    found = f"{what} raises {said if isinstance(error, EndedByFile) else message_of(error)}"
+    return FileError(name, found, allowed, row=lines[-1] if lines else None)

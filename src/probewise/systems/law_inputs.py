@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.systems.calls import read_only_views
-from probewise.systems.simulator import Law
+from probewise.systems.law import Jump, LawWithEffects
 from probewise.systems.step import Steps
 from probewise.systems.table import RunTable
 
@@ -121,44 +121,6 @@ def _of_rows(values: FloatArray, row: IntArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Jump:
-    """A jump of a parameter by `size` after the time `at`, as printed, (n_samples, 1) each."""
-
-    parameter: str
-    size: FloatArray
-    at: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class BetweenRows:
-    """What effects do between the rows; the law's `hold` alone determines the rest.
-
-    By column, the dead time after which it acts; by parameter, its drift, a slope in time as printed, (n_samples, 1)
-    each; and jumps of parameters.
-    """
-
-    dead_times: Mapping[str, FloatArray] = field(default_factory=dict)
-    drifts: Mapping[str, FloatArray] = field(default_factory=dict)
-    jumps: tuple[Jump, ...] = ()
-
-    def with_dead_time(self, column: str, dead_time: FloatArray) -> BetweenRows:
-        """Return it with a column that acts after a dead time, (n_samples, 1); two of one column add up."""
-        return replace(self, dead_times=_with_added(self.dead_times, column, dead_time))
-
-    def with_drift(self, parameter: str, slope: FloatArray) -> BetweenRows:
-        """Return it with a drift of a parameter, a slope in time, (n_samples, 1); two of one parameter add up."""
-        return replace(self, drifts=_with_added(self.drifts, parameter, slope))
-
-    def with_jump(self, jump: Jump) -> BetweenRows:
-        """Return it with a jump of a parameter."""
-        return replace(self, jumps=(*self.jumps, jump))
-
-
-def _with_added(known: Mapping[str, FloatArray], name: str, value: FloatArray) -> dict[str, FloatArray]:
-    return {**known, name: np.asarray(known.get(name, 0.0) + value)}
-
-
-@dataclass(frozen=True, eq=False)
 class StepInputs:
     """Parameters and columns, in that order, by name: `held` over a gap, read-only, or on straight `lines` over it.
 
@@ -213,22 +175,21 @@ class LawInputs:
     @classmethod
     def of(
         cls,
-        law: Law,
+        motion: LawWithEffects,
         steps: Steps,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
-        between: BetweenRows,
     ) -> LawInputs:
         """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
 
-        Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `between`
+        Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `motion`
         has their drifts and jumps, and the columns that are late.
         """
-        rows, table, linear = steps.row_by_position_and_run, steps.table, law.hold == "linear"
+        rows, table, linear = steps.row_by_position_and_run, steps.table, motion.law.hold == "linear"
         held: dict[str, Any] = {}
         moving: dict[str, Line] = {}
         for name, values in parameters.items():
-            for jump in between.jumps:
+            for jump in motion.jumps:
                 if jump.parameter == name:  # it is added where it is, within a gap
                     values = values - jump.size * (table.time_s > jump.at)
             own = values_at_rows(values, rows)
@@ -236,8 +197,8 @@ class LawInputs:
                 held[name] = own[:, :1]
             elif linear:
                 moving[name] = own, np.diff(own, axis=1)
-            elif name in between.drifts:
-                moving[name] = own, between.drifts[name][:, :, None] * steps.gaps
+            elif name in motion.drifts:
+                moving[name] = own, motion.drifts[name][:, :, None] * steps.gaps
             else:
                 held[name] = own
         still: dict[str, Any] = {}
@@ -249,13 +210,12 @@ class LawInputs:
             else:
                 still[name] = own
         over_table = StepInputs((read_only_views(held), read_only_views(still)), (moving, sloping))
-        timeline = Timeline.of(table) if between.dead_times else None
-        late = {
-            name: LateColumn.of(timeline, columns[name], dead_time, linear=linear)
-            for name, dead_time in between.dead_times.items()
-            if timeline is not None
-        }
-        return cls(steps, over_table, late, between.jumps)
+        late = {}
+        if motion.dead_times:
+            timeline = Timeline.of(table)
+            for name, dead_time in motion.dead_times.items():
+                late[name] = LateColumn.of(timeline, columns[name], dead_time, linear=linear)
+        return cls(steps, over_table, late, motion.jumps)
 
     def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
         """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""

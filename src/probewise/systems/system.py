@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,8 @@ from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
 from probewise.systems.calls import Caller, IntegrationTally, take_samples, user_function_error
-from probewise.systems.law import LawWithEffects, evaluations_per_step, integrate_states, readings_of_states
-from probewise.systems.law_inputs import BetweenRows
+from probewise.systems.integrate import evaluations_per_step, integrate_states
+from probewise.systems.law import LawWithEffects, readings_of_states
 from probewise.systems.simulator import Simulator
 from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import RunTable, relative_sds_of_column
@@ -298,13 +298,13 @@ class SystemChain:
     def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
         system = self.system
-        columns: Mapping[str, NDArray[Any]] = columns_without_reading(system.simulator, plan)
-        columns = self._apply_stage(Stage.INPUT, columns, theta, plan)
+        given = columns_without_reading(system.simulator, plan)
+        columns = self._apply_stage(Stage.INPUT, given, theta, plan)
         parameters = self._apply_stage(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
         if system.caller is not None:
             readings = self._call_for_each_recording(system.caller, parameters, columns, plan)
         else:
-            readings = self._integrated_readings(parameters, columns, theta, plan)
+            readings = self._integrated_readings(parameters, columns, given, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
     def _call_for_each_recording(
@@ -331,17 +331,28 @@ class SystemChain:
         self,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
+        given: Mapping[str, NDArray[Any]],
         theta: FloatArray,
         plan: RunTable,
     ) -> FloatArray:
-        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise."""
-        system, law, of_rates = self.system, self.system.simulator.law, self._columns_of_rates(columns, theta, plan)
+        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise.
+
+        `columns` are those `given` with all effects on inputs; the rates take them without those that act between rows.
+        """
+        system, law = self.system, self.system.simulator.law
         assert law is not None
+        between = {effect: getattr(getattr(effect, "act", None), "between_rows", None) for effect in self.effects}
+        of_rates = columns
+        if any(act is not None and effect.stage is Stage.INPUT for effect, act in between.items()):
+            of_rates = self._apply_stage(Stage.INPUT, given, theta, plan, but=between)
 
         def law_and_inputs_of_samples(
             samples: IntArray,
         ) -> tuple[LawWithEffects, dict[str, FloatArray], dict[str, NDArray[Any]]]:
-            motion = LawWithEffects(law, between_rows=self._between_rows(theta[samples]))
+            motion = LawWithEffects(law)
+            for effect, own in self._effects_with_theta_columns:
+                if (act := between[effect]) is not None:
+                    motion = act(motion, theta[samples, own])
             motion = self._apply_stage(Stage.RATE, motion, theta[samples], plan)
             return motion, take_samples(parameters, samples), take_samples(of_rates, samples)
 
@@ -372,46 +383,18 @@ class SystemChain:
                     view = effect.apply(view, theta[:, columns], plan)
         return limited_to_range(view, self.system, plan) if self.system.limited else view
 
-    def _columns_of_rates(
-        self, columns: Mapping[str, NDArray[Any]], theta: FloatArray, plan: RunTable
-    ) -> Mapping[str, NDArray[Any]]:
-        """Return the columns for the rates of a law: without the effects that act between the rows, and so there.
-
-        `columns` are those with all effects on inputs.
-        """
-        acting = [each for each in self._effects_with_theta_columns if each[0].stage is Stage.INPUT]
-        at_rows = [(effect, own) for effect, own in acting if _act_between_rows(effect) is None]
-        if len(at_rows) == len(acting):
-            return columns
-        out: Mapping[str, NDArray[Any]] = columns_without_reading(self.system.simulator, plan)
-        for effect, own in at_rows:
-            out = cast(Any, effect).apply(out, theta[:, own], plan)
-        return out
-
-    def _between_rows(self, theta: FloatArray) -> BetweenRows:
-        """Return what the effects do to inputs and parameters between the rows of a law."""
-        out = BetweenRows()
-        for effect, own in self._effects_with_theta_columns:
-            act = _act_between_rows(effect)
-            if act is not None:
-                out = act(out, theta[:, own])
-        return out
-
-    def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
+    def _apply_stage(
+        self, stage: Stage, value: Any, theta: FloatArray, plan: Any, *, but: Mapping[AnyEffect, Any] | None = None
+    ) -> Any:
+        """Return the value of a stage with its effects, of which those with a value in `but` are left out."""
         for effect, columns in self._effects_with_theta_columns:
-            if effect.stage is stage:
+            if effect.stage is stage and (but is None or but[effect] is None):
                 value = effect.apply(value, theta[:, columns], plan)
         return value
 
     @cached_property
     def _effects_with_theta_columns(self) -> list[tuple[AnyEffect, slice]]:
         return effects_with_columns(self.effects, self.system.n_params)
-
-
-def _act_between_rows(effect: AnyEffect) -> Callable[[BetweenRows, FloatArray], BetweenRows] | None:
-    """Return what an effect does between the rows, if it does anything there that its act at the rows does not say."""
-    act: Any = getattr(effect, "act", None)
-    return getattr(act, "between_rows", None)
 
 
 STANDS_STILL = 0.02

@@ -30,8 +30,8 @@ from probewise.effects.effect import (
 from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
-from probewise.systems.law import integrate_states
-from probewise.systems.law_inputs import BetweenRows
+from probewise.systems.integrate import integrate_states
+from probewise.systems.law import LawWithEffects
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
@@ -57,8 +57,8 @@ _FLAG_WIDTH = 1e-9  # of its prior
 _BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
 _BLOCKS = 0.1  # odds of a step that goes back: as those of a second wave
 
-ActBetween = Callable[[BetweenRows, FloatArray], BetweenRows]
-"""Function of what other effects do between the rows and parameters (n_samples, n_params); adds the effect's."""
+ActBetween = Callable[[LawWithEffects, FloatArray], LawWithEffects]
+"""Function of a law with other effects and parameters (n_samples, n_params); adds what the effect does between rows."""
 
 Form: TypeAlias = Effect
 """An effect that is bound to a target of a simulator: its act takes the table of the runs."""

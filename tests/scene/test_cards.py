@@ -8,7 +8,7 @@ import pytest
 from probewise.errors import ParameterError
 from probewise.experiment import with_cards
 from probewise.experiment.rivals import rivals_of
-from probewise.inquiry import CardedForecast, TabulatedChain, forecast_of
+from probewise.inquiry import DiscForecast, TabulatedChain, forecast_of
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
@@ -45,7 +45,7 @@ def test_the_closed_form_reads_cards_as_the_pixels_do(chain, plan):
 def test_tables_with_cards_laid_over_them_are_the_chain(chain, plan):
     theta = np.array([[500.0, 300.0, 100.0], [340.0, 215.0, 60.0], [700.0, 120.0, 80.0]])
     forecast = forecast_of(chain)
-    assert isinstance(forecast, CardedForecast)
+    assert isinstance(forecast, DiscForecast)
     np.testing.assert_allclose(forecast.model.predict(theta, plan), chain.predict(theta, plan), atol=0.02)
     dimmed = replace(plan, covariates={"led": np.linspace(0.0, 1.0, len(plan))})
     np.testing.assert_allclose(forecast.model.predict(theta, dimmed), chain.predict(theta, dimmed), atol=0.02)

@@ -11,7 +11,7 @@ settings.
 from probewise.inquiry.any_instrument import Inquiry
 from probewise.inquiry.disc_table import DiscForecast, DiscTable, TabulatedChain, forecast_of
 from probewise.inquiry.entropy import UtilityMap, best_places_mask, choose, entropy_map, label_entropy, reachable_rows
-from probewise.inquiry.forecast import CardedForecast, DirectForecast, Forecast, PredictiveDistributions, cards_of
+from probewise.inquiry.forecast import DirectForecast, Forecast, PredictiveDistributions, cards_of
 from probewise.inquiry.grid import Design, Designs, Grid
 from probewise.inquiry.predictive import ReadingNoise
 from probewise.inquiry.readout import (
@@ -45,7 +45,6 @@ from probewise.inquiry.utilities import (
 __all__ = [
     "UTILITY_NAMES",
     "Bound",
-    "CardedForecast",
     "Design",
     "Designs",
     "DirectForecast",

@@ -19,15 +19,18 @@ from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Known
 from probewise.errors import ParameterError
 from probewise.inquiry.forecast import (
+    MOST_ASKED,
     MOST_LEVELS,
-    CardedForecast,
-    CardedModel,
     DirectForecast,
     Forecast,
     PredictiveDistributions,
     cards_of,
+    footprint_share_by_card,
+    nearest_level_index,
     predict_where_visible,
+    resampled_rows_and_weights,
     rows_by_combination,
+    weight_by_level,
 )
 from probewise.inquiry.grid import Designs, Grid
 from probewise.inquiry.readout import evenly_spaced_levels
@@ -50,6 +53,7 @@ _FLAT = 1e-5  # share of the levels' difference below which a level counts as co
 _DIRECTIONS = 128
 _BENDS = 8
 _TINY = 1e-30
+_SHOWS = 1e-4  # share of the footprint on a card from which the card counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +374,10 @@ def _distance_to_constant_reading_mm(
 
 @dataclass(frozen=True, eq=False)
 class DiscForecast:
-    """A forecast for discs, by the table of the sensor's response."""
+    """A forecast for discs, by the table of the sensor's response; at cards, by predictions of at most 400 hypotheses.
+
+    `model`: the sensor over the disc, and over the cards if there are any.
+    """
 
     model: SensorModel
     table: DiscTable
@@ -386,6 +393,11 @@ class DiscForecast:
         table, grid = self.table, designs.grid
         levels = evenly_spaced_levels(table.dark, table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
         turns_rad = plan.orientation_rad.reshape(-1, grid.n_places)
+        at_cards = self._rows_at_cards(plan.take(rows))
+        if at_cards.size:
+            chosen, share = resampled_rows_and_weights(weight, MOST_ASKED)
+            predicted = self.model.predict(theta[chosen], plan.take(rows[at_cards]))
+            index, stands_for = nearest_level_index(predicted, levels).clip(0, len(levels) - 1), share / weight[chosen]
 
         def level_weights(weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
             some = weight > 0
@@ -394,36 +406,44 @@ class DiscForecast:
                 turn = turns_rad[number]
                 if stood is None or not np.array_equal(stood, turn):  # combinations of one orientation share the work
                     stood, mass = turn, table.level_histogram(theta[some], weight[some], grid, levels, turn)
-                yield at, mass if len(places) == len(mass) else mass[places]
+                here = mass if len(places) == len(mass) else mass[places]
+                if at_cards.size:
+                    _, own, asked = np.intersect1d(at, at_cards, return_indices=True)
+                    here = here.copy()
+                    here[own] = weight_by_level(index[:, asked], weight[chosen] * stands_for, len(levels))
+                yield at, here
 
         return PredictiveDistributions(levels, level_weights)
+
+    def _rows_at_cards(self, plan: Plan) -> IntArray:
+        """Return the rows of a plan at which cards show."""
+        if not isinstance(self.model, TabulatedChain) or not cards_of(self.model.chain):
+            return np.empty(0, dtype=np.int64)
+        shares = footprint_share_by_card(self.model.chain, self.model.chain.poses(np.empty((1, 0)), plan), plan)
+        return np.flatnonzero(sum(share[0] for share in shares) > _SHOWS)
 
 
 @dataclass(frozen=True, eq=False)
 class TabulatedChain:
     """A chain over one disc that takes the seen white fraction from a table, and applies the other effects unchanged.
 
-    No effect may change the disc itself, and effects on the footprint must be those of the table. `cards`: the model
-    with known cards, if there are any.
+    No effect may change the disc itself, and effects on the footprint must be those of the table. Cards on the field
+    are seen besides.
     """
 
     chain: Chain
     table: DiscTable
-    cards: CardedModel | None = None
 
     @classmethod
     def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
         """Make `chain` a chain over the table of `plain`, the same chain with fewer effects; None if impossible."""
-        if isinstance(plain, TabulatedChain):
-            plain = plain.table if plain.cards is None else plain.cards
-        cards = plain if isinstance(plain, CardedModel) else None
-        table = plain if cards is None else cards.plain
+        table = plain.table if isinstance(plain, TabulatedChain) else plain
         if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
             return None
         seen = (effect for effect in chain.effects if effect.stage in (Stage.SCENE, Stage.FOOTPRINT))
         if not all(map(is_known_footprint_effect, seen)):
             return None
-        return cls(chain, table, cards)
+        return cls(chain, table)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -435,8 +455,8 @@ class TabulatedChain:
         poses, disc, table = self.chain.poses(theta, plan), theta[:, :3], self.table
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
-        if self.cards is not None:
-            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.footprint_share_by_card(poses, plan))
+        if cards := cards_of(self.chain):
+            seen = mean_albedo_with_cards(seen, cards, footprint_share_by_card(self.chain, poses, plan))
         return self.chain.readings_from_simulated_view(
             View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan
         )
@@ -452,7 +472,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
         if chain is not None and not chain.effects and highest is None:
             base = forecast_of(replace(chain, scene=HypothesisScene(chain.scene.shape)))  # type: ignore[attr-defined]
             if isinstance(base, DiscForecast):
-                return CardedForecast(base, chain)
+                return DiscForecast(TabulatedChain(chain, base.table), base.table)
         return DirectForecast(model)
     table = DiscTable.of(model) if highest is None else None
     if table is not None:

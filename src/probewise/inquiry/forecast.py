@@ -1,4 +1,4 @@
-"""Predictions for many hypotheses at many designs: directly, and with known cards over another forecast."""
+"""Predictions for many hypotheses at many designs, and the share of the footprint on known cards."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from probewise.inquiry.grid import Designs
 from probewise.inquiry.readout import evenly_spaced_levels
 from probewise.recordings.plan import Plan
 from probewise.scene import Card, CardedScene, HypothesisScene, outlines
-from probewise.scene.scenes import mean_albedo_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import RegionsAndPoses, response
-from probewise.sensor.commanded import has_commanded_height_or_led, led_state, with_led_on
+from probewise.sensor.commanded import has_commanded_height_or_led
 from probewise.sensor.stages import Poses, SensorModel
 
 MOST_LEVELS = 1000
 """Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
-_MOST_ASKED = 400  # hypotheses predicted directly
+MOST_ASKED = 400  # hypotheses predicted directly
 _PER_SD = 8.0  # levels per noise sd: fine, since each of a few hundred hypotheses matters
 _REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
-_SHOWS = 1e-4  # share of the footprint on a card from which the card counts
 _TILE_MM = 110.0
 _FAR_MM = 1e5
 
@@ -75,7 +73,7 @@ class DirectForecast:
     """
 
     model: SensorModel
-    n_asked: int = _MOST_ASKED
+    n_asked: int = MOST_ASKED
     levels_per_sd: float = _PER_SD
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -197,99 +195,22 @@ def cards_of(model: SensorModel) -> tuple[Card, ...]:
     return scene.cards if isinstance(scene, CardedScene) else ()
 
 
-@dataclass(frozen=True, eq=False)
-class CardedModel:
-    """A sensor model without effects, for a shape and known cards on the field.
-
-    `plain` predicts the shape alone; `chain` gives the share of the footprint on each card in closed form.
-    """
-
-    chain: Chain
-    plain: SensorModel
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The shape's parameters."""
-        return self.plain.names
-
-    @property
-    def cards(self) -> tuple[Card, ...]:
-        """The known cards on the field."""
-        return cards_of(self.chain)
-
-    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
-        levels = self.chain.levels
-        assert isinstance(levels, FixedLevels)
-        dark, bright = levels.i_min, levels.i_max
-        seen = (self.plain.predict(theta, with_led_on(plan)) - dark) / (bright - dark)
-        mean = mean_albedo_with_cards(seen, self.cards, self.footprint_share_by_card(_poses_of(plan), plan))
-        return np.asarray(dark + (bright - dark) * led_state(plan) * mean)
-
-    def footprint_share_by_card(self, poses: Poses, plan: Plan) -> list[FloatArray]:
-        """Return for each card the share of the footprint on the card, (n_samples or 1, n_points)."""
-        mixture = self.chain.ssf
-        assert isinstance(mixture, FixedMixture)
-        reach, footprint = _footprint_reach_mm(mixture), mixture.footprint(np.empty((1, 0)))
-        found = []
-        for card in self.cards:
-            out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
-            within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
-                np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
-            )
-            rows = np.flatnonzero(within.any(axis=0))
-            if rows.size:
-                there = Poses(*(a[:, rows] for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
-                part = plan.take(rows)
-                regions = dict.fromkeys(part.pattern_names, card.region)
-                out[:, rows] = response(RegionsAndPoses(regions, there, part), footprint, n_nodes=self.chain.n_nodes)
-            found.append(out)
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class CardedForecast:
-    """A forecast by tables of the shape for all hypotheses; near cards, by direct predictions of at most 400."""
-
-    base: Forecast
-    chain: Chain
-
-    @property
-    def model(self) -> CardedModel:
-        """The sensor model, with the cards."""
-        return CardedModel(self.chain, self.base.model)
-
-    def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Predict noise-free readings, with cards: (n_samples, n_params) -> (n_samples, n_points)."""
-        return self.model.predict(theta, plan)
-
-    def predictive(
-        self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> PredictiveDistributions:
-        """Return the predictive distribution at `rows`; see `Forecast.predictive`."""
-        base = self.base.predictive(theta, weight, designs, plan, rows, noise_sd)
-        there, model, levels = plan.take(rows), self.model, base.levels
-        covered = model.footprint_share_by_card(_poses_of(there), there)
-        near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
-        if not near.size:
-            return base
-        chosen, share = resampled_rows_and_weights(weight, _MOST_ASKED)
-        index = nearest_level_index(model.predict(theta[chosen], there.take(near)), levels).clip(0, len(levels) - 1)
-        stands_for = share / weight[chosen]
-        number = np.full(len(rows), -1)
-        number[near] = np.arange(len(near))
-
-        def level_weights(weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-            mass_there = weight_by_level(index, weight[chosen] * stands_for, len(levels))
-            for at, mass in base.level_weights(weight):
-                sees = np.flatnonzero(number[at] >= 0)
-                if sees.size:
-                    mass = mass.copy()
-                    mass[sees] = mass_there[number[at[sees]]]
-                yield at, mass
-
-        return PredictiveDistributions(levels, level_weights)
-
-
-def _poses_of(plan: Plan) -> Poses:
-    return Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
+def footprint_share_by_card(chain: Chain, poses: Poses, plan: Plan) -> list[FloatArray]:
+    """Return for each card the share of the footprint of a known mixture on it, (n_samples or 1, n_points)."""
+    mixture = chain.ssf
+    assert isinstance(mixture, FixedMixture)
+    reach, footprint = _footprint_reach_mm(mixture), mixture.footprint(np.empty((1, 0)))
+    found = []
+    for card in cards_of(chain):
+        out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
+        within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
+            np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
+        )
+        rows = np.flatnonzero(within.any(axis=0))
+        if rows.size:
+            there = Poses(*(a[:, rows] for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+            part = plan.take(rows)
+            regions = dict.fromkeys(part.pattern_names, card.region)
+            out[:, rows] = response(RegionsAndPoses(regions, there, part), footprint, n_nodes=chain.n_nodes)
+        found.append(out)
+    return found

@@ -42,13 +42,6 @@ def led_state(plan: Plan) -> FloatArray:
     return np.where(np.isfinite(led), led, 1.0)
 
 
-def with_led_on(plan: Plan) -> Plan:
-    """Return the plan without its column `led`, as if the LED were on at each reading."""
-    if "led" not in plan.covariates:
-        return plan
-    return replace(plan, covariates={name: column for name, column in plan.covariates.items() if name != "led"})
-
-
 def height_ratio(plan: Plan) -> FloatArray | None:
     """Return h/h0 of each reading, (n_points,), 1 at NaN; None if no height is known or all are the description's.
 

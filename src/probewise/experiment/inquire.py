@@ -319,7 +319,7 @@ def utilities_near_end(
 
     def chances(own: FloatArray, n: int) -> FloatArray:
         after = WeightsGivenReading(own, weight, given.readout, repeats=n)
-        return _probability_of_meeting_rule(lengths - weight @ lengths, after, goal_sd_mm, off_mm)
+        return after.probability_of_knowing(lengths - weight @ lengths, goal_sd_mm, off=off_mm, most_off=MOST_OFF)
 
     of_best = answers[:, best], n_repeats[best]
     chance = _by_repeats(chances, *of_best)
@@ -341,26 +341,6 @@ def _by_repeats(
     for n in np.unique(n_repeats).tolist():
         own = np.flatnonzero(n_repeats == n)
         out[own] = utility(answers[:, own], n)
-    return out
-
-
-def _probability_of_meeting_rule(
-    away: FloatArray, after: WeightsGivenReading, goal_sd_mm: float, off_mm: float
-) -> FloatArray:
-    """Return the probability, (n_designs,), that the posterior after a design's readings meets the stopping rule.
-
-    `away` (n, n_lengths) are the lengths of each hypothesis, less their mean.
-    """
-    out = np.empty(len(after.weight_by_cell))
-    for design, mass in enumerate(after.weight_by_cell):
-        joint = after.weight_by_hypothesis_and_cell(design)
-        ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
-        for length in away.T:
-            mean = length @ joint / mass
-            ends &= length**2 @ joint / mass - mean**2 < goal_sd_mm**2
-            off |= np.abs(length[:, None] - mean) > off_mm
-        ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
-        out[design] = mass[ends].sum() / mass.sum()
     return out
 
 

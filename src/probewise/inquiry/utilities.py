@@ -201,9 +201,24 @@ class WeightsGivenReading:
         """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
         return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 
-    def weight_by_hypothesis_and_cell(self, design: int) -> FloatArray:
-        """Return weight times probability of each cell for each hypothesis at one design, (n, n_cells)."""
-        return np.asarray(self._weight[:, None] * self._chance[self._index[:, design]])
+    def probability_of_knowing(
+        self, lengths: FloatArray, sd: float, *, off: float = math.inf, most_off: float = 1.0
+    ) -> FloatArray:
+        """Return the probability, (n_designs,), that after the reading all lengths, (n, n_lengths), are known to `sd`.
+
+        And that the probability of a length more than `off` from its mean is below `most_off`. The lengths are those
+        of each hypothesis, best less their means, so that no digits are lost.
+        """
+        weight, means = self.weight_by_cell, []
+        ends = np.ones(weight.shape, dtype=np.bool_)
+        for length in lengths.T:
+            means.append(self.weighted_sum_by_cell(length) / weight)
+            ends &= self.weighted_sum_by_cell(length**2) / weight - means[-1] ** 2 < sd**2
+        for design in np.flatnonzero(ends.any(axis=1)) if math.isfinite(off) else ():
+            apart = np.abs(lengths[:, :, None] - np.array(means)[:, design]) > off
+            joint = self._weight[:, None] * self._chance[self._index[:, design]]
+            ends[design] &= np.where(apart.any(axis=1), joint, 0.0).sum(axis=0) < most_off * weight[design]
+        return np.asarray((weight * ends).sum(axis=1) / weight.sum(axis=1))
 
 
 class Utility(Protocol):
@@ -375,11 +390,7 @@ def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: Int
     for n in np.unique(n_repeats).tolist():
         own = n_repeats == n
         given = WeightsGivenReading(answers[:, own], share, utility_input.readout, repeats=n)
-        ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
-        for length in away.T:
-            mean = given.weighted_sum_by_cell(length) / given.weight_by_cell
-            ends &= given.weighted_sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
-        out[own] = (given.weight_by_cell * ends).sum(axis=1) / given.weight_by_cell.sum(axis=1)
+        out[own] = given.probability_of_knowing(away, goal.sd)
     return out
 
 

@@ -190,7 +190,7 @@ def leading(info, name):
     ]
     particles = tuple(replace(p, weighted=w) for p, w in zip(info.kinds.particles, weighted, strict=True))
     kinds = replace(info.kinds, particles=particles)
-    return replace(info, kinds=kinds, left_out=kinds.left_out)
+    return replace(info, kinds=kinds)
 
 
 def test_what_leads_is_said_with_its_numbers(stepped):
@@ -219,7 +219,6 @@ def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):
             for kind, p in zip(last.kinds.kinds, last.kinds.particles, strict=True)
         )
         last = replace(last, kinds=replace(last.kinds, particles=particles))
-    last = replace(last, left_out=last.kinds.left_out)
     share = 0.1 / (len({kind.left_out for kind in last.kinds.kinds}) - 1)
     plain, wary = share / (0.9 + share), 14.0 * share / (0.9 + 14.0 * share)
     said = left_out_after_step(last, 0.9)

@@ -141,28 +141,20 @@ def step(
     pose, *planned = planned_before or next_poses(experiment, given, utilities, readings, rng=rng)
     log_prior = experiment.prior.log_prob(joined.theta)
     info = Step(
+        **vars(judged),
         number=n_readings,
         reading=reading,
         names=experiment.shape.prior.names,
-        mean=judged.mean,
-        sd=judged.sd,
-        shapes=judged.shapes,
         samples=given.drawn[:, experiment.shape_columns],
         map=utilities,
         next_pose=None if reason else pose,
         bits=bits_gained(information_nats(joined), log_prior, joined.weight, state.prior_bits),
-        p_value=judged.p_value,
         posterior=posterior,
         sensor=sensor_moments(experiment, posterior),
-        left_out=kinds.left_out,
         kinds=kinds,
-        chance_off=judged.chance_off,
         stop_reason=reason,
-        notes=judged.notes,
         pace=Pace.from_readings(readings),
-        arm_error=judged.arm_error,
         checks_sensor=judged.may_stop and checks,
-        unexplained=judged.unexplained,
     )
     return replace(state, readings=readings, posterior=kinds, next_pose=pose, planned=tuple(planned)), info
 

@@ -23,7 +23,7 @@ from probewise.experiment.kinds import HypothesisKind, Posterior
 from probewise.experiment.rivals import SINCE_CALIBRATION, Pace
 from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.experiment.simulated import HiddenShape
-from probewise.experiment.stopping import probability_of_length_off
+from probewise.experiment.stopping import Judgement, probability_of_length_off
 from probewise.inquiry import UtilityMap
 from probewise.nested import Weighted
 from probewise.nested.weights import weighted_quantiles
@@ -53,45 +53,30 @@ _ALIASES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Step(ShowsItself):
-    """The result of one reading.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step(Judgement, ShowsItself):
+    """The result of one reading: a `Judgement` of the posterior after it, and the next pose.
 
     Attributes
     ----------
     number, reading
         Number of the reading from 1, and the reading.
-    names, mean, sd
-        Names of the shape's parameters, their posterior means and sds, each (n_params,). For a set of shapes: given the
-        most probable shape, with NaN for parameters of other shapes.
-    shapes, samples
-        Probability of each shape of a set, by its name (empty for a single shape); shapes drawn from the posterior,
-        (n_samples, n_params).
+    names, samples
+        Names of the shape's parameters; shapes drawn from the posterior, (n_samples, n_params).
     map, next_pose, stop_reason
         Utility of each possible next reading; the next pose, or None and the reason why the run ends here.
     bits
         Information gained so far: prior minus posterior differential entropy of all parameters. With `trust` below 1,
         the information about the effect left out and its parameters is added, so this exceeds that about the shape.
-    p_value
-        p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
-        None where the most probable noise is not the declared one, of which this test is.
     posterior
         Weighted posterior of all parameters, with the evidence; the odds of a left-out effect are raised, see
         `kinds.FAULT_ODDS_FACTOR`.
     sensor
         Posterior mean and sd of the sensor's parameters by name, if they are inferred too.
-    left_out
-        Probability of each effect that the sensor model may leave out, by name; "" is none. The odds are not raised.
     kinds
-        The posterior of every kind of hypotheses, with odds as in `left_out`.
-    chance_off
-        Probability that a length is off by three times the sd of the stopping rule.
-    notes, replayed, pace
-        Warnings on this step; whether the reading comes from a journal; pace of the run so far.
-    arm_error
-        Effect of the arm's own error; None far from the end of a run, or if that error is not known.
-    unexplained
-        With what the residuals of the best hypothesis change, in words; "" if they show no trend.
+        The posterior of every kind of hypotheses; the odds of a left-out effect are not raised.
+    replayed, pace
+        Whether the reading comes from a journal; pace of the run so far.
     checks_sensor
         Whether the stopping rule is met, and the run goes on only to check what the sensor model may leave out.
     """
@@ -99,26 +84,22 @@ class Step(ShowsItself):
     number: int
     reading: Reading
     names: tuple[str, ...]
-    mean: FloatArray
-    sd: FloatArray
-    shapes: Mapping[str, float]
     samples: FloatArray
     map: UtilityMap
     next_pose: Pose | None
     bits: float
-    p_value: float | None
     posterior: Weighted
     sensor: Mapping[str, tuple[float, float]]
-    left_out: Mapping[str, float]
     kinds: Posterior
-    chance_off: float
     stop_reason: str | None
-    notes: tuple[str, ...]
     replayed: bool = False
     pace: Pace = field(default_factory=Pace)
-    arm_error: ArmError | None = None
     checks_sensor: bool = False
-    unexplained: str = ""
+
+    @property
+    def left_out(self) -> Mapping[str, float]:
+        """Probability of each effect that the sensor model may leave out, by name; "" is none."""
+        return self.kinds.left_out
 
     @property
     def log_z(self) -> float:

@@ -37,7 +37,29 @@ _ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a posterior says, as in `Step`; and whether the stopping rule is met, arm included (`may_stop`)."""
+    """What a posterior says of the shape, and whether it explains the readings.
+
+    Attributes
+    ----------
+    mean, sd
+        Posterior means and sds of the shape's parameters, each (n_params,). For a set of shapes: given the most
+        probable shape, with NaN for parameters of other shapes.
+    shapes
+        Probability of each shape of a set, by its name (empty for a single shape).
+    may_stop
+        Whether the stopping rule is met, arm included.
+    chance_off
+        Probability that a length is off by three times the sd of the stopping rule.
+    p_value
+        p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
+        None where the most probable noise is not the declared one, of which this test is.
+    notes
+        Warnings.
+    unexplained
+        With what the residuals of the best hypothesis change, in words; "" if they show no trend.
+    arm_error
+        Effect of the arm's own error; None far from the end of a run, or if that error is not known.
+    """
 
     mean: FloatArray
     sd: FloatArray

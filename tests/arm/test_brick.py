@@ -89,7 +89,7 @@ def changed(at, byte):
 
 # Bytes 0 to 2 are type, opcode and status; 3 port, 4 valid, 5 calibrated, 6 type, 7 mode, then four words.
 @pytest.mark.parametrize("at", range(3, 16))
-@pytest.mark.parametrize("byte", [0x03, 0x7F, 0xFF])
+@pytest.mark.parametrize("byte", [0x03, 0xFF])
 def test_a_byte_of_a_reading_that_was_changed_on_its_way_changes_no_reading(brick, paper_brick, at, byte):
     light = brick.light_sensor(1)
     assert light.read().raw_counts == 500

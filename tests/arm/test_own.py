@@ -59,11 +59,6 @@ def test_what_is_known_of_a_reading_takes_the_place_of_what_was_asked_for_and_th
     assert math.isnan(reading.covariates["lux"])
 
 
-def test_a_reading_is_handed_on_as_it_is():
-    reading = Reading(3.0, Pose(1.0, 2.0), 4.0)
-    assert entered(Own(reading)).measure(Pose(0.0, 0.0)) is reading
-
-
 HERE = Pose(1.0, 2.0)
 BAD = {
     "nothing": (None, "what measure returned is None; allowed: a finite number, or a dict"),
@@ -367,10 +362,6 @@ def test_a_plan_that_it_cannot_carry_out_is_refused_before_anything_moves(own, c
     with pytest.raises(error, match=message):
         taken(own, [], plan(**changes))
     assert own.asked == []
-
-
-def test_one_height_in_every_row_is_where_an_instrument_that_does_not_lift_reads():
-    assert len(taken(Own(), [], plan(covariates={"height_mm": [math.nan, 10, 10, 10]}))) == 4
 
 
 def test_any_object_that_measures_carries_out_a_plan():

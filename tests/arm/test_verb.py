@@ -29,10 +29,6 @@ def at_port(paper_brick, clock, monkeypatch):
     return paper_brick
 
 
-def test_check_with_quiet_says_nothing(at_port, capsys):
-    assert said(capsys, "arm", "check", "--arm", "nxt:x", "--quiet").out == ""
-
-
 def test_check_asks_a_brick_who_it_is_and_moves_nothing(at_port, capsys):
     out = said(capsys, "arm", "check", "--arm", "nxt:x").out
     assert "brick        ARM1, firmware 1.31, battery 7.41 V" in out

@@ -43,19 +43,6 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
     }
 
 
-def test_a_directory_in_the_way_leaves_everything_as_it_was(tmp_path):
-    (tmp_path / "b").mkdir()
-
-    def write():
-        with staged_output(tmp_path) as stage:
-            (stage / "a").write_text("new")
-            (stage / "b").write_text("new")
-
-    with pytest.raises(FileError, match="a directory of that name is in the way"):
-        write()
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".results.lock", "b"]
-
-
 @pytest.mark.parametrize(
     ("held", "words"),
     [

@@ -1,7 +1,6 @@
 """What a command says while it works: a bar on a terminal, a line now and then elsewhere, nothing where it is quiet."""
 
 import io
-import threading
 import time
 from types import SimpleNamespace
 
@@ -13,7 +12,6 @@ from probewise import _progress
 from probewise._progress import progress_shown
 from probewise.cli._bench import prompter_for_answer
 from probewise.progress import silent
-from probewise.recordings import read_recording
 
 
 class Terminal(io.StringIO):
@@ -66,16 +64,6 @@ def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):
     ]
 
 
-def test_hours_of_work_are_told_of_more_seldom(clock, capsys):
-    lines = _progress._TextProgress()
-    for k in range(3600):
-        lines("runs", k, 3600, "a key")
-        clock[0] += 1.0
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "runs, 2 of 3600, a key (2 s)"
-    assert 50 < len(said) < 150
-
-
 def test_what_has_not_changed_is_not_told_again(clock, capsys):
     lines = _progress._TextProgress()
     for note in ("thinking about 23", "moving"):
@@ -115,25 +103,12 @@ def test_a_quiet_command_says_nothing(hurried, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_nothing_beats_on_after_an_error(hurried):
-    before = threading.active_count()
-    with pytest.raises(RuntimeError, match="stop"), progress_shown(quiet=False):
-        raise RuntimeError("stop")
-    assert threading.active_count() == before
-
-
 def test_nothing_beats_where_a_person_is_asked(hurried, capsys):
     with progress_shown(quiet=False, beat=False) as progress:
         time.sleep(0.05)
         assert capsys.readouterr().err == ""
         progress("readings", 1, 3)
     assert capsys.readouterr().err == "readings, 1 of 3 (0 s)\n"
-
-
-def test_reading_a_file_tells_of_its_rows(recording_file):
-    told = []
-    recording = read_recording(recording_file, progress=lambda *words: told.append(words))
-    assert told[-1] == ("reading small.csv", len(recording), len(recording))
 
 
 def test_a_run_that_is_resumed_tells_how_far_it_is_through_its_journal(sensor_file, tmp_path):

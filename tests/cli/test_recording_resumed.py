@@ -51,14 +51,10 @@ def record(tmp_path, monkeypatch):
 
 CHANGES = {
     "the unit": ({}, ["--unit", "mV"], "unit is 'V' there, 'mV' here"),
-    "the range": ({}, ["--range", "0,10"], "max is 5.0 there, 10.0 here"),
-    "the step": ({}, ["--step", "0.5"], "step is None there, 0.5 here"),
     "the height": ({"height_mm": 20}, [], "height_mm is None there, 20.0 here"),
     "the orientation": ({"orientation_rad": [0, 0, 0.2, 0]}, [], "the orientation of reading 3 differs"),
-    "a scan": ({"scan": ["a", "a", "b", "b"]}, [], "the scan of reading 3 differs"),
     "a place": ({"x_mm": [-20, -10, 10, 26]}, [], "the x_mm of reading 4 differs"),
     "a pattern": ({"patterns": {"edge": Quadrant((0.0, 0.0), (1, 1))}}, [], "pattern 'edge' is HalfPlane("),
-    "a pattern's place": ({"patterns": {"edge": HalfPlane(0.0, 3.0)}}, [], "offset_mm=3.0"),
     "its length": ({"x_mm": [-20, -10, 10]}, [], "it has 4 rows, this plan 3"),
 }
 

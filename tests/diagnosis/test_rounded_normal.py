@@ -73,22 +73,6 @@ def test_a_reading_of_its_own_sd_has_the_probability_of_its_cell(law_of_own_sds)
     assert found - 0.5 * law.n_kept * np.log(2 * np.pi) == pytest.approx(wanted, rel=1e-6)
 
 
-def test_whitened_readings_of_their_own_sds_are_equally_informative(law_of_own_sds):
-    """Each tells of the mean as its own law does, and is drawn as such."""
-    law, rng = law_of_own_sds, np.random.default_rng(1)
-    kept, n_draws = ~law.lost, 40_000
-    drawn = law.draw_pseudo_residuals(n_draws, rng=rng)
-    noise = SIGMA * SDS[:, None] * rng.standard_normal((60, n_draws)) + STEP / 2 * rng.uniform(-1, 1, (60, n_draws))
-    pseudo = law.normal_pseudo_residuals(law(noise), np.array([SIGMA])) * np.sqrt(law.fisher_information) / SIGMA
-    # The scores of a narrow reading are rare and large, so that few draws carry their variance.
-    np.testing.assert_allclose(pseudo.std(axis=1)[kept], 1.0, rtol=0.06)
-    bounded = law.bounded_pseudo_residuals(law(noise), np.array([SIGMA])) * np.sqrt(law.fisher_information) / SIGMA
-    np.testing.assert_allclose(drawn.std(axis=1), bounded.std(axis=1), rtol=0.06)
-    own = [float(RoundedNormal(0.5 * STEP / SIGMA / sd, 1.0).fisher_information) / sd**2 for sd in SDS[kept]]
-    told = law(np.ones(60))[kept] ** 2 * law.fisher_information
-    np.testing.assert_allclose(told, own, rtol=5e-3)
-
-
 @pytest.mark.parametrize("half", [0.8, 2.0, 6.0])
 def test_pseudo_residuals_say_as_much_as_the_density_does(half):
     rng = np.random.default_rng(3)
@@ -141,17 +125,6 @@ def test_rounding_is_found_in_whatever_order_readings_are_taken(order, spread):
     found = NoiseModels(prepared.recording, effects, prior, about)
     assert found.certain == ("quantisation",)
     assert found.models["quantisation",].rounding == pytest.approx(0.1)
-
-
-def test_a_lattice_of_printed_digits_is_no_rounding():
-    rng, x = np.random.default_rng(2), np.linspace(-1, 1, 100)
-    line = Simulator("y", "V", {"a": (-5, 5), "b": (-5, 5)}, simulate=lambda p, u: p["a"] + p["b"] * u["x"])
-    readings = np.round(1 + 2 * x + 0.05 * rng.standard_normal(100), 2)
-    prepared = prepare_system(line, table_for(line, {"x": x, "y": readings}))
-    effects = {"quantisation": prepared.effects["quantisation"]}
-    prior, about = PriorOdds.for_effects(effects), noise_sd_about_given_null(prepared)
-    assert about == pytest.approx(0.05, rel=0.3)
-    assert NoiseModels(prepared.recording, effects, prior, about).certain == ()
 
 
 @pytest.mark.parametrize("noise_sd", [0.5, 1.0, 3.0])

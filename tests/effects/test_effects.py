@@ -355,18 +355,6 @@ def test_a_recording_within_ten_of_its_lengths_of_0_counts_from_0(start_s, start
     assert Origin.of(plan.take([3])) == Origin()  # one reading has no length
 
 
-def test_effects_of_one_scan_leave_the_others_alone():
-    """Turned, raised or moved in one scan: the readings of all others are those of the plain chain."""
-    plain = base().predict(np.zeros((1, 0)), PLAN)
-    inside = np.array([PLAN.scan_names[k] == "edge_90_out" for k in PLAN.scan])
-    for name, size in (("scan_angle_error", 20.0), ("height_offset", 1.0), ("scan_misplacement", 1.0)):
-        variants = VOCABULARY[name].for_extent(EXTENT).variants()
-        effect = next(v for v in variants if v.scans == ("edge_90_out",))
-        found = base().with_effects(effect).predict(np.array([[size]]), PLAN)
-        np.testing.assert_allclose(found[:, ~inside], plain[:, ~inside], atol=1e-9)
-        assert np.abs(found[:, inside] - plain[:, inside]).max() > 0.5
-
-
 def test_a_shadow_falls_on_the_patterns_with_raised_edges_alone():
     """Two-way scans of half planes, quadrants and a disc: all of the kinds, one of them, or all but one."""
     variants = VOCABULARY["edge_shadow"].for_extent(EXTENT).variants()
@@ -489,26 +477,11 @@ def test_frequencies_lie_close_enough_to_find_any():
     assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
 
 
-@pytest.mark.parametrize(("gap", "told"), [(0.03, True), (0.0, False)])
-def test_a_size_of_either_sign_is_told_with_its_range(gap, told):
-    """And one that is not told from 0 has no sign to tell."""
-    share = 0.01 * np.random.default_rng(3).standard_normal(500)
-    samples = np.stack([share + gap * np.sign(share), np.full(500, 6.0)], axis=1)
-    said = sentence_from_samples(EFFECTS["overshoot"](), samples)
-    assert ("; its size share may have either sign, between -0.05" in said) is told
-
-
 def test_a_soft_saturation_is_below_its_limit_and_nothing_far_below():
     values = np.array([[10.0, 49.0, 50.0, 51.0, 80.0]])
     soft = VOCABULARY["saturation"]().apply(values, np.array([[50.0, 4.0]]), there_and_back())
     assert (soft < np.minimum(values, 50.0)).all()
     assert soft[0, 0] == pytest.approx(10.0, abs=1e-3)
-
-
-def test_nonlinearity_keeps_black_and_white():
-    values = np.array([[-1e-17, 0.0, 0.25, 1.0, 1 + 1e-15]])
-    out = VOCABULARY["nonlinearity"]().apply(values, np.array([[0.5]]), there_and_back())
-    np.testing.assert_allclose(out, [[0.0, 0.0, 0.5, 1.0, 1.0]])
 
 
 def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():

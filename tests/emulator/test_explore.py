@@ -23,8 +23,6 @@ from arm_faults import (
     experiment,
     explored,
     injected,
-    lost,
-    twice,
     violations,
     wrong,
 )
@@ -105,11 +103,6 @@ def ended(*taken: Taken, journal: tuple[Reading, ...], n_read: int | None = None
     return Run(taken=[*taken], journal=journal, n_read=len(taken) if n_read is None else n_read)
 
 
-def test_a_good_reading_is_neither_wrong_nor_lost_nor_twice() -> None:
-    run = ended(GOOD, journal=(READ,))
-    assert (wrong(run), lost(run), twice(run)) == ([], 0, 0)
-
-
 @pytest.mark.parametrize(
     "bad",
     [
@@ -126,14 +119,6 @@ def test_a_good_reading_is_neither_wrong_nor_lost_nor_twice() -> None:
 def test_a_reading_that_is_not_the_brick_s_is_found_out(bad: Taken) -> None:
     """Never answered; another percentage, value, place, orientation, battery, height; not what lies there."""
     assert len(wrong(ended(bad, journal=(bad.reading,)))) == 1
-
-
-def test_a_reading_lost_or_doubled_anywhere_is_counted() -> None:
-    again = replace(READ, time_s=2.0)
-    assert lost(ended(GOOD, journal=())) == 1
-    assert lost(ended(GOOD, journal=(READ,), n_read=2)) == 1
-    assert twice(ended(GOOD, replace(GOOD, reading=again), journal=(READ, again))) == 1
-    assert twice(ended(GOOD, journal=(READ, READ))) == 1
 
 
 def test_from_python_too_a_fitted_arm_counts_its_own_error() -> None:

@@ -62,29 +62,6 @@ def test_readings_are_invalid_for_20_ms_after_a_change_of_type_and_show_the_old_
     assert lit[3] == 57
 
 
-def test_a_change_of_mode_alone_is_valid_a_millisecond_later(ask, clock) -> None:
-    ask("80 05 01 05 80")
-    clock.sleep(0.1)
-    ask("80 05 01 05 00")
-    assert values(ask)[0] == 0
-    clock.sleep(0.001)
-    assert values(ask)[0] == 1
-
-
-def test_the_converter_takes_a_new_sample_every_three_milliseconds(clock: VirtualClock) -> None:
-    taken = []
-
-    def seen(lit: bool) -> float:
-        taken.append(lit)
-        return 50.0
-
-    light = LightSensor(seen, clock)
-    for _ in range(30):
-        light(True)
-        clock.sleep(0.001)
-    assert len(taken) == 10
-
-
 @given(percent=st.floats(0, 100))
 def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
     """One count of the converter is 0.147 %, and the firmware truncates."""

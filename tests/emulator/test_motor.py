@@ -86,18 +86,6 @@ def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(as
     assert 400 <= port.tacho_count <= 440
 
 
-def test_hold_ends_the_coasting_and_the_motor_settles(ask, clock, brick) -> None:
-    turn(ask, 75, 360)
-    while wait(clock, brick, 0.01).run_state != RunState.IDLE:
-        pass
-    wait(clock, brick, 0.02)
-    ask(f"80 04 00 {HOLD}")
-    settled = wait(clock, brick, 0.8).tacho_count
-    assert 360 < settled < 400
-    assert wait(clock, brick, 1.0).tacho_count == settled
-    assert brick.outputs.ports[0].run_state == RunState.RUNNING
-
-
 def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick) -> None:
     ask(f"80 04 00 {HOLD}")
     port = wait(clock, brick, 0.5)
@@ -115,25 +103,6 @@ def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, b
         turn(ask, 75, 360)
         port = wait(clock, brick, 2.0)
     assert 720 + 40 <= port.tacho_count <= 720 + 80
-
-
-def test_a_run_without_limit_draws_the_goal_along(ask, clock, brick) -> None:
-    turn(ask, 75, 360)
-    wait(clock, brick, 2.0)
-    turn(ask, 30, 0)
-    here = wait(clock, brick, 2.0).tacho_count
-    turn(ask, 30, 200)
-    there = wait(clock, brick, 3.0).tacho_count
-    assert 200 <= there - here <= 230
-
-
-def test_the_three_counters_are_reset_apart(ask, clock, brick) -> None:
-    turn(ask, 75, 360)
-    count = wait(clock, brick, 2.0).tacho_count
-    ask("80 0A 00 01")
-    assert ask("00 06 00").endswith(f"{little(count)} 00 00 00 00 {little(count)}".upper())
-    ask("80 0A 00 00")
-    assert ask("00 06 00").endswith(f"{little(count)} 00 00 00 00 00 00 00 00".upper())
 
 
 def test_a_motor_stands_still_at_its_stop() -> None:

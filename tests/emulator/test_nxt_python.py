@@ -97,11 +97,6 @@ motor.idle()
     assert abs(int(back)) <= 70
 
 
-def test_it_renames_the_brick(client: Callable[[str], list[str]]) -> None:
-    assert client('brick.set_brick_name("ROBBIE")\nprint(brick.get_device_info()[0])') == ["ROBBIE"]
-    client('brick.set_brick_name("NXT")')
-
-
 def test_it_starts_a_program_and_finds_the_errors_that_it_knows(client: Callable[[str], list[str]]) -> None:
     assert client("""
 def raised(call, *arguments):

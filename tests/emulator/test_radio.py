@@ -71,18 +71,6 @@ def test_lateness_befalls_its_share_and_lasts_as_long_as_said(clock: VirtualCloc
     assert late == pytest.approx([2.56] * len(late))
 
 
-def test_every_byte_of_a_reply_is_dropped_at_its_rate(clock: VirtualClock) -> None:
-    got = answers(clock, Faults(drop=0.02, late_s=0.0))
-    assert likely(N * len(ANSWER) - sum(len(a) for a, _ in got), N * len(ANSWER), 0.02)
-
-
-def test_a_reply_that_waits_comes_in_one_piece_with_the_next(clock: VirtualClock) -> None:
-    got = answers(clock, Faults(merge=0.1, late_s=0.0))
-    assert b"".join(a for a, _ in got).startswith(ANSWER * (N - 2))
-    assert likely(sum(a == b"" for a, _ in got), N, 0.1)
-    assert {len(a) // len(ANSWER) for a, _ in got} >= {0, 1, 2}
-
-
 def test_a_corrupted_reply_has_one_other_byte(clock: VirtualClock) -> None:
     """Anywhere in the frame, its length included."""
     got = answers(clock, Faults(corrupt=0.2, late_s=0.0))
@@ -122,14 +110,6 @@ def test_a_request_that_an_error_befalls_is_not_carried_out(clock: VirtualClock)
     radio.brick.advance()
     assert radio.brick.outputs.ports[0].tacho_count == 0
     assert radio.mishaps == {"error": 3}
-
-
-def test_an_unasked_message_comes_before_a_share_of_the_replies(clock: VirtualClock) -> None:
-    got = answers(clock, Faults(unasked=0.3, late_s=0.0))
-    assert all(a.endswith(ANSWER) for a, _ in got)
-    extra = {a.removesuffix(ANSWER) for a, _ in got} - {b""}
-    assert extra == {framed(bytes.fromhex("8009000368 6900"))}
-    assert likely(sum(a != ANSWER for a, _ in got), N, 0.3)
 
 
 def test_a_lost_request_is_not_carried_out_and_a_silent_one_is(clock: VirtualClock) -> None:

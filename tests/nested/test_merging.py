@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 from nested_sampling import problems
-from scipy.stats import combine_pvalues
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested import Check, NestedResult, merge, run
@@ -136,16 +135,6 @@ def test_agreement_by_hand(terraces: list[NestedResult]) -> None:
     assert found.p_value == pytest.approx(math.erfc(2.0 / math.sqrt(2)))
     assert found.log_z_sd == pytest.approx(math.sqrt(0.5))
     assert found.n_runs == 2
-
-
-def test_insertion_tests_are_combined(terraces: list[NestedResult], rng: np.random.Generator) -> None:
-    known = [dataclasses.replace(r, insertion_p_value=p) for r, p in zip(terraces, (0.03, 0.2, 0.9), strict=False)]
-    merged = merge(known, rng=rng)
-    assert merged.insertion_p_value == pytest.approx(combine_pvalues([0.03, 0.2, 0.9]).pvalue)
-    assert merged.insertion_rank.size == sum(r.insertion_rank.size for r in known)
-    bad = [dataclasses.replace(r, insertion_p_value=1e-3) for r in terraces[:4]]
-    with pytest.warns(DoubtfulResultWarning, match="insertion ranks of the runs together"):
-        merge(bad, rng=rng)
 
 
 def test_what_is_no_independent_run_of_the_same_problem_is_refused(

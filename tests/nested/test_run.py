@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,10 +23,7 @@ from probewise.nested import (
     RemainingEvidence,
     RoundSummary,
     SliceMove,
-    make_problem,
-    refine,
     run,
-    update,
 )
 from probewise.nested.clusters import find_clusters
 from probewise.nested.evidence import insertion_p_value, insertion_ranks, integrate
@@ -183,31 +179,6 @@ def test_rare_possible_hypotheses_are_doubtful_but_used(rng: np.random.Generator
     assert "doubtful" in result.summary()
 
 
-@pytest.mark.parametrize("n_possible", [1, 2, 3])
-def test_a_run_of_one_parameter_may_begin_with_few_possible_draws(n_possible: int) -> None:
-    """One, two or three of all draws that a run takes; the chains supply the rest."""
-    drawn: list[np.ndarray] = []
-
-    def take_note(x: np.ndarray) -> np.ndarray:
-        drawn.append(x[:, 0].copy())
-        return np.full(len(x), -np.inf)
-
-    with pytest.raises(NotConvergedError):
-        run_once(make_problem(take_note, [(0.0, 1.0)], vectorized=True), rng=np.random.default_rng(6), n_live=20)
-    first = np.sort(np.concatenate(drawn))
-    low, high = 0.0, float(0.5 * (first[n_possible - 1] + first[n_possible]))
-
-    def log_likelihood(x: np.ndarray) -> np.ndarray:
-        return np.where((x[:, 0] >= low) & (x[:, 0] < high), 0.0, -np.inf)
-
-    result = run_once(
-        make_problem(log_likelihood, [(0.0, 1.0)], vectorized=True), rng=np.random.default_rng(6), n_live=20
-    )
-    assert result.log_start == pytest.approx(math.log(n_possible / len(first)))
-    assert result.complete
-    assert (result.theta < high).all()
-
-
 class Slab:
     """A problem of which the first `share` is possible, with a peak there; it counts its evaluations."""
 
@@ -232,19 +203,6 @@ def test_the_call_limit_holds_where_a_part_of_the_prior_is_impossible(share: flo
     if not result.complete:
         assert f"stopped at {result.n_calls} of max_calls = {max_calls}" in result.warnings[0]
     assert result.samples(10, rng=np.random.default_rng(3))[:, 0].max() < share
-
-
-@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
-def test_a_run_that_the_call_limit_ended_at_its_first_draws_begins_anew_from_its_checkpoint(tmp_path: Path) -> None:
-    def once(max_calls: int | None, checkpoint: Path | None) -> NestedResult:
-        rng = np.random.default_rng(2)
-        return run_once(Slab(0.03), rng=rng, n_live=50, max_calls=max_calls, checkpoint=checkpoint)
-
-    path = tmp_path / "run.npz"
-    assert not once(300, path).complete
-    resumed = once(None, path)
-    assert resumed.complete
-    assert resumed.log_z == once(None, None).log_z
 
 
 def test_a_hypothesis_space_that_excludes_the_readings_is_an_error(rng: np.random.Generator) -> None:
@@ -284,15 +242,6 @@ def test_a_problem_without_parameters_is_its_likelihood(rng: np.random.Generator
     result = run(problems.Known(Product({}), lambda t: np.full(len(t), -3.5), -3.5), rng=rng)
     assert (result.log_z, result.log_z_error, result.theta.shape) == (-3.5, 0.0, (1, 0))
     assert "log Z" in result.summary()
-
-
-def test_a_problem_without_parameters_is_updated_by_its_likelihood_and_refused_elsewhere() -> None:
-    problem, seeded = problems.Known(Product({}), lambda t: np.full(len(t), -3.5), -3.5), np.random.default_rng(2)
-    result = run(problem, rng=seeded)
-    more = problems.Known(Product({}), lambda t: np.full(len(t), -4.5), -4.5)
-    assert update(result, more, rng=seeded, fall_back=lambda: run(more, rng=seeded)).log_z == -4.5
-    with pytest.raises(ParameterError, match="the evidence is exact without"):
-        refine(result, problem, rng=seeded)
 
 
 @pytest.mark.parametrize("options", [{"n_live": 5}, {"n_replaced": 30, "n_live": 50}, {"max_calls": 10, "n_live": 50}])

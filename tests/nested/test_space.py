@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from probewise.calibration import SSFPrior, default_prior
-from probewise.nested.problem import space_of, unbounded_space_of
+from probewise.nested.problem import unbounded_space_of
 from probewise.priors import (
     HeavyTailedPrior,
     Joint,
     LogHeavyTailedPrior,
     LogUniform,
     Normal,
-    Prior,
     Product,
     Uniform,
 )
@@ -85,17 +84,6 @@ def test_parameters_are_found_again_from_coordinates_without_walls(prior):
     np.testing.assert_allclose(space.enter(back), x, atol=1e-6)
     assert np.isinf(space.low).all()
     assert np.isinf(space.high).all()
-
-
-@pytest.mark.parametrize("prior", [p for p in PRIORS.values() if not hasattr(p, "coordinates")])
-def test_chains_step_in_the_unit_cube_where_a_prior_has_no_better(prior):
-    assert isinstance(prior, Prior)
-    space = space_of(prior)
-    u = cube(prior)
-    theta, log_density = space.leave(u)
-    np.testing.assert_array_equal(theta, prior.from_unit_cube(u))
-    assert (log_density == 0).all()
-    np.testing.assert_allclose(space.enter(theta), u, atol=1e-7)
 
 
 def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():

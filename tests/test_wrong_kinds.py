@@ -12,10 +12,7 @@ import probewise
 from probewise import diagnosis
 from probewise.arm import Pose, Reading, SimulatedArm
 from probewise.calibration import Calibration, read_sensor, write_sensor
-from probewise.diagnosis import (
-    diagnose_system,
-    fit_simulator,
-)
+from probewise.diagnosis import diagnose_system, fit_simulator
 from probewise.effects import VOCABULARY, Effect
 from probewise.errors import NotConvergedError, ParameterError, ProbewiseError
 from probewise.experiment import Experiment, Exploration

@@ -52,13 +52,7 @@ VECTORS = [
     (t.ResetMotorPosition(2, 0), True, "04 00 00 0A 02 00", "03 00 02 0A 00", None),
     (t.GetBatteryLevel(), True, "02 00 00 0B", "05 00 02 0B 00 F4 1C", 7412),
     (t.KeepAlive(), True, "02 00 00 0D", "07 00 02 0D 00 C0 27 09 00", 600000),
-    (
-        t.GetCurrentProgramName(),
-        True,
-        "02 00 00 11",
-        "17 00 02 11 00 61 72 6D 2E 72 78 65" + 13 * " 00",
-        "arm.rxe",
-    ),
+    (t.GetCurrentProgramName(), True, "02 00 00 11", "17 00 02 11 00 61 72 6D 2E 72 78 65" + 13 * " 00", "arm.rxe"),
     (
         t.GetFirmwareVersion(),
         True,

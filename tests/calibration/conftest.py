@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from probewise._arrays import FloatArray
-from probewise.calibration import (
-    Calibration,
-    FittedSensor,
-    calibrate,
-    choose_pixel_mm,
-    posterior_mean_ssf_field,
-)
+from probewise.calibration import Calibration, FittedSensor, calibrate, choose_pixel_mm, posterior_mean_ssf_field
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_parameter_names

@@ -39,11 +39,7 @@ def journal_file(sensor_file, tmp_path):
     x_mm, y_mm = poses()
     n = len(x_mm)
     plan = Plan.from_arrays(
-        x_mm=x_mm,
-        y_mm=y_mm,
-        time_s=5.0 * np.arange(n),
-        patterns={"field": Disc(CENTRE_MM, RADIUS_MM)},
-        unit="LEGO",
+        x_mm=x_mm, y_mm=y_mm, time_s=5.0 * np.arange(n), patterns={"field": Disc(CENTRE_MM, RADIUS_MM)}, unit="LEGO"
     )
     ssf = fixed_mixture(sensor.samples.mean(axis=0)[:6])
     exact = Chain(ssf, FixedLevels(10.0, 60.0), KnownScene(plan.patterns)).predict(np.empty((1, 0)), plan)[0]

@@ -61,20 +61,6 @@ def test_a_fit_predicts_runs_that_it_has_not_seen(folder, fit):
     assert all(np.isfinite(float(r["log_density"])) for r in rows)
 
 
-def test_a_changed_simulator_does_not_predict_by_the_old_file(folder, fit, capsys):
-    (folder / "changed.py").write_text(FILE.replace("(0, 10)", "(0, 11)"))
-    arguments = [
-        "predict",
-        str(fit / "fitted.json"),
-        str(folder / "new.csv"),
-        "--simulator",
-        str(folder / "changed.py"),
-    ]
-    assert main([*arguments, "--out", str(folder / "q.csv")]) == 2
-    assert "that file unchanged" in capsys.readouterr().err
-    assert not (folder / "q.csv").exists()
-
-
 @pytest.mark.slow
 def test_an_audit_needs_no_readings(folder):
     lines = (folder / "data.csv").read_text().splitlines()

@@ -62,21 +62,3 @@ def test_a_fit_that_does_not_arrive_gives_no_verdict(recording_file, tmp_path, m
     assert said.err.splitlines()[-1] == "probewise diagnose: the fit of the model did not converge"
     assert said.out == ""
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("verb", ["predict", "audit"])
-def test_a_plan_over_a_pattern_that_its_description_lacks_is_refused(
-    verb, recording_file, sensor_file, tmp_path, capsys
-):
-    description = recording_file.with_suffix(".json")
-    content = json.loads(description.read_text())
-    del content["patterns"]["quadrant_a"]
-    description.write_text(json.dumps(content))
-    arguments = {
-        "predict": ("predict", sensor_file, recording_file, "--out", tmp_path / "p.csv"),
-        "audit": ("audit", recording_file, "--out", tmp_path / "out"),
-    }[verb]
-    assert run(*arguments) == 2
-    said = capsys.readouterr().err
-    assert "quadrant_a" in said
-    assert said.count("\n") == 1

@@ -24,10 +24,7 @@ from probewise.diagnosis.advice import (
 )
 from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS
 from probewise.diagnosis.fit import Model
-from probewise.diagnosis.light_sensor import (
-    LightSensorApparatus,
-    target_swaps,
-)
+from probewise.diagnosis.light_sensor import LightSensorApparatus, target_swaps
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.sensors import default_sensor
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
@@ -182,8 +179,7 @@ def refit(name: str, settings: list[float], plan: Plan) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(
-    ("lag", "play", "advised"),
-    [(0.5, 0.5, True), (0.93, 0.07, True), (0.984, 0.016, False), (0.02, 0.98, False)],
+    ("lag", "play", "advised"), [(0.5, 0.5, True), (0.93, 0.07, True), (0.984, 0.016, False), (0.02, 0.98, False)]
 )
 def test_readings_are_advised_only_where_a_question_is_open(lag, play, advised):
     """They would tell a lag from backlash by many nats, whatever their probabilities."""

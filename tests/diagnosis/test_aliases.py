@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 from heater import SIMULATOR, runs
 
-from probewise.diagnosis.advice import (
-    COUNTS,
-    Alias,
-    pairs_with_separating_scans,
-)
+from probewise.diagnosis.advice import COUNTS, Alias, pairs_with_separating_scans
 from probewise.diagnosis.apparatus import MOST_READINGS
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import Linearised

@@ -217,11 +217,7 @@ def clock(constant: float) -> Simulator:
 
 
 def table(constant: float) -> dict[str, np.ndarray]:
-    return {
-        "t": np.arange(float(N_FAR_OFF)),
-        "x": X_FAR_OFF,
-        "y": constant + Y_FAR_OFF,
-    }
+    return {"t": np.arange(float(N_FAR_OFF)), "x": X_FAR_OFF, "y": constant + Y_FAR_OFF}
 
 
 @pytest.mark.parametrize("name", ["offset_step", "lag", "offset_drift"])

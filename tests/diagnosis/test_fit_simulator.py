@@ -143,10 +143,7 @@ def _notes(prior, *, slope=SLOPE, seed=3):
     simulator = Simulator(
         "strain_ue", "ue", {"per_n": prior}, simulate=lambda p, data: p["per_n"] * data["pull_n"], noise=Noise(sd=SD)
     )
-    table = {
-        "pull_n": X_IN_CONFLICT,
-        "strain_ue": slope * X_IN_CONFLICT + rng.normal(0, SD, len(X_IN_CONFLICT)),
-    }
+    table = {"pull_n": X_IN_CONFLICT, "strain_ue": slope * X_IN_CONFLICT + rng.normal(0, SD, len(X_IN_CONFLICT))}
     prepared = prepare_system(simulator, table_for(simulator, table), with_effects=False)
     return [note for note in prepared.recording.notes if "prior" in note]
 

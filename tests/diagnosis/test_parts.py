@@ -11,41 +11,20 @@ from scipy.integrate import quad
 
 from probewise.arm import readings_of_recording, recording_of_readings
 from probewise.diagnosis.advice import Alias
-from probewise.diagnosis.evidence import (
-    LEAST_VISIBLE,
-    SCALES,
-    Linearised,
-)
+from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
-from probewise.diagnosis.locate import (
-    Covariate,
-    places_of_effect,
-    significant_places,
-)
+from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
-from probewise.diagnosis.templates import (
-    EffectTemplates,
-    TemplateBank,
-    log_bayes_factors_of_pairs,
-    templates_of_effect,
-)
+from probewise.diagnosis.templates import EffectTemplates, TemplateBank, log_bayes_factors_of_pairs, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
 from probewise.effects.reference import candidate_scan_groups
 from probewise.errors import ParameterError
-from probewise.recordings import (
-    HalfPlane,
-    Plan,
-    Recording,
-    Uniform,
-    read_recording,
-    two_way_plan,
-    write_recording,
-)
+from probewise.recordings import HalfPlane, Plan, Recording, Uniform, read_recording, two_way_plan, write_recording
 from probewise.recordings.plans import with_jittered_times
 from probewise.sensor import footprint_of, mixture_parameter_names
 

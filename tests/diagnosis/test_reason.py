@@ -72,21 +72,13 @@ SAID = [
         {"form": "an SSF of one Gaussian"},
         "The model, an SSF of one Gaussian, explains all 100 readings to within their noise (p = 0.4).",
     ),
-    (
-        judged("cannot_tell"),
-        {"settles": "repeat run 2"},
-        f"{APART}; to tell them apart: repeat run 2.",
-    ),
+    (judged("cannot_tell"), {"settles": "repeat run 2"}, f"{APART}; to tell them apart: repeat run 2."),
     (
         judged("cannot_tell"),
         {"settles": "repeat run 2", "apart": "lag or clean from unknown"},
         f"{APART}; to tell lag or clean from unknown: repeat run 2.",
     ),
-    (
-        judged("cannot_tell"),
-        {"settles": ""},
-        f"{APART}; no reading tells them apart.",
-    ),
+    (judged("cannot_tell"), {"settles": ""}, f"{APART}; no reading tells them apart."),
     (
         judged("unknown", ("unknown",)),
         {"beside": ("lag",), "shows_in": ("time", "level")},

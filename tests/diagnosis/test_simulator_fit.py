@@ -126,10 +126,7 @@ def test_a_law_that_needs_finer_steps_once_it_is_repaired_gets_them(swings):
         "x_m",
         "m",
         {"k": ("log", 10, 100), "c": (0, 1)},
-        law=Law(
-            {"x": 1.0, "v": 0.0},
-            lambda s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]},
-        ),
+        law=Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]}),
         time="t_s",
     )
     stages = []

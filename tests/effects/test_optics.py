@@ -15,19 +15,8 @@ from probewise.effects.optics import RegionWithGradient, RegionWithPatch
 from probewise.priors import Product
 from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform, paper_plan
 from probewise.scene import KnownScene, edge_distance
-from probewise.scene.regions import (
-    HalfPlaneRegion,
-    PolygonRegion,
-    QuadrantRegion,
-    StripesRegion,
-    disc_region,
-)
-from probewise.sensor import (
-    Chain,
-    FixedLevels,
-    FixedMixture,
-    Stage,
-)
+from probewise.scene.regions import HalfPlaneRegion, PolygonRegion, QuadrantRegion, StripesRegion, disc_region
+from probewise.sensor import Chain, FixedLevels, FixedMixture, Stage
 
 I_MIN, I_MAX, H0 = 10.0, 60.0, 12.0
 PIXEL = 0.2
@@ -189,10 +178,7 @@ CASES = {
         Rival(place=lambda k, x, y: (x + 0.8 * np.sin(2 * np.pi * x / 11 + 0.4), y)),
     ),
     "edge_misplacement": ((1.4,), Rival(albedo=lambda k, name, x, y: moved(k, name, x, y, 1.4))),
-    "scan_misplacement": (
-        (1.4,),
-        Rival(albedo=lambda k, name, x, y: moved(k, name, x, y, 1.4 * in_scan(1)(k))),
-    ),
+    "scan_misplacement": ((1.4,), Rival(albedo=lambda k, name, x, y: moved(k, name, x, y, 1.4 * in_scan(1)(k)))),
     "scan_angle_error": ((35.0,), Rival(turn_deg=lambda k: 35.0 * in_scan(1)(k))),
     "orientation_error": ((-20.0,), Rival(turn_deg=lambda k: -20.0)),
     "sensor_tilt": ((0.9, -1.3), Rival(place=lambda k, x, y: (x + 0.9, y - 1.3))),

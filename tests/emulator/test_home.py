@@ -31,8 +31,7 @@ HOME_DEG = 0.2 + 0.15  # half the play, and nearly two of the twelve counts to a
 
 def with_stops(*names: str) -> arm.Geometry:
     return dataclasses.replace(
-        SHIPPED,
-        **{n: dataclasses.replace(getattr(SHIPPED, n), stop_rad=math.radians(STOPS_DEG[n])) for n in names},
+        SHIPPED, **{n: dataclasses.replace(getattr(SHIPPED, n), stop_rad=math.radians(STOPS_DEG[n])) for n in names}
     )
 
 

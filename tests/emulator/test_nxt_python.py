@@ -43,11 +43,7 @@ def client(device: str) -> Callable[[str], list[str]]:
     def client(statements: str) -> list[str]:
         body = "".join(f"    {line}\n" for line in statements.strip().splitlines())
         done = subprocess.run(
-            [sys.executable, "-c", HEAD + body, device],
-            capture_output=True,
-            text=True,
-            timeout=LIMIT_S,
-            check=False,
+            [sys.executable, "-c", HEAD + body, device], capture_output=True, text=True, timeout=LIMIT_S, check=False
         )
         assert done.returncode == 0, done.stderr
         return done.stdout.splitlines()

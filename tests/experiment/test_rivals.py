@@ -48,11 +48,7 @@ from probewise.experiment.rivals import rivals_of
 from probewise.experiment.stopping import trend_of_residuals
 from probewise.inference import Rounded
 from probewise.inquiry import Readout
-from probewise.proof.concealed_study import (
-    ConcealedTrial,
-    _arm_in_concealed_world,
-    run_concealed_trial,
-)
+from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world, run_concealed_trial
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import Trial, arm_of, experiment_of, timed_steps
 from probewise.recordings import Plan, Recording, Uniform
@@ -477,11 +473,7 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
 @pytest.mark.parametrize(
     ("plain", "level", "read"),
     [
-        (
-            Rounded(sd=1.0, step=1.0, low=0.0, high=100.0),
-            101.0,
-            [100.0] * 6,
-        ),
+        (Rounded(sd=1.0, step=1.0, low=0.0, high=100.0), 101.0, [100.0] * 6),
         (Rounded(sd=0.6, step=1.0, low=1.0, high=100.0), 10.2, [10.0] * 6),
         (Rounded(sd=0.6, step=1.0, low=1.0, high=100.0), 10.2, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]),
     ],

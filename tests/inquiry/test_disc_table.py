@@ -141,11 +141,7 @@ def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
 @pytest.mark.parametrize("names", [("backlash",), ("edge_blur",), ("backlash", "edge_blur", "saturation")])
 def test_a_sensor_with_known_effects_is_looked_up_too(made, places, names):
     """A repaired sensor predicts from the table what its chain predicts by quadrature."""
-    values = {
-        "backlash": (6.0,),
-        "edge_blur": (8.0,),
-        "saturation": (45.0, 1.0),
-    }
+    values = {"backlash": (6.0,), "edge_blur": (8.0,), "saturation": (45.0, 1.0)}
     model = replace(made.chain(), effects=tuple(Known(EFFECTS[name](), values[name]) for name in names))
     forecast, theta = forecast_of(model), made.circles(40)
     assert isinstance(forecast.model, DiscTable | TabulatedChain)

@@ -27,11 +27,7 @@ def disc() -> object:
     return problems.Known(prior, function, math.log((0.4 + 0.1 * math.e) * math.pi / 4))
 
 
-PROBLEMS = {
-    "plateau": problems.plateau,
-    "Rosenbrock 2-D": lambda: problems.rosenbrock(2),
-    "partly impossible": disc,
-}
+PROBLEMS = {"plateau": problems.plateau, "Rosenbrock 2-D": lambda: problems.rosenbrock(2), "partly impossible": disc}
 
 
 @pytest.fixture(scope="module", params=[*PROBLEMS, "two runs"])

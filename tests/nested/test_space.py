@@ -7,15 +7,7 @@ import pytest
 
 from probewise.calibration import SSFPrior, default_prior
 from probewise.nested.problem import unbounded_space_of
-from probewise.priors import (
-    HeavyTailedPrior,
-    Joint,
-    LogHeavyTailedPrior,
-    LogUniform,
-    Normal,
-    Product,
-    Uniform,
-)
+from probewise.priors import HeavyTailedPrior, Joint, LogHeavyTailedPrior, LogUniform, Normal, Product, Uniform
 from probewise.recordings import Recording, paper_plan
 from probewise.scene import AnyOf, Circle, Ellipse, Rectangle, RegularPolygon
 

@@ -57,10 +57,7 @@ def test_a_lock_file_that_is_a_symbolic_link_is_refused_and_where_it_leads_stays
     for target in ("victim", "to be made"):
         (tmp_path / ".a.lock").unlink(missing_ok=True)
         (tmp_path / ".a.lock").symlink_to(tmp_path / target)
-        with (
-            pytest.raises(FileError, match=r"\.a\.lock: cannot be locked \(is a sym"),
-            hold_lock(tmp_path / "a"),
-        ):
+        with pytest.raises(FileError, match=r"\.a\.lock: cannot be locked \(is a sym"), hold_lock(tmp_path / "a"):
             pass
     assert {p.name for p in tmp_path.iterdir()} == {".a.lock", "victim"}
     assert (tmp_path / "victim").read_text() == "precious"

@@ -8,11 +8,7 @@ import pytest
 from probewise.diagnosis import Place
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.recordings import Recording, Uniform
-from probewise.report.covariates import (
-    ResidualNoise,
-    covariate_in_words_and_unit,
-    views_of_place,
-)
+from probewise.report.covariates import ResidualNoise, covariate_in_words_and_unit, views_of_place
 from probewise.report.diagnosis import _place_caption
 from probewise.systems import RunTable
 from probewise.systems.table import RunRecording

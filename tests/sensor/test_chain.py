@@ -172,8 +172,7 @@ def test_the_naive_sensor_reads_by_the_point_under_it():
 
 def test_a_pattern_that_the_scene_lacks_is_named():
     with pytest.raises(
-        ParameterError,
-        match=r"one that is described \('disc'\); 'boundary' is named but not described",
+        ParameterError, match=r"one that is described \('disc'\); 'boundary' is named but not described"
     ):
         Chain(FreeMixture(1), FreeLevels(), KnownScene({"disc": PATTERNS["disc"]})).predict(
             thetas(1, 1), plan_of(names=("boundary",))

@@ -131,11 +131,7 @@ def test_time_that_falls_within_a_run_is_refused_with_the_row():
 @pytest.mark.slow
 def test_the_step_is_halved_until_readings_stand_still():
     simulator = Simulator(
-        "y",
-        "V",
-        {"l_m": (0.1, 1.0), "c": (0.0, 0.1)},
-        law=Law({"phi": 1.0, "omega": 0.0}, _pendulum),
-        time="t_s",
+        "y", "V", {"l_m": (0.1, 1.0), "c": (0.0, 0.1)}, law=Law({"phi": 1.0, "omega": 0.0}, _pendulum), time="t_s"
     )
     table = _table(np.linspace(0, 10, 30))
     system = System.of(simulator, table)
@@ -302,10 +298,7 @@ CASES = {
     "depends:k:force": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _FORCE, _MEAN_FORCE, 0.3)}),
     "depends:k:warm": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _WARM, _MEAN_WARM, 0.3)}),
     "drifts:k": ([0.2], lambda hold: {"spring": lambda t, middle, k: _SPRING + 0.2 * t}),
-    "steps:k": (
-        [1.0, 4.01],
-        lambda hold: {"spring": lambda t, middle, k: _SPRING + (middle > 4.01), "breaks": [4.01]},
-    ),
+    "steps:k": ([1.0, 4.01], lambda hold: {"spring": lambda t, middle, k: _SPRING + (middle > 4.01), "breaks": [4.01]}),
     "differs:k": (
         [[0.5, -0.8][int(name)] for name in TABLE.scan_names],
         lambda hold: {"spring": lambda t, middle, k: _SPRING + [0.5, -0.8][k]},

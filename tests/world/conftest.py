@@ -25,11 +25,7 @@ def plan():
         scan_names=("out", "back", "white", "along_y"),
         pattern=np.repeat([0, 0, 1, 2], counts),
         pattern_names=("boundary", "white", "disc"),
-        patterns={
-            "boundary": HalfPlane(NORMAL_RAD, OFFSET_MM),
-            "white": Uniform(1.0),
-            "disc": Disc((1.3, -0.4), 12.0),
-        },
+        patterns={"boundary": HalfPlane(NORMAL_RAD, OFFSET_MM), "white": Uniform(1.0), "disc": Disc((1.3, -0.4), 12.0)},
         covariates={"battery_mv": np.round(8300 - 2.0 * time_s)},
         instrumentation=Instrumentation(min=0.0, max=100.0, height_mm=14.0),
     )

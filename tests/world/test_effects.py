@@ -68,10 +68,7 @@ FORMULAS = {
     "flicker": (known.flicker(1.5, 0.07, 0.3), lambda y, p: y + 1.5 * np.sin(2 * np.pi * 0.07 * p.time_s + 0.3)),
     "saturation": (known.saturation(45.0), lambda y, p: np.where(y > 45, 45.0, y)),
     "nonlinearity": (known.nonlinearity(1.3), lambda y, p: 10 + 50 * ((y - 10) / 50) ** 1.3),
-    "hysteresis": (
-        known.hysteresis(0.8),
-        lambda y, p: y + 0.8 * np.array([1.0, -1.0, 1.0, 1.0])[p.scan],
-    ),
+    "hysteresis": (known.hysteresis(0.8), lambda y, p: y + 0.8 * np.array([1.0, -1.0, 1.0, 1.0])[p.scan]),
     "glint": (
         known.glint(3.0, 4.0, 1.0, 5.0),
         lambda y, p: y + 3 * np.exp(-((p.x_mm - 4) ** 2 + (p.y_mm - 1) ** 2) / 50),
@@ -93,10 +90,7 @@ FORMULAS |= {
         strange.peak_memory(0.1),
         lambda y, p: y + 0.1 * np.array([(y[: k + 1][p.scan[: k + 1] == p.scan[k]] - 10).max() for k in range(len(y))]),
     ),
-    "gain_loss": (
-        strange.gain_loss(0.02, 2.0),
-        lambda y, p: 10 + (y - 10) * np.clip(1 - 0.01 * p.time_s, 0, None),
-    ),
+    "gain_loss": (strange.gain_loss(0.02, 2.0), lambda y, p: 10 + (y - 10) * np.clip(1 - 0.01 * p.time_s, 0, None)),
 }
 
 
@@ -124,10 +118,7 @@ STANDS = {
     "bent_rail": (strange.bent_rail(0.5), lambda p: _moved_along_x(p, 0.005 * p.x_mm**2)),
     "twisted_rail": (strange.twisted_rail(0.5), lambda p: _moved_along_x(p, 0.0005 * p.x_mm**3)),
     "place_step": (strange.place_step(0.5, 1.0), lambda p: _moved_along_x(p, np.where(p.x_mm > 1, 0.5, 0))),
-    "stick_slip": (
-        strange.stick_slip(0.5, 8.0, 0.25),
-        lambda p: _moved_along_x(p, np.mod(p.x_mm + 2, 8) / 8 - 0.5),
-    ),
+    "stick_slip": (strange.stick_slip(0.5, 8.0, 0.25), lambda p: _moved_along_x(p, np.mod(p.x_mm + 2, 8) / 8 - 0.5)),
     "play_of_axes": (
         strange.play_of_axes(2.0, 1.0),
         lambda p: places(p) - np.array([[1, 0], [-1, 0], [1, 0], [0, 0.5]])[p.scan],
@@ -164,11 +155,7 @@ def test_an_angle_error_reads_what_a_turned_sensor_reads(effect, scans, plan):
 
 def test_a_misplaced_edge_is_a_pattern_that_lies_elsewhere(plan):
     """Across the edge for a boundary, along X for a disc."""
-    moved = {
-        **plan.patterns,
-        "boundary": HalfPlane(0.1, 0.7 + 0.9),
-        "disc": Disc((1.3 + 0.9, -0.4), 12.0),
-    }
+    moved = {**plan.patterns, "boundary": HalfPlane(0.1, 0.7 + 0.9), "disc": Disc((1.3 + 0.9, -0.4), 12.0)}
     expected = read(replace(plan, patterns=moved))
     assert np.abs(read(plan, known.edge_misplacement(0.9)) - expected).max() < 1e-9
     one = read(plan, known.scan_misplacement(0.9, "back"))

@@ -9,16 +9,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
-from probewise.world import (
-    Blob,
-    Oval,
-    Spot,
-    albedo_at,
-    gaussian_spot,
-    ridge_spot,
-    seen_white_fraction,
-    tailed_spot,
-)
+from probewise.world import Blob, Oval, Spot, albedo_at, gaussian_spot, ridge_spot, seen_white_fraction, tailed_spot
 
 BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)
 SPOTS = {

@@ -7,12 +7,7 @@ import pytest
 
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Uniform, paper_plan, two_way_plan
-from probewise.world import (
-    Blob,
-    World,
-    gaussian_spot,
-    simulate,
-)
+from probewise.world import Blob, World, gaussian_spot, simulate
 from probewise.world import concealed as known
 from probewise.world.stages import acts_at
 

@@ -119,9 +119,7 @@ def test_the_formula_beside_names_is_that_of_largest_evidence_which_adds_formula
 
 
 @pytest.mark.parametrize(
-    ("named", "stays"),
-    [(16.0, True), (14.0, False)],
-    ids=["over half of all that is explained", "less than half"],
+    ("named", "stays"), [(16.0, True), (14.0, False)], ids=["over half of all that is explained", "less than half"]
 )
 def test_a_name_stays_if_it_explains_more_than_all_that_has_no_name(named, stays):
     """A gradient of 14 nats, a reflection that adds 10 and an unknown effect that adds 6: 14 of 30 have a name."""

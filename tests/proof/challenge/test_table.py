@@ -29,8 +29,7 @@ def test_a_bootstrap_of_the_mean_agrees_with_its_standard_error():
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "decision"),
-    [(0.95, 0.99, "met"), (0.8, 0.85, "missed"), (0.85, 0.95, "open"), (0.9, 1.0, "met")],
+    ("low", "high", "decision"), [(0.95, 0.99, "met"), (0.8, 0.85, "missed"), (0.85, 0.95, "open"), (0.9, 1.0, "met")]
 )
 def test_a_row_is_decided_only_by_its_whole_interval(low, high, decision):
     assert ScoreRow("x", Estimate(0.9, low, high, 10), least=0.9).decision == decision

@@ -27,12 +27,7 @@ _DRIVE = np.round(512 * (np.sin(_T) + 0.3 * np.sin(3.1 * _T))) / 512
 
 def _table(shift, far=0.0):
     return RunTable(
-        {
-            "t_s": _T + shift,
-            "run": np.repeat([1.0, 2.0], N_ROWS // 2),
-            "drive": _DRIVE + far,
-            "y": 1.0 + 2.0 * _DRIVE,
-        },
+        {"t_s": _T + shift, "run": np.repeat([1.0, 2.0], N_ROWS // 2), "drive": _DRIVE + far, "y": 1.0 + 2.0 * _DRIVE},
         time="t_s",
         run="run",
     )
@@ -49,12 +44,7 @@ def _law(far):
 
 def _about(shift, far, how):
     simulator = Simulator(
-        reading="y",
-        unit="V",
-        parameters={"offset": (-5, 5), "gain": (0, 4)},
-        time="t_s",
-        run="run",
-        **how(far),
+        reading="y", unit="V", parameters={"offset": (-5, 5), "gain": (0, 4)}, time="t_s", run="run", **how(far)
     )
     table = _table(shift, far)
     system = System.of(simulator, table)
@@ -115,8 +105,7 @@ def test_a_periodic_error_of_a_column_far_from_0_has_its_phase_from_there():
 
 
 @pytest.mark.parametrize(
-    ("how", "name"),
-    [*((_function, name) for name in COUNTS_TIME[:-2]), *((_law, name) for name in COUNTS_TIME[-2:])],
+    ("how", "name"), [*((_function, name) for name in COUNTS_TIME[:-2]), *((_law, name) for name in COUNTS_TIME[-2:])]
 )
 def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
     """The drift of a gain is 0 at the first time: without that time its size alone says nothing."""

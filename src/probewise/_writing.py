@@ -173,7 +173,7 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
 
 def _require_short_name(path: Path) -> None:
     """Raise FileError if a path, or a name in it, is too long: before any work, since it just seems not to exist."""
-    for name in (path, *path.parts):
+    for name in (str(path), *path.parts):
         try:
             os.lstat(name)
         except OSError as error:

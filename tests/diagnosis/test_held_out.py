@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.held_out import mean_gain_over_parts, predictive_log_densities
-from probewise.diagnosis.light_sensor import held_out_parts
+from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.recordings import Recording, paper_plan
 
@@ -29,12 +29,12 @@ def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
             "scan_names": tuple(f"line_{k}" for k in range(16)),
         }
     )
-    parts, names = held_out_parts(Recording(many, np.zeros(len(many))))
+    parts, names = LightSensorApparatus().held_out_parts(Recording(many, np.zeros(len(many))))
     assert len(names) == 2
     assert names[0].endswith("0 degrees")
     np.testing.assert_array_equal(parts, np.round(many.orientation_rad / (np.pi / 2)).astype(int) - int(parts[0] != 0))
     a_turn_more = replace(many, orientation_rad=many.orientation_rad + 2 * np.pi * (many.scan % 2))
-    again, names_again = held_out_parts(Recording(a_turn_more, np.zeros(len(many))))
+    again, names_again = LightSensorApparatus().held_out_parts(Recording(a_turn_more, np.zeros(len(many))))
     np.testing.assert_array_equal(again, parts)
     assert names_again == names
     held = mean_gain_over_parts(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)

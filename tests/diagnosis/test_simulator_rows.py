@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -16,7 +17,7 @@ from probewise.diagnosis.fit import Model
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise_law import white_noise
 from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
-from probewise.diagnosis.simulator_rows import SimulatorApparatus, plan_of_alternatives, possible_run_commands
+from probewise.diagnosis.simulator_rows import SimulatorApparatus, possible_run_commands
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.recordings import Plan
 from probewise.systems import (
@@ -39,7 +40,8 @@ TABLE = runs()
 
 
 def offered(controls=("power_w",), table=TABLE, by_law=True):
-    commands = possible_run_commands(table, "temp_c", controls, "s", by_law=by_law)
+    simulator = SimpleNamespace(reading="temp_c", controls=controls, time_unit="s", law=by_law or None)
+    commands = possible_run_commands(table, simulator)
     return {command.plan.scan_names[0]: command for command in commands}
 
 
@@ -61,7 +63,7 @@ def test_a_control_is_swept_held_and_switched_between_its_ends():
 
 
 def test_commands_set_behind_each_other_are_runs_of_their_own():
-    together = cast(RunTable, plan_of_alternatives(list(offered().values())[:3], TABLE))
+    together = cast(RunTable, SimulatorApparatus(ABOUT).plan_of_alternatives(list(offered().values())[:3], TABLE))
     assert len(together.scan_names) == 3
     assert set(together.like.values()) <= set(TABLE.scan_names)
 

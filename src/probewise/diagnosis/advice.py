@@ -121,25 +121,11 @@ def _projected_basis(problem: Linearised, whitened: FloatArray) -> tuple[FloatAr
     return u[:, kept], axes[kept].T / lengths[kept]
 
 
-def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
-    """List the pairs of effects whose projected templates have a cosine of 0.9 or more, the most collinear first.
-
-    `templates`: for each effect, its best-fitting template columns (n_points, k); `otherwise`: the `settle_by` of each
-    pair; its `readings` are 0.
-    """
-    bases = {name: _projected_basis(problem, problem.whiten(templates[name]))[0] for name in sorted(templates)}
-    out = []
-    for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
-        cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
-        if cosines[0] >= ALIAS_COSINE:
-            out.append(Alias(pair, float(min(cosines[0], 1.0)), otherwise, 0))
-    return sorted(out, key=lambda alias: -alias.cosine)
-
-
 def aliases_with_separating_plans(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
     """List the aliased pairs of effects of the vocabulary on the mean, each with the scan that separates it best.
 
-    An effect's template is the best-fitting entry of its bank (its changes of readings, at a grid of its parameters).
+    The most collinear come first: their projected templates have a cosine of 0.9 or more. A template is the best
+    entry of an effect's bank (its changes of readings, at a grid of its parameters).
     """
     prepared, misfit_templates = searched.prepared, searched.misfit_templates
     telling, chosen = dict[str, FloatArray](), dict[str, EffectEntry]()
@@ -153,7 +139,14 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         best = int(np.argmax(scores))
         telling[name] = templates.columns[best]
         chosen[name] = templates.variant_of_entry(best), templates.settings[best]
-    pairs = collinear_pairs(problem, telling, otherwise=prepared.apparatus.words.settles_nothing)
+    bases = {name: _projected_basis(problem, problem.whiten(telling[name]))[0] for name in sorted(telling)}
+    pairs = []
+    for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
+        cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
+        if cosines[0] >= ALIAS_COSINE:
+            settles_nothing = prepared.apparatus.words.settles_nothing
+            pairs.append(Alias(pair, float(min(cosines[0], 1.0)), settles_nothing, 0))
+    pairs.sort(key=lambda alias: -alias.cosine)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
 
 

@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._kinds import require_progress, require_rng
 from probewise._words import count_with_noun
-from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared, diagnosis_of_search
+from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording
@@ -250,11 +250,11 @@ def diagnose_system(
     def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
+        searched = None
         if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
             prior = prepared.apparatus.prior_odds(prepared.effects)
-            found = replace(search(replace(prepared, effects={}), prior=prior, progress=told), prepared=prepared)
-            return diagnosis_of_search(found, thorough=thorough, progress=told, rng=rng)
-        return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
+            searched = replace(search(replace(prepared, effects={}), prior=prior, progress=told), prepared=prepared)
+        return diagnose_prepared(prepared, searched=searched, thorough=thorough, progress=told, rng=rng)
 
     diagnosis = fit_and_diagnose(simulator)
     needed = finer_step_for_repair(diagnosis)

@@ -482,18 +482,16 @@ def diagnose(
 
 
 def diagnose_prepared(
-    prepared: Prepared, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
+    prepared: Prepared,
+    *,
+    searched: Searched | None = None,
+    thorough: Thorough | None = None,
+    progress: Progress = silent,
+    rng: np.random.Generator,
 ) -> Diagnosis:
-    """Run the pipeline of `diagnose` on the input of any apparatus, with the same returns and errors."""
-    searched = search_with_formulas(search(prepared, progress=progress), progress=progress)
-    return diagnosis_of_search(searched, thorough=thorough, progress=progress, rng=rng)
-
-
-def diagnosis_of_search(
-    searched: Searched, *, thorough: Thorough | None = None, progress: Progress = silent, rng: np.random.Generator
-) -> Diagnosis:
-    """Run the rest of the pipeline on the result of a search, with the arguments and returns of `diagnose`."""
-    prepared, weighings = searched.prepared, tuple[Weighing, ...]()
+    """Run the pipeline of `diagnose` on the input of any apparatus, or on the result of a search in it."""
+    searched = searched or search_with_formulas(search(prepared, progress=progress), progress=progress)
+    prepared, weighings = searched.prepared, tuple[Weighing, ...]()  # with the formulas that it tried
     if prepared.has_too_little_data:
         searched = searched.with_prior_probabilities()
     elif thorough is not None:

@@ -46,28 +46,6 @@ def _earliest_start_s(plan: Plan) -> float:
     return float(plan.time_s.max(initial=0.0)) + BREAK_S
 
 
-def plan_of_alternatives(commands: Sequence[Command], after: Plan) -> Plan:
-    """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
-
-    Covariates that cannot be commanded, such as battery voltage, keep their last known value of that plan.
-    """
-    plan = join_plans([command.plan for command in commands])
-    read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
-    kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
-    return replace(plan, covariates={**kept, **plan.covariates})
-
-
-def plan_of_sequence(commands: Sequence[Command], after: Plan) -> Plan:
-    """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
-
-    Covariates that the scans lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
-    """
-    out: list[Command] = []
-    for scan in commands:
-        out.append(scan_started_after(scan, out[-1].plan if out else after))
-    return plan_of_alternatives(out, after)
-
-
 def scan_started_after(scan: Command, plan: Plan) -> Command:
     """Move a scan to after a plan, with time to lay its sheet."""
     delay_s = _earliest_start_s(plan) + _sheet_laying_s(scan.kind) - float(scan.plan.time_s[0])
@@ -291,24 +269,6 @@ def _distance_inside_edge_mm(plan: Plan, edge: HalfPlane) -> FloatArray:
     return plan.x_mm * math.cos(edge.normal_rad) + plan.y_mm * math.sin(edge.normal_rad) - edge.offset_mm
 
 
-def held_out_parts(recording: Recording) -> Parts:
-    """Return the part of each usable reading, (n_usable,), and the names of the parts: scans.
-
-    If more than ten scans have eight readings or more, all scans over one pattern in one orientation are one part,
-    since neighbouring scans would leak information; unless there is only one such part.
-    """
-    plan, usable = recording.plan, recording.usable
-    scan = plan.scan[usable]
-    if np.sum(np.bincount(scan) >= LEAST_ROWS) > MOST_PARTS:
-        views = np.stack([plan.pattern[usable].astype(np.float64), orientation_deg(plan)[usable]])
-        kinds, part = np.unique(views, axis=1, return_inverse=True)
-        if kinds.shape[1] > 1:
-            return part.reshape(-1), tuple(
-                f"{plan.pattern_names[int(code)]}, {turn:.0f} degrees" for code, turn in kinds.T
-            )
-    return scan, plan.scan_names
-
-
 _NOT_COLUMNS = frozenset({"time", "level", "edge_distance", "slope", "direction", "orientation", "scan", "place"})
 _MOST_SCANS_ALONE = 24  # number of scans above which residuals are not located in single scans
 
@@ -439,9 +399,30 @@ class LightSensorApparatus(Apparatus):
         rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
         return Covariate("place", values[rows], rows) if rows.size else shown
 
-    held_out_parts = staticmethod(held_out_parts)
-    plan_of_alternatives = staticmethod(plan_of_alternatives)
-    plan_of_sequence = staticmethod(plan_of_sequence)
+    def held_out_parts(self, recording: Recording) -> Parts:
+        plan, usable = recording.plan, recording.usable
+        scan = plan.scan[usable]
+        if np.sum(np.bincount(scan) >= LEAST_ROWS) > MOST_PARTS:
+            # All scans over one pattern in one orientation are one part: neighbouring scans would leak information.
+            views = np.stack([plan.pattern[usable].astype(np.float64), orientation_deg(plan)[usable]])
+            kinds, part = np.unique(views, axis=1, return_inverse=True)
+            if kinds.shape[1] > 1:
+                named = ((plan.pattern_names[int(code)], turn) for code, turn in kinds.T)
+                return part.reshape(-1), tuple(f"{pattern}, {turn:.0f} degrees" for pattern, turn in named)
+        return scan, plan.scan_names
+
+    def plan_of_alternatives(self, commands: Sequence[Command], after: Plan) -> Plan:
+        plan = join_plans([command.plan for command in commands])
+        # What cannot be commanded, such as battery voltage, keeps its last known value until it is measured.
+        read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
+        kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
+        return replace(plan, covariates={**kept, **plan.covariates})
+
+    def plan_of_sequence(self, commands: Sequence[Command], after: Plan) -> Plan:
+        out: list[Command] = []
+        for scan in commands:
+            out.append(scan_started_after(scan, out[-1].plan if out else after))
+        return self.plan_of_alternatives(out, after)
 
     def settings_of(self, plan: Plan) -> FloatArray:
         number = np.array([zlib.crc32(name.encode()) for name in plan.pattern_names])[plan.pattern]

@@ -28,7 +28,7 @@ from probewise.effects.noise import (
     signal_dependent_noise,
 )
 from probewise.recordings.plan import Plan, Recording
-from probewise.systems import RunTable, System
+from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import has_value_per_run, names_of_jumps_in_sorted_rows
 from probewise.systems.forms.formulas import formula_forms
@@ -55,22 +55,18 @@ _BREAK = 0.5  # minutes, before a run
 _RUN = "run"
 
 
-def possible_run_commands(
-    table: RunTable, reading: str, controls: Sequence[str], time_unit: str, *, by_law: bool = False
-) -> list[Command]:
+def possible_run_commands(table: RunTable, simulator: Simulator) -> list[Command]:
     """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
 
-    At most four recorded runs are taken, those that differ in their controls.
-
-    `reading`: the predicted column, which is empty in rows yet to be taken; `controls`: columns that can be set;
-    without any, runs can only be repeated. A function of the time may hold for constant controls alone, as a step
-    response does: unless the simulator is a law (`by_law`), only a control that varies in a recorded run does so again.
+    At most four recorded runs are taken, those that differ in their controls; without any, runs can only be repeated. A
+    function of the time may hold for constant controls alone, as a step response does: unless the simulator is a law,
+    only a control that varies in a recorded run does so again.
     """
     out, run = list[Command](), table.run or unused_name(_RUN, table.columns)
-    settable = [name for name in controls if name in table.covariates]
+    reading, settable = simulator.reading, [name for name in simulator.controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
-    free = set(settable) if by_law or table.time is None else varies
+    free = set(settable) if simulator.law is not None or table.time is None else varies
     for rows in _rows_of_distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
@@ -86,7 +82,7 @@ def possible_run_commands(
                 changed[table.time] = begin + slower * (time - time[0])
             taken, like = table.take(kept), {called: table.like.get(name, name)}  # parameters per run as in that run
             made = replace(taken, columns={**taken.columns, **changed}, run=run, like=like, first_row=len(table))
-            unit = _minutes_of_time_unit(made, time_unit)
+            unit = _minutes_of_time_unit(made, simulator.time_unit)
             minutes = len(made) * _A_READING if unit is None else float(np.ptp(made.time_s)) * unit
             out.append(Command(kind, words, cast(Plan, made), _BREAK + minutes))
     return out
@@ -138,25 +134,6 @@ def _next_start_time(table: RunTable) -> float:
     gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
     apart = [pause for pause in between if pause > 0]
     return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
-
-
-def plan_of_alternatives(commands: Sequence[Command], after: Plan) -> Plan:
-    """Concatenate alternative runs, each timed as if it came next, to predict all of them at once."""
-    first, *more = (cast(RunTable, command.plan) for command in commands)
-    return cast(Plan, append_tables(first, more))
-
-
-def plan_of_sequence(commands: Sequence[Command], after: Plan) -> Plan:
-    """Concatenate runs to be recorded in sequence: each begins after the one before, unless time restarts with each."""
-    recorded = cast(RunTable, after)
-    out: list[RunTable] = []
-    for command in commands:
-        table = cast(RunTable, command.plan)
-        if table.time is not None and not recorded.time_begins_anew and out:
-            later = float(out[-1].time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
-            table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
-        out.append(table)
-    return cast(Plan, append_tables(out[0], out[1:]))
 
 
 def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
@@ -378,9 +355,18 @@ class SimulatorApparatus(Apparatus):
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> list[Command]:
-        own = self.system.simulator
-        by_law = own.law is not None
-        return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit, by_law=by_law)
+        return possible_run_commands(cast(RunTable, plan), self.system.simulator)
 
-    plan_of_alternatives = staticmethod(plan_of_alternatives)
-    plan_of_sequence = staticmethod(plan_of_sequence)
+    def plan_of_alternatives(self, commands: Sequence[Command], after: Plan) -> Plan:
+        first, *more = (cast(RunTable, command.plan) for command in commands)
+        return cast(Plan, append_tables(first, more))
+
+    def plan_of_sequence(self, commands: Sequence[Command], after: Plan) -> Plan:
+        recorded, out = cast(RunTable, after), list[Command]()
+        for command in commands:
+            table = cast(RunTable, command.plan)
+            if table.time is not None and not recorded.time_begins_anew and out:
+                later = float(out[-1].plan.time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
+                table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
+            out.append(replace(command, plan=cast(Plan, table)))
+        return self.plan_of_alternatives(out, after)

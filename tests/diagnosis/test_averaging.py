@@ -100,7 +100,7 @@ def samples(probabilities, own=frozenset()):
     fits = {(0, names): candidate(names, log_z) for names, log_z in [((), 0.0), (("lag",), 1.0), (("drift",), 9.0)]}
     searched = SimpleNamespace(
         evidences=SimpleNamespace(fits=fits),
-        posterior=Posterior(probabilities, {0: 1.0}),
+        posterior=Posterior(probabilities),
         prior=SimpleNamespace(log_prior_on_mean=lambda names: 0.0),
         prepared=SimpleNamespace(effects={}, apparatus=SimpleNamespace(user_effect_names=lambda effects: own)),
     )

@@ -515,7 +515,7 @@ def diagnose_prepared(
     noise = noise_found(searched, best, best_samples, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, best_samples)
-    shares, orders = searched.evidences.unknown_shares, searched.posterior.order_probabilities
+    shares = searched.evidences.unknown_shares
     beside = searched.likeliest_fit_beside_unknown(test.noise)
     formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
     settles, apart = separating_readings_in_words(searched, judged, asked)
@@ -523,7 +523,7 @@ def diagnose_prepared(
         words=prepared.apparatus.words,
         n_readings=len(prepared.usable_rows),
         least_readings=prepared.least_readings,
-        form=searched.nulls[max(orders, key=lambda n: orders[n])].ssf_in_words,
+        form=searched.nulls[searched.likeliest_order].ssf_in_words,
         sentences={effect.name: effect.sentence for effect in found},
         like=tuple(sentence_from_samples(each, best_samples.effect_samples(each.name)) for each in formulas),
         family=max(shares, key=lambda family: shares[family], default=""),

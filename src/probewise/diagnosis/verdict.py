@@ -149,7 +149,6 @@ class Judged:
     p_value: float
     hypotheses: tuple[Hypothesis, ...]
     aliases: tuple[Alias, ...] = ()
-    order_probabilities: Mapping[int, float] = field(default_factory=dict)
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
     too_little: bool = False
     withdrawn: bool = False
@@ -240,7 +239,6 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
         test.p_value,
         hypotheses,
         aliases=pairs,
-        order_probabilities=dict(searched.posterior.order_probabilities),
         unknown_shares=searched.probabilities_of_unknown_forms(besides=rare),
         too_little=prepared.has_too_little_data,
     )

@@ -54,20 +54,6 @@ def test_an_evidence_that_is_no_number_leaves_all_others_as_they_are():
     assert by_mean == posterior().marginal_over_noise
 
 
-def test_orders_are_averaged_over_noises_by_the_prior_of_the_noise():
-    """Order 2 leads only under outliers; by prior times evidence, not by evidence alone, order 1 is more probable."""
-    by_noise = {1: {(): 0.0, ("outliers",): 0.0}, 2: {(): -1.0, ("outliers",): 0.5}}
-    fits = {
-        (n, ()): Fit(evidence={noise: SimpleNamespace(log_z=log_z) for noise, log_z in own.items()})
-        for n, own in by_noise.items()
-    }
-    weight = {noise: math.exp(PRIOR.log_prior_on_noise(noise)) for noise in ((), ("outliers",))}
-    first, second = (sum(weight[noise] * math.exp(z) for noise, z in by_noise[n].items()) for n in (1, 2))
-    found = posterior_of(Evidences(fits), PRIOR, certain=(), n_forms=2).order_probabilities
-    assert found[1] == pytest.approx(first / (first + second))
-    assert found[1] > 0.5
-
-
 def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_stated():
     found = replace(
         posterior(),

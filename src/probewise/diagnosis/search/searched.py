@@ -126,10 +126,9 @@ class Evidences:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Probabilities of hypotheses by (names on the mean, names on the noise), and of each SSF order of the null."""
+    """Probabilities of hypotheses by (names on the mean, names on the noise)."""
 
     probabilities: Mapping[tuple[Names, Names], float]
-    order_probabilities: Mapping[int, float]
 
     @property
     def marginal_over_noise(self) -> dict[Names, float]:
@@ -167,12 +166,8 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
     for (names, noise), value in evidences.screened.items() if not outlying else ():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
-
-    def log_prior_on_noise(noise: Names) -> float:
-        return prior.log_prior_on_noise(tuple(n for n in noise if n not in certain))
-
     for names, noise in log_p:
-        log_p[names, noise] += -math.log(n_forms) + log_prior_on_noise(noise)
+        log_p[names, noise] += prior.log_prior_on_noise(tuple(n for n in noise if n not in certain)) - math.log(n_forms)
     # Exact aliases differ by how far their fits went: within a hundredth of a nat they tie. Of those that tie the one
     # with fewer effects, on a reading before a parameter or a rate, comes first.
     level = math.inf
@@ -181,16 +176,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         log_p[key] = level
     log_p = dict(sorted(log_p.items(), key=lambda item: (-item[1], *map(_plainness, item[0]))))
     total = float(logsumexp(list(log_p.values())))
-    nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
-    clean_by_order = {
-        n: float(logsumexp([e.log_z + log_prior_on_noise(noise) for noise, e in fit.evidence.items()]))
-        for n, fit in nulls.items()
-    }
-    norm = float(logsumexp(list(clean_by_order.values())))
-    return Posterior(
-        {key: math.exp(value - total) for key, value in log_p.items()},
-        {n: math.exp(v - norm) for n, v in clean_by_order.items()},
-    )
+    return Posterior({key: math.exp(value - total) for key, value in log_p.items()})
 
 
 def _plainness(names: Names) -> tuple[int, int, Names]:

@@ -10,7 +10,7 @@ import pytest
 
 from probewise import nested
 from probewise.diagnosis.fit import Model
-from probewise.diagnosis.hypothesis_problem import FoldedNormal, StandardNormal
+from probewise.diagnosis.posterior import FoldedNormal, StandardNormal
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import Extent
 from probewise.nested.repartition import repartitioned

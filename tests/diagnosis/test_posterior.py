@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.diagnosis.hypothesis_problem import log_likelihood_marginal_over_sigma
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.posterior import (
     QuadraticPredictions,
     draw_by_annealing,
     importance_resample,
+    log_likelihood_marginal_over_sigma,
     surrogate_log_density,
 )
 

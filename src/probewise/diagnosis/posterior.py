@@ -1,35 +1,402 @@
-"""Draws of a fit's coordinates from its posterior.
+"""A hypothesis as an inference problem, and draws from its posterior.
 
-Importance resampling from the closest proposal at hand, or annealing where no proposal is close enough: the densities
-between are q^(1 - beta) p^beta (Neal 2001). After each step of beta the samples are resampled by their weights and
-moved: each half by differences of the other half (ter Braak 2006), which leaves the density invariant.
+The likelihood of exchangeable Gaussians has every mode N! times. (The prior of three or more shares, given by their
+ratios to the first, is not quite the same for all orders.) Folded onto the order nearest to a point, with the prior
+density of all orders summed, the posterior has each mode once, and sampling need not hop between modes.
 
-A quadratic surrogate of the model's predictions is cheap enough to move thousands of samples. It is fitted at steps of
-the size of the approximate posterior, so that it interpolates over the relevant region instead of extrapolating from a
-point. Negligible changes of the readings are left out.
+Draws are by importance resampling from the closest proposal at hand, or by one of two ways where none is close enough.
+Where many predictions cost little, adaptive importance sampling: a few readings, or parameters that act alike, leave a
+posterior that is narrow and bent, of which Laplace's approximation at its mode covers a part. The ridge is followed
+from the mode to where it is unlikely; kernels along it, each of the local shape, are a proposal that covers all of it
+(after Cornuet, Marin, Mira & Robert 2012, with local covariances).
+
+Else annealing: the densities between are q^(1 - beta) p^beta (Neal 2001). After each step of beta the samples are
+resampled by their weights and moved: each half by differences of the other half (ter Braak 2006), which leaves the
+density invariant. A quadratic surrogate of the model's predictions is cheap enough to move thousands of samples. It is
+fitted at steps of the size of the approximate posterior, so that it interpolates over the relevant region instead of
+extrapolating from a point. Negligible changes of the readings are left out.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self, TypeAlias
+from typing import Self, TypeAlias, cast
 
 import numpy as np
+from scipy.special import logsumexp, ndtr, ndtri
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
-from probewise.diagnosis.fit import FARTHEST, Fit, Model
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem, log_likelihood_marginal_over_sigma
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
 from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
-from probewise.diagnosis.simulator_posterior import draw_by_importance
+from probewise.diagnosis.sensors import CalibratedSensor
+from probewise.diagnosis.simulator_fit import log_evidence_of
 from probewise.errors import NotConvergedError
-from probewise.nested.weights import n_effective, power_bracket, resampled_rows
+from probewise.nested import Weighted
+from probewise.nested.importance import weighted_draws
+from probewise.nested.weights import (
+    n_effective,
+    power_bracket,
+    resampled_rows,
+    student_t_draws,
+    student_t_log_norm,
+    tempering_power,
+)
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
+
+NUMBERS = 4_000_000
+"""Readings that are predicted at once."""
+
+_HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
+
+
+@dataclass(frozen=True, eq=False)
+class StandardNormal:
+    """The prior of a model's coordinates: independent standard normals, in which chains step directly."""
+
+    n_params: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"z_{k + 1}" for k in range(self.n_params))
+
+    @property
+    def coordinates(self) -> StandardNormal:
+        return self
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        return np.asarray(ndtri(u))
+
+    def to_unit_cube(self, theta: FloatArray) -> FloatArray:
+        return np.asarray(ndtr(theta))
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        return np.asarray(-0.5 * np.sum(theta**2 + math.log(2 * math.pi), axis=1))
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        return theta
+
+    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return x, self.log_prob(x)
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisProblem:
+    """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
+
+    Predictions of many samples are made in blocks, to fit in memory.
+
+    `model`, `recording`: model and data; `noise`: evidence of a fit by node of the noise model (a set of its
+    parameters); the probable nodes are averaged over; `near`: a point, (n_params,), such as its best fit, onto the
+    nearest order of whose Gaussians the prior is folded. Predictions do not depend on the order, nor does the evidence.
+    """
+
+    model: Model
+    recording: Recording
+    noise: NoiseEvidence
+    near: FloatArray | None = None
+
+    @cached_property
+    def prior(self) -> StandardNormal:
+        """The prior of the model's coordinates, folded only if its sensor has exchangeable Gaussians."""
+        sensor, n_params = self.model.sensor, self.model.n_params
+        if self.near is None or not sensor.has_exchangeable_gaussians or sensor.n_gaussians < 2:
+            return StandardNormal(n_params)
+        return FoldedNormal(n_params, cast(CalibratedSensor, sensor), self.near)
+
+    def predict(self, z: FloatArray) -> FloatArray:
+        """Return the readings of all rows, (n_samples, n_params) -> (n_samples, n_points)."""
+        return self._in_blocks(self.model.predict, z)
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Return the log likelihood, averaged over the kept noise nodes: (n_samples, n_params) -> (n_samples,)."""
+        return self._in_blocks(self._log_likelihood_of_block, theta)
+
+    def _in_blocks(self, function: Callable[[FloatArray], FloatArray], z: FloatArray) -> FloatArray:
+        blocks = np.array_split(z, max(-(-len(z) * len(self.recording) // NUMBERS), 1))
+        return np.concatenate([function(block) for block in blocks])
+
+    def _log_likelihood_of_block(self, theta: FloatArray) -> FloatArray:
+        usable = self.recording.usable
+        predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
+        nodes, kept = self.noise.nodes, self._kept_node_indices
+        laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
+        with np.errstate(all="ignore"):  # of predictions that ran away: impossible below
+            residuals = (self.recording.readings[usable] - predicted).T
+            terms = [
+                log_weight + log_likelihood_marginal_over_sigma(law, law(residuals))
+                for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
+            ]
+            out = np.asarray(logsumexp(terms, axis=0)) + log_share
+        return np.where(np.isfinite(out), out, -np.inf)
+
+    @cached_property
+    def _kept_node_indices(self) -> list[int]:
+        order = np.argsort(-self.noise.weights)
+        n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
+        kept: list[int] = order[:n_kept].tolist()
+        return kept
+
+
+def log_likelihood_marginal_over_sigma(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
+    """Return the log likelihood of whitened residuals (n_points, n_samples) under one noise distribution: (n_samples,).
+
+    Log sigma, with a flat prior, is integrated out by Laplace's method about its peak.
+    """
+    n_points = law.n_kept
+    sigma = law.likeliest_sigma(whitened)
+    curvature = (
+        law.whitened_density.log_sigma_curvature(whitened, sigma, n_points)
+        if not law.whitened_density.is_normal
+        else 2.0 * n_points
+    )
+    peak = -law.minus_log_likelihood(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
+    return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.half_log_det() + law.log_extra)
+
+
+@dataclass(frozen=True, eq=False)
+class FoldedNormal(StandardNormal):
+    """A standard normal prior, folded onto the order of a sensor's Gaussians that is nearest to a point.
+
+    The density of a point is the sum of the normal's densities over all orders (permutations of the Gaussians).
+
+    `n_params`: number of coordinates; `sensor`: sensor with exchangeable Gaussians; its coordinates come first; `near`:
+    the point, (n_params,).
+    """
+
+    sensor: CalibratedSensor
+    near: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "near", read_only_floats(self.near))
+
+    @cached_property
+    def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
+        n_own = self.sensor.n_params
+        orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
+        shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])
+        return np.stack([self.sensor.permuted(np.eye(n_own), order) for order in orders]) - shift, shift
+
+    def _reordered_with_distances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z in every order, (n_orders, n_samples, n_params), and distances from the point; as given is first."""
+        turn, shift = self._reordering_maps
+        images = np.repeat(z[None], len(turn) + 1, axis=0)
+        n_own = self.sensor.n_params
+        images[1:, :, :n_own] = z[:, :n_own] @ turn + shift
+        return images, np.linalg.norm(images - self.near, axis=2)
+
+    def fold(self, z: FloatArray) -> FloatArray:
+        """Reorder each sample's Gaussians to be nearest to the point, (n_samples, n_params) both ways."""
+        images, far = self._reordered_with_distances(z)
+        return np.asarray(images[np.argmin(far, axis=0), np.arange(len(z))])
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        return self.fold(super().from_unit_cube(u))
+
+    def log_prob(self, theta: FloatArray) -> FloatArray:
+        images, far = self._reordered_with_distances(theta)
+        density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
+        return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
+
+
+# If many predictions cost little, and else: draws of a round, kernels, rounds, effective draws that suffice.
+_SIZES = {True: (2000, 150, 20, 1000.0), False: (400, 20, 4, 250.0)}
+_PER_PRIOR = 20  # draws of a proposal for one of the prior
+_AS_IT_IS = 0.75  # effective share of the first draws from which no ridge is followed
+_UNSURE_K = 0.7  # Pareto k from which the mean of the weights converges too slowly (Vehtari et al. 2024)
+_UNIFORM = 0.5  # effective share from which the weights have no tail, whatever k
+_SETTLED = 0.03, 0.05  # changes of the log evidence and, in their share, of the sds between two rounds
+_MOST_TAILED, _LEAST_TAILED = 2.0, 8.0  # degrees of freedom of the kernels, between them those of the readings
+_TEMPERED = 25  # effective draws for each parameter, to which weights are tempered for the next proposal
+_STRETCHED = 1.7  # distance of every other anchor from the middle, of a draw's
+_WALKERS, _STRIDES, _STARTS = 80, 60, 4
+_BELOW = 8.0  # nats, and half a nat for each parameter, below the mode, at which a ridge ends
+_FIRM = 9.0  # inverse square of how far, in strides, a walker is drawn back along the ridge
+_RETURNS, _PROXIMAL_STEPS = 2, 3  # Gauss-Newton steps to the ridge, of a walker after a stride, and of a kernel
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class _Kernels:
+    """A mixture of Student-t kernels: means (k, n_params), precisions (k, n_params, n_params), shares (k,), tails."""
+
+    mean: FloatArray
+    precision: FloatArray
+    share: FloatArray
+    degrees_of_freedom: float
+
+    @cached_property
+    def lower(self) -> FloatArray:
+        """Cholesky factors of the precisions, definite but for rounding."""
+        scale = np.sqrt(np.einsum("kpp->kp", self.precision))
+        unit = self.precision / scale[:, :, None] / scale[:, None] + _ROUNDING * np.eye(self.mean.shape[1])
+        return np.asarray(np.linalg.cholesky(unit) * scale[:, :, None])
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        which = rng.choice(len(self.share), n, p=self.share)
+        white = student_t_draws(n, self.mean.shape[1], self.degrees_of_freedom, rng=rng)
+        root = np.linalg.inv(self.lower).transpose(0, 2, 1)
+        return np.asarray(self.mean[which] + np.einsum("nij,nj->ni", root[which], white))
+
+    def log_density(self, z: FloatArray) -> FloatArray:
+        n_params, nu = z.shape[1], self.degrees_of_freedom
+        norm = (
+            student_t_log_norm(n_params, nu) + np.log(self.share) + np.log(np.einsum("kpp->kp", self.lower)).sum(axis=1)
+        )
+        blocks = np.array_split(z, max(len(z) * self.mean.size // NUMBERS, 1))
+        squares = (np.sum(((block - self.mean[:, None]) @ self.lower) ** 2, axis=2) for block in blocks)
+        each = (norm[:, None] - 0.5 * (nu + n_params) * np.log1p(square / nu) for square in squares)
+        return np.concatenate([logsumexp(densities, axis=0) for densities in each])
+
+
+def draw_by_importance(
+    problem: HypothesisProblem,
+    fits: Sequence[Fit],
+    law: NoiseLaw,
+    *,
+    sizes: tuple[int, int, int, float] | None = None,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[Weighted, bool]:
+    """Draw from a posterior by adaptive importance sampling from its modes; return the draws, and whether they settled.
+
+    The first proposal has a kernel at each mode, the second kernels along the ridges from there. Each further one has
+    kernels at draws of those before, by their weights, tempered where few have any, and beyond these. All draws count,
+    over the mixture of all proposals and a share of the prior.
+
+    `fits`: the modes, the most probable first; `sizes`: draws of a round, kernels, rounds at most, and effective draws
+    that suffice; `progress`: called after each round.
+    """
+    ridge = _Ridge(problem, fits[0], law)
+    sensor, n_params = problem.model.sensor, problem.model.n_params
+    n_draws, n_kernels, n_rounds, enough = sizes or _SIZES[sensor.predicts_in_bulk]
+    kernels, proposals = ridge.kernels_at_modes(fits), list[_Kernels]()
+    z, (log_prior, log_likelihood, log_mixture) = np.zeros((0, n_params)), np.zeros((3, 0))
+    before, log_share = (math.inf, np.zeros(n_params)), -math.log(_PER_PRIOR)
+    for k in range(n_rounds):
+        if k:
+            log_mixture = np.logaddexp(log_mixture, np.logaddexp(kernels.log_density(z), log_prior + log_share))
+        proposals.append(kernels)
+        new = np.concatenate([kernels.draw(n_draws, rng=rng), rng.standard_normal((n_draws // _PER_PRIOR, n_params))])
+        prior = problem.prior.log_prob(new)
+        of_all = [np.logaddexp(own.log_density(new), prior + log_share) for own in proposals]
+        z = np.concatenate([z, new])
+        log_prior, log_likelihood = np.append(log_prior, prior), np.append(log_likelihood, problem.log_likelihood(new))
+        log_mixture = np.append(log_mixture, logsumexp(of_all, axis=0))
+        height = np.where((np.abs(z) < FARTHEST).all(axis=1), log_prior + log_likelihood, -np.inf)
+        log_ratio = height - log_mixture + math.log((1 + 1 / _PER_PRIOR) * len(proposals))
+        draws = weighted_draws(problem.prior.names, z, log_likelihood, log_ratio, len(z))
+        weight, now, share = draws.weight, (draws.log_z, draws.sd()), draws.n_eff / len(z)
+        is_sound = draws.n_eff >= enough and (draws.pareto_k < _UNSURE_K or share > _UNIFORM)
+        is_still = abs(now[0] - before[0]) < _SETTLED[0] and np.allclose(now[1], before[1], rtol=_SETTLED[1])
+        if is_sound and (is_still or (not k and share > _AS_IT_IS)):
+            return draws, True
+        before = now
+        progress("sampling the posterior", note=f"{draws.n_eff:.0f} effective draws")
+        along = not k and sensor.predicts_in_bulk and not sensor.predicts_dearly
+        anchors = rng.permutation(ridge.follow(fits, rng=rng)) if along else z[:0]
+        if len(anchors) > n_params:
+            spread, anchors = np.cov(anchors.T), anchors[:n_kernels]
+        else:  # readings that are met exactly leave a mode from which no stride is likely enough
+            weight = weight ** tempering_power(log_ratio, _TEMPERED * n_params)
+            anchors = z[np.unique(resampled_rows(weight, n_kernels, rng))]
+            middle, spread = np.average(z, axis=0, weights=weight), np.cov(z.T, aweights=weight)
+            anchors[1::2] = np.clip(middle + _STRETCHED * (anchors[1::2] - middle), -FARTHEST, FARTHEST)
+        kernels = ridge.kernels_beside(anchors, spread.reshape(n_params, n_params))
+    return draws, False
+
+
+class _Ridge:
+    """The posterior of a problem, linearised at many points at once; white noise of the sd about its best fit."""
+
+    def __init__(self, problem: HypothesisProblem, best: Fit, law: NoiseLaw) -> None:
+        self.problem, self.law, self.best = problem, law, best
+        self.free = max(law.n_kept - len(best.z), 1)
+        self.degrees_of_freedom = float(np.clip(self.free, _MOST_TAILED, _LEAST_TAILED))
+        self.eye = np.eye(len(best.z))
+
+    def _variance(self, found: Fit) -> float:
+        return max(found.sd, LEAST_SCALE) ** 2 * self.law.n_kept / self.free / self.law.fisher_information
+
+    def _linearise(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return slopes (k, n_params, n), residuals (k, n), both in noise sds, precisions, and which are possible."""
+        usable, (points, steps) = self.problem.recording.usable, difference_points_and_steps(z)
+        predicted = self.problem.predict(points.reshape(-1, z.shape[1]))[:, usable]
+        with np.errstate(all="ignore"):
+            left = self.law((self.problem.recording.readings[usable] - predicted).T).T
+            left = (left / self._variance(self.best) ** 0.5).reshape(*points.shape[:2], -1)
+            slopes, residuals = (left[:, :1] - left[:, 1:]) / steps[:, :, None], left[:, 0]
+        possible = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
+        slopes, residuals = np.where(possible[:, None, None], slopes, 0.0), np.where(possible[:, None], residuals, 0.0)
+        return slopes, residuals, slopes @ slopes.transpose(0, 2, 1) + self.eye, possible
+
+    def _drawn_to_ridge(self, anchors: FloatArray, firmness: FloatArray, n_steps: int) -> FloatArray:
+        """Return points by Gauss-Newton steps towards the mode, held to anchors by a precision (k or 1, p, p)."""
+        z = anchors
+        for _ in range(n_steps):
+            slopes, residuals, precision, _ = self._linearise(z)
+            downhill = np.einsum("kpn,kn->kp", slopes, residuals) - z
+            downhill += ((anchors - z)[:, None] @ firmness)[:, 0]
+            z = np.clip(z + np.linalg.solve(precision + firmness, downhill[:, :, None])[:, :, 0], -FARTHEST, FARTHEST)
+        return z
+
+    def kernels_at_modes(self, fits: Sequence[Fit]) -> _Kernels:
+        """Return Laplace's approximation at fits, with shares by their evidence, a tenth of the largest at least."""
+        slopes = np.stack([self.law(found.slopes).T / math.sqrt(self._variance(found)) for found in fits])
+        log_z = np.array([log_evidence_of(found, self.law) for found in fits])
+        share = np.maximum(np.exp(log_z - log_z.max()), 0.1)
+        precision = slopes @ slopes.transpose(0, 2, 1) + self.eye
+        mean = np.stack([found.z for found in fits])
+        return _Kernels(mean, precision, share / share.sum(), self.degrees_of_freedom)
+
+    def kernels_beside(self, anchors: FloatArray, spread: FloatArray) -> _Kernels:
+        """Return a kernel on the ridge beside each anchor, (k, n_params), with the local shape.
+
+        Along the ridge a kernel is as wide as Silverman's rule says for draws of the covariance `spread`.
+        """
+        n, n_params = anchors.shape
+        width = (4 / (n_params + 2) / n) ** (1 / (n_params + 4))
+        squares, axes = np.linalg.eigh(spread)
+        metric = (axes / np.maximum(squares, _ROUNDING * squares.max())) @ axes.T / width**2
+        z = self._drawn_to_ridge(anchors, metric[None], _PROXIMAL_STEPS)
+        _, _, precision, possible = self._linearise(z)
+        share = np.full(int(possible.sum()), 1 / possible.sum())
+        return _Kernels(z[possible], precision[possible] + metric, share, self.degrees_of_freedom)
+
+    def follow(self, fits: Sequence[Fit], *, rng: np.random.Generator) -> FloatArray:
+        """Return points (n, n_params) along the ridges from modes, to where the density is some nats lower.
+
+        Walkers go a local sd at a time in directions of their own, and return to the ridge after each stride.
+        """
+        modes = np.stack([found.z for found in fits[:_STARTS]])
+        z, out = np.repeat(modes, _WALKERS // len(modes), axis=0), [modes]
+        way = rng.standard_normal(z.shape)
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        lowest = -self._heights(self._linearise(modes)[1], modes).max() + _BELOW + 0.5 * z.shape[1]
+        _, _, precision, _ = self._linearise(z)
+        for _ in range(_STRIDES):
+            lengths, axes = np.linalg.eigh(precision)
+            stride = np.einsum("kij,kj,klj,kl->ki", axes, lengths**-0.5, axes, way)
+            firmness = _FIRM / np.maximum(np.sum(stride**2, axis=1), LEAST_SCALE)[:, None, None] * self.eye
+            z = self._drawn_to_ridge(np.clip(z + stride, -FARTHEST, FARTHEST), firmness, _RETURNS)
+            _, residuals, precision, possible = self._linearise(z)
+            goes = possible & (-self._heights(residuals, z) < lowest)
+            z, way, precision = z[goes], way[goes], precision[goes]
+            if not len(z):
+                break
+            out.append(z)
+        return np.concatenate(out)
+
+    def _heights(self, residuals: FloatArray, z: FloatArray) -> FloatArray:
+        squares = np.maximum(np.sum(residuals**2, axis=1), LEAST_SCALE)
+        return np.asarray(-0.5 * self.law.n_kept * np.log(squares) - 0.5 * np.sum(z**2, axis=1))
+
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
 _LEAST_OF_IT = 0.5  # least acceptable share of the target
@@ -238,7 +605,7 @@ _MOVES = 6  # of each walker after a step of beta
 _N_FIRST = 1000  # draws of a proposal
 _LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
 _NEARLY_ALL = 0.8  # and where adaptive importance sampling costs little
-_SIZES = 1000, 60, 8, 250.0  # of that: draws of a round, kernels, rounds, effective draws that suffice
+_SIZES_HERE = 1000, 60, 8, 250.0  # of that: draws of a round, kernels, rounds, effective draws that suffice
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -291,7 +658,7 @@ def posterior_draws(
         if drawn is not None:
             return drawn
     if in_bulk:
-        draws, _ = draw_by_importance(problem, [found], laplace.law, sizes=_SIZES, rng=rng, progress=progress)
+        draws, _ = draw_by_importance(problem, [found], laplace.law, sizes=_SIZES_HERE, rng=rng, progress=progress)
         if draws.n_eff >= _LEAST_OF_IT * _ENOUGH * n_samples:
             return draws.samples(n_samples, rng=rng)
     model, usable, center, steps = found.model, recording.usable, laplace.center, laplace.steps

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.diagnosis.evidence import covariance_root
 from probewise.diagnosis.fit import FARTHEST
-from probewise.diagnosis.hypothesis_problem import HypothesisProblem
+from probewise.diagnosis.posterior import HypothesisProblem
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.refits import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.searched import Searched

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.samples import HypothesisSamples, ModelSamples, can_share_one_model, mix
-from probewise.diagnosis.search.searched import Posterior
+from probewise.diagnosis.search.hypotheses import Posterior
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan

@@ -18,7 +18,7 @@ from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
 from probewise.diagnosis.noise_models import NoiseModel
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.refits import NoiseModels
+from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent, NoiseEffect
 from probewise.effects.noise import correlated_noise, drifting_noise, outliers, random_walk, signal_dependent_noise

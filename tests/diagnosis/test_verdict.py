@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from probewise.diagnosis.advice import Alias
-from probewise.diagnosis.search.searched import Posterior
+from probewise.diagnosis.search.hypotheses import Posterior
 from probewise.diagnosis.verdict import (
     Hypothesis,
     Judged,

@@ -30,8 +30,7 @@ from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covarian
 from probewise.diagnosis.fit import Fit, Model, residual_degrees_of_freedom
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.prior_odds import Names
-from probewise.diagnosis.search.refits import WeighedFit, effects_out_of_vocabulary
-from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, effects_out_of_vocabulary
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import Effect, name_of_first_copy
 from probewise.recordings.plan import Plan, Recording

@@ -30,8 +30,7 @@ from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.noise_models import walk_given_readings
 from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
-from probewise.diagnosis.search.refits import WeighedFit
-from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.hypotheses import Searched, WeighedFit
 from probewise.diagnosis.templates import TemplateBank
 from probewise.diagnosis.verdict import GlobalTest, Judged, judge
 from probewise.recordings.plan import Recording

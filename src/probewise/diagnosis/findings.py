@@ -17,8 +17,7 @@ from probewise.diagnosis.locate import ALARM, significant_places
 from probewise.diagnosis.noise_law import n_rows_since_previous_usable, noise_statistics, previous_usable
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
-from probewise.diagnosis.search.refits import ALIASED_NATS, WeighedFit, noise_effects_in_vocabulary
-from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.hypotheses import ALIASED_NATS, Searched, WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.templates import TemplateCache, log_bayes_factors_by_label, log_mean_exp
 from probewise.diagnosis.verdict import N_DRAWS, Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit

@@ -25,8 +25,7 @@ from probewise.diagnosis.fit import FARTHEST, Fit, Null, Predictor, effect_value
 from probewise.diagnosis.noise_law import NoiseLaw
 from probewise.diagnosis.posterior import n_tried, posterior_draws
 from probewise.diagnosis.prior_odds import Names
-from probewise.diagnosis.search.refits import WeighedFit, effects_out_of_vocabulary
-from probewise.diagnosis.search.searched import Searched
+from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, effects_out_of_vocabulary
 from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_by_label, templates_of_effect
 from probewise.diagnosis.verdict import GlobalTest, Judged
 from probewise.effects import NUISANCES, Effect, Extent, NoiseEffect

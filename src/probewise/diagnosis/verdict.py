@@ -15,13 +15,13 @@ from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
-from probewise.diagnosis.search.refits import (
+from probewise.diagnosis.search.hypotheses import (
+    Searched,
     WeighedFit,
     effects_out_of_vocabulary,
     noise_effects_in_vocabulary,
     require_converged_fit,
 )
-from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.sensors import fine_structure_slopes
 from probewise.diagnosis.unknown_bases import PRODUCTS
 from probewise.diagnosis.words import (

@@ -11,9 +11,14 @@ from refitted import state_with_nulls
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.search import search as searching
-from probewise.diagnosis.search.refits import Refits, _amplitudes_in_residual, is_significantly_better
+from probewise.diagnosis.search.hypotheses import (
+    Evidences,
+    Refits,
+    _amplitudes_in_residual,
+    is_significantly_better,
+    posterior_of,
+)
 from probewise.diagnosis.search.search import search_with_formulas
-from probewise.diagnosis.search.searched import Evidences, posterior_of
 from probewise.effects import Extent
 from probewise.effects.noise import correlated_noise, random_walk
 from probewise.priors import LogUniform, Uniform

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.searched import Evidences, Searched, posterior_of
+from probewise.diagnosis.search.hypotheses import Evidences, Searched, posterior_of
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 

@@ -25,19 +25,23 @@ from probewise.diagnosis.noise_law import MAD_OF_NORMAL, NoiseLaw, white_noise_o
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
-from probewise.diagnosis.search.refits import (
+from probewise.diagnosis.search.hypotheses import (
     ALIASED_NATS,
     EXTENDED_WITHIN,
     SAME_MODE,
     WITH_MEMORY,
+    Evidences,
+    MisfitTemplates,
     NoiseModels,
+    Posterior,
     Refits,
+    Searched,
     WeighedFit,
     effects_out_of_vocabulary,
     expected_log_bayes_factor,
     is_significantly_better,
+    posterior_of,
 )
-from probewise.diagnosis.search.searched import Evidences, MisfitTemplates, Posterior, Searched, posterior_of
 from probewise.diagnosis.sensors import (
     default_sensor,
     starts_of_one_gaussian,

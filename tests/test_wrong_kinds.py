@@ -93,10 +93,6 @@ class Bell:
         self.log_likelihood = log_likelihood or (lambda theta: -0.5 * (theta**2).sum(axis=1))
 
 
-class NoPrior(Bell):
-    prior = {"x": (0, 1)}  # noqa: RUF012
-
-
 class OfOne(Calibration):
     """A calibration, whatever it was made of."""
 
@@ -106,25 +102,13 @@ class OfOne(Calibration):
 CALIBRATION = OfOne(RECORDING, ())
 
 
-class Own:
-    """An instrument of one's own that returns whatever it is told to."""
-
-    def __init__(self, reading):
-        self.reading = reading
-
-    def measure(self, pose):
-        return self.reading
-
-
 def found():
     """Run nested sampling, short."""
     with warnings.catch_warnings(action="ignore"):
         return run(Bell(), rng=np.random.default_rng(1), n_live=20, stop=RemainingEvidence(5.0))
 
 
-A_GENERATOR = r"allowed: a NumPy random generator: np.random.default_rng\("
 A_RECORDING = "allowed: a Recording: read_recording"
-A_PLAN = "allowed: a Plan: read_plan"
 A_SENSOR = "allowed: a FittedSensor: read_sensor"
 
 MISTAKES = {

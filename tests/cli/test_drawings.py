@@ -16,7 +16,6 @@ from probewise.proof import concealed_study
 from probewise.report.html import figure
 from probewise.systems import run_table_csv
 
-HEATER = ("--simulator", "heater.py")
 DIAGNOSIS = ("diagnosis.json", "sensor.json", "calibrated.json", "report.html")
 # Of each command, the files that it leaves where no figure can be drawn.
 COMMANDS = {

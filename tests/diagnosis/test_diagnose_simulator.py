@@ -82,10 +82,6 @@ def test_residuals_count_from_the_walk_and_the_lines_contain_it(diagnosis):
         assert abs(shown.residuals.mean()) < _SD / 2
 
 
-MASS, VISCOUS, DRY, OFFSET = 95.0, 200.0, 20.0, -3.0  # kg, N s/m, N, N
-GAP, SD, N_ROWS, FINE = 0.05, 1e-4, 200, 1e-4  # s, m, rows, s
-
-
 N, SD_OF_IMPOSSIBLE = 50, 0.02
 X = np.sort(np.random.default_rng(2).uniform(-0.4, 1.45, N))
 Y = 2 * np.sqrt(1 - (X - 0.5) ** 2) + SD_OF_IMPOSSIBLE * np.random.default_rng(3).normal(size=N)

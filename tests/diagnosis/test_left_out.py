@@ -222,6 +222,3 @@ def test_too_few_readings_within_the_range_are_refused_in_one_line():
     )  # fmt: skip
     with pytest.raises(ParameterError, match="readings within the declared range is 5; allowed: 12 or more"):
         prepare_system(simulator, table_for(simulator, {"x": x, "y": y}))
-
-
-DRAG_PER_M, STOP_M = 0.25, 2.4

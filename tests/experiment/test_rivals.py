@@ -260,6 +260,28 @@ def test_the_fit_is_tested_where_the_declared_noise_leads(doubting, stepped, mon
     assert not doubting.fit_is_doubtful(info.p_value)
 
 
+def utilities_near_end_of_kind(experiment, left_out, sd_mm):
+    """Return the utilities by the plain sensor, and by the kind, of a circle that is known so well."""
+    rng = np.random.default_rng(1)
+    posterior = prior_posterior([kind for kind in experiment.kinds if kind.left_out == left_out], 600, rng=rng)
+    (particles,) = posterior.particles
+    theta = np.array([500.0, 260.0, 90.0]) + np.array(sd_mm) * rng.standard_normal((600, 3))
+    weighted = replace(particles.weighted, theta=theta)
+    posterior = replace(posterior, particles=(replace(particles, weighted=weighted),))
+    readings = (Reading(35.0, Pose(500.0, 170.0), 8.0), Reading(35.0, Pose(500.0, 350.0), 16.0))
+    with arm_of(Trial(REFERENCE, 0)) as arm:
+        field = ArmReachAndTravel.from_instrument(arm, experiment.grid)
+    of = predict_readings_and_utilities(experiment, weighted, theta[:20], field, at=readings[-1], goal=experiment.goal)
+    return of[1], utilities_near_end(experiment, posterior, *of, readings, rng=rng)
+
+
+@pytest.mark.parametrize("left_out", ["", "noise_sd"])
+def test_far_from_the_end_the_plain_sensor_chooses_until_it_is_surely_incomplete(doubting, left_out):
+    plain, there = utilities_near_end_of_kind(doubting, left_out, (90.0, 90.0, 9.0))
+    assert (there is plain) == (left_out == "")
+    assert there.label == (INFORMATION if left_out else plain.label)
+
+
 @pytest.mark.parametrize(
     ("sd_mm", "what"),
     [((30.0, 30.0, 9.0), INFORMATION), ((6.0, 1.0, 1.0), ENDS)],
@@ -267,18 +289,7 @@ def test_the_fit_is_tested_where_the_declared_noise_leads(doubting, stepped, mon
 )
 def test_near_the_end_repeats_are_worth_more_than_one_reading(doubting, sd_mm, what):
     """At every place that is a candidate with one reading and with nine: the noise of their mean is a third."""
-    experiment = replace(doubting, repeats=(1, 9), noise_sd=6.0)
-    rng = np.random.default_rng(1)
-    posterior = prior_posterior(doubting.kinds[:1], 600, rng=rng)
-    (particles,) = posterior.particles
-    theta = np.array([500.0, 260.0, 90.0]) + np.array(sd_mm) * rng.standard_normal((600, 3))
-    weighted = replace(particles.weighted, theta=theta)
-    posterior = replace(posterior, particles=(replace(particles, weighted=weighted),))
-    readings = (Reading(35.0, Pose(500.0, 170.0), 8.0), Reading(35.0, Pose(500.0, 350.0), 16.0))
-    with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-    of = predict_readings_and_utilities(experiment, weighted, theta[:20], field, at=readings[-1], goal=experiment.goal)
-    there = utilities_near_end(experiment, posterior, *of, readings, rng=rng)
+    _, there = utilities_near_end_of_kind(replace(doubting, repeats=(1, 9), noise_sd=6.0), "", sd_mm)
     assert there.label == what
     once, nine_times = there.values.reshape(2, -1)
     both = (once > 0) & (nine_times > 0)

@@ -1,9 +1,10 @@
 """Inquire: the utility of every available reading, and the choice of the next (paper, "the inquiry engine").
 
-Far from the end, the utility is the experiment's own. Near the end of a run with doubt in its sensor, several kinds of
-hypotheses may explain all readings and differ in the shape. Then the utility is the expected information about all
-kinds together; once some reading has a chance of 25 % or more to meet the stopping rule, that chance: kinds that are
-aliased but agree on the shape need not be distinguished. Bits about the effect left out are added.
+Far from the end, the utility is the experiment's own, by the plain sensor, unless that is surely incomplete. Near the
+end of a run with doubt in its sensor, several kinds of hypotheses may explain all readings and differ in the shape.
+Then the utility is the expected information about all kinds together; once some reading has a chance of 25 % or more to
+meet the stopping rule, that chance: kinds that are aliased but agree on the shape need not be distinguished. Bits about
+the effect left out are added.
 
 Before such a run ends, two things are checked. A dozen readings that fit the sensor without faults cannot exclude most
 faults, and one further reading would show some. And if a shape was read from one side only, its far side follows from
@@ -265,7 +266,8 @@ def utilities_near_end(
 ) -> UtilityMap:
     """Return the utility map for all kinds near the end of a run.
 
-    Far from the end, or without a goal (a set of shapes), return the given map. `known` says whether the posterior
+    Without a goal (a set of shapes), or far from the end while the sensor may be complete, return the given map: by the
+    plain sensor, each reading since a light rose would promise an edge beside it. `known` says whether the posterior
     meets the stopping rule. Then the utility is that of a reading on the far side of the shape, if no reading has seen
     that, or the expected information about the effect that the sensor model leaves out; see `must_continue`.
 
@@ -278,7 +280,8 @@ def utilities_near_end(
         experiment, kinds, _LEAST_OF_NAMES if known else _LEAST_EACH, rng
     )
     spread = weight @ (lengths - weight @ lengths) ** 2
-    if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
+    may_be_complete = kinds.left_out.get("", 0.0) >= _COMPLETE
+    if may_be_complete and np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities
     mean = (given.weight @ given.theta[:, experiment.shape_columns])[None] / given.weight.sum()
     unseen, shows_far_side = far_side(given, experiment.shape.region(mean), readings)

@@ -16,15 +16,16 @@ from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
-from probewise.report.demo import doubt_section, doubt_sentence
-from probewise.report.plots import PAGE_IN, grid_of_axes, png
-from probewise.report.searches import (
+from probewise.report.demo import (
     RobotSearch,
+    doubt_section,
+    doubt_sentence,
     draw_effect_probabilities,
     draw_final_posteriors,
     paper_view,
     window_around_runs_mm,
 )
+from probewise.report.plots import PAGE_IN, grid_of_axes, png
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model, Step
     from probewise.progress import Progress
-    from probewise.report.searches import RobotSearch
+    from probewise.report.demo import RobotSearch
     from probewise.scene import Circle
 
 _DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
@@ -68,7 +68,7 @@ def _run_demo(
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
-    from probewise.report.searches import search_comparison_lines
+    from probewise.report.demo import search_comparison_lines
     from probewise.world.shipped import true_world as world_behind
 
     started, seed, out = time.monotonic(), arguments.seed, drawings.out
@@ -153,7 +153,7 @@ def searches_with_true_circle(
     """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
     import numpy as np
 
-    from probewise.report.searches import RobotSearch
+    from probewise.report.demo import RobotSearch
     from probewise.scene import outlines
 
     means, circle = sensor.mean(), hypothesised_circle()

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Protocol, Self
 
@@ -308,8 +308,7 @@ class SensorAndShape(CalibratedSensor):
     @classmethod
     def over(cls, sensor: CalibratedSensor, shape: Shape, found: FloatArray) -> Self:
         """Build from a calibrated sensor, a shape and the coordinates at which to start."""
-        own = {of.name: getattr(sensor, of.name) for of in fields(CalibratedSensor)}
-        return cls(**own, shape=shape, found=read_only_floats(found))
+        return cls(**vars(sensor), shape=shape, found=read_only_floats(found))
 
     @classmethod
     def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:

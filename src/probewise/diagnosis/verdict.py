@@ -57,42 +57,31 @@ class GlobalTest:
 def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTest:
     """Test whether effects are missing in the mean of the null; the p-value is 1 where all readings are equal.
 
+    It is the largest over the SSF's order (number of Gaussians) and higher ones, and with fine structure: the evidence
+    accepts another Gaussian only if it gains ten nats or more, and a smaller misfit of an SSF that is no mixture is not
+    physics. So an alarm must hold at every order, and with fine structure about the freest form. Once a p-value exceeds
+    .05, the rest is not tested.
+
     Raises NotConvergedError if the fit of the null did not converge, with enough readings to tell.
     """
     prepared, null, noise = searched.prepared, searched.null, searched.posterior.likeliest_noise()
-    problem = Linearised.of(null.found, null.evidence[null.possible_noise(noise)].likeliest_law)
     if not prepared.has_too_little_data:
         require_converged_fit(null.found, Linearised.of(null.found, null.law))
-    draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
-    p_value = bayes_factor_p_value(problem, searched.template_banks_for_global_test(null.found), draws)
-    p_value = _max_p_value_over_orders(searched, null, noise, p_value, rng=rng)
-    # Constant readings have no noise to compare a residual with.
-    return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_only_equal_readings else p_value)
-
-
-def _max_p_value_over_orders(
-    searched: Searched, null: WeighedFit, noise: Names, p_value: float, *, rng: np.random.Generator
-) -> float:
-    """Return the largest p-value over the SSF's order (number of Gaussians) and higher ones, and with fine structure.
-
-    The evidence accepts another Gaussian only if it gains ten nats or more; a smaller misfit of an SSF that is no
-    mixture is not physics. So an alarm must hold at every order, and with fine structure about the freest form. Once a
-    p-value exceeds .05, the rest is not tested.
-    """
-    prepared, fits = searched.prepared, searched.evidences.fits
-    rivals = [fits[n, ()] for n in sorted(n for n, names in fits if not names and n > null.n_gaussians)]
-    asked = [(rival, False) for rival in rivals]
-    if prepared.null is None:  # a known prior is kept at every order: an orientation error shows only relative to it
-        asked.append(((rivals or [null])[-1], True))
-    for rival, fine in asked:
+    fits, tested, p_value = searched.evidences.fits, list[tuple[Linearised, FloatArray]](), 0.0
+    forms = [null, *(fits[n, ()] for n in sorted(n for n, names in fits if not names and n > null.n_gaussians))]
+    # A known prior is kept at every order: an orientation error shows only relative to it.
+    fine = [(forms[-1], True)] if prepared.null is None else []
+    for form, is_fine in [*((form, False) for form in forms), *fine]:
+        found, law = form.found, form.evidence[form.possible_noise(noise)].likeliest_law
+        beside = fine_structure_slopes(found.model, found.z, prepared.usable_rows) if is_fine else None
+        problem = Linearised.of(found, law, beside)
+        draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
+        tested.append((problem, draws))
+        p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
         if p_value > _NO_ALARM:
             break
-        found = rival.found
-        beside = fine_structure_slopes(found.model, found.z, prepared.usable_rows) if fine else None
-        problem = Linearised.of(found, rival.evidence[rival.possible_noise(noise)].likeliest_law, beside)
-        draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
-        p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
-    return p_value
+    # Constant readings have no noise to compare a residual with.
+    return GlobalTest(null, noise, *tested[0], 1.0 if prepared.has_only_equal_readings else p_value)
 
 
 OUT_OF_THE_QUESTION = 0.2

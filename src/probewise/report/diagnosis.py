@@ -90,7 +90,8 @@ def page_html(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
     """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`, `audit` that of its plan, if any."""
-    readings = f"{_n_readings_used(diagnosis)} used of {len(diagnosis.recording)}"
+    n_used = int(diagnosis.recording.usable[rows_to_diagnose(diagnosis.recording)].sum())
+    readings = f"{n_used} used of {len(diagnosis.recording)}"
     facts = {"recordings": source, "readings": readings, "seed": str(seed), **dict(diagnosis.apparatus.words.facts)}
     notes = html.notes_in_words((*diagnosis.recording.notes, *notes_on_calls(diagnosis)))
     design = () if audit is None else (html.Section("What these readings could have shown", _audit_elements(audit)),)
@@ -103,13 +104,6 @@ def page_html(
         sections=[*sections(diagnosis, drawn), *design, html.Section("This run", (facts, *notes))],
         terms_in=f"{diagnosis.verdict} {first}",
     )
-
-
-def _n_readings_used(diagnosis: Diagnosis) -> int:
-    """Return the number of readings diagnosed: of a long recording by a light sensor, only a part."""
-    usable, is_table = diagnosis.recording.usable, diagnosis.apparatus.words.covariates is not None
-    # A table's recording holds only the readings that are used.
-    return int((usable if is_table else usable[rows_to_diagnose(diagnosis.recording)]).sum())
 
 
 def _first_figure_caption(diagnosis: Diagnosis) -> str:

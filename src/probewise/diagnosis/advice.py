@@ -10,7 +10,7 @@ long as there is information to gain.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
@@ -439,13 +439,17 @@ def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> Floa
     return out
 
 
-def _classes_told_apart(nats: FloatArray, members: Sequence[int]) -> list[list[int]]:
-    """Group members that the readings cannot tell apart, by their expected log Bayes factors, `nats` (n, n)."""
+def classes_of(members: Iterable[int], alike: Callable[[int, int], bool]) -> list[list[int]]:
+    """Group members that are alike directly, or through others of their class; sorted."""
     classes: list[list[int]] = []
     for k in members:
-        alike = [own for own in classes if any(min(nats[k, j], nats[j, k]) < NOTHING_NATS for j in own)]
-        classes = [own for own in classes if own not in alike] + [sorted([k, *itertools.chain(*alike)])]
+        joined = [own for own in classes if any(alike(k, j) for j in own)]
+        classes = [own for own in classes if own not in joined] + [sorted([k, *itertools.chain(*joined)])]
     return sorted(classes)
+
+
+def _classes_told_apart(nats: FloatArray, members: Iterable[int]) -> list[list[int]]:
+    return classes_of(members, lambda k, j: min(nats[k, j], nats[j, k]) < NOTHING_NATS)
 
 
 def _mean_over_closest(nats: FloatArray, weights: FloatArray) -> float:

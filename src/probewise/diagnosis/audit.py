@@ -21,8 +21,8 @@ from probewise._arrays import FloatArray, IntArray, own_arithmetic, read_only_fl
 from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
-from probewise.diagnosis.advice import LAMBDA, LEAST_SHARE
-from probewise.diagnosis.apparatus import Command, Words
+from probewise.diagnosis.advice import LAMBDA, LEAST_SHARE, classes_of
+from probewise.diagnosis.apparatus import ENOUGH_NATS, Command, Words
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
@@ -57,8 +57,7 @@ from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
 from probewise.systems.system import STANDS_STILL, with_converged_step
 from probewise.systems.table import median_sd_of_column
 
-LEAST_NATS = 3.0  # least evidence that separates two effects
-ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which the evidence is LEAST_NATS
+ALIAS = math.sqrt(1 - 2 * ENOUGH_NATS / LAMBDA**2)  # the cosine at which the evidence is ENOUGH_NATS
 _MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
 
 
@@ -524,7 +523,7 @@ def _total_detectability_deficit(bank: EffectBank, rows: IntArray, ailing: Seque
             total += 2.0 - share / LEAST_SHARE
         else:
             nats = 0.5 * LAMBDA**2 * (1 - max(like.values(), default=0.0) ** 2)
-            total += max(1.0 - nats / LEAST_NATS, 0.0)
+            total += max(1.0 - nats / ENOUGH_NATS, 0.0)
     return total
 
 
@@ -635,8 +634,12 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
         else replace(e, rows=math.ceil((LAMBDA / e.share) ** 2))
         for e in found
     )
+    like = {effect.name: {name for name, _ in effect.alike} for effect in effects}
+    named = sorted(like)
+    every = classes_of(range(len(named)), lambda j, k: named[j] in like[named[k]] or named[k] in like[named[j]])
+    classes = tuple(tuple(named[k] for k in own) for own in every if len(own) > 1)
     words = SimulatorApparatus(about).words
-    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _alias_classes(effects))
+    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, classes)
 
 
 def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
@@ -706,15 +709,3 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
         kinds = ("damping", "drag", "friction", "forcing", "periodic_forcing", "limit")
         out |= {f"{kind}:{state}": nothing for kind in kinds}
     return out
-
-
-def _alias_classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
-    """Return sorted groups of names: effects aliased directly, or through others of the group."""
-    group = {effect.name: {effect.name} for effect in effects}
-    for effect in effects:
-        for name, _ in effect.alike:
-            if group[name] is not group[effect.name]:
-                joined = group[name] | group[effect.name]
-                group |= dict.fromkeys(joined, joined)
-    kept = {id(members): tuple(sorted(members)) for members in group.values() if len(members) > 1}
-    return tuple(sorted(kept.values()))

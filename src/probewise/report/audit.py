@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from probewise._words import count_with_noun, unit_after_number
 from probewise.diagnosis import EffectAudit, PlanAudit
 from probewise.diagnosis.advice import LAMBDA
-from probewise.diagnosis.audit import ALIAS, LEAST_NATS
+from probewise.diagnosis.apparatus import ENOUGH_NATS
+from probewise.diagnosis.audit import ALIAS
 from probewise.effects import spoken_name
 from probewise.report.html import Markup, Section, figure, page, table
 from probewise.report.plots.canvas import AxesGrid, png
@@ -70,7 +71,7 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
         "Right: the effect of the row is present, at typical parameters; the cosine measures how well the effect of "
         "the column imitates it, at the parameters that suit it best. The matrix is not symmetric: an effect with many "
         "parameters can imitate a simple one, but not the other way round. A circle marks an "
-        f"alias: at size λ = {LAMBDA:g} these readings favour the row over the column by less than {LEAST_NATS:g} "
+        f"alias: at size λ = {LAMBDA:g} these readings favour the row over the column by less than {ENOUGH_NATS:g} "
         "nats.",
     )
     helped = (

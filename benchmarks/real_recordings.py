@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from probewise.diagnosis.fit import Model, fit
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.sensors import (
     default_sensor,
     starts_of_one_gaussian,

@@ -13,7 +13,7 @@ from probewise.diagnosis.apparatus import MOST_READINGS
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model, fit
-from probewise.diagnosis.noise_law import white_noise_of_recording
+from probewise.diagnosis.noise import white_noise_of_recording
 
 PREPARED = prepare_system(SIMULATOR, runs(rng=np.random.default_rng(3), n=20))
 RECORDING, PLAN, APPARATUS = PREPARED.recording, PREPARED.recording.plan, PREPARED.apparatus

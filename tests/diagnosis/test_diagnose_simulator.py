@@ -15,7 +15,7 @@ from probewise.diagnosis import diagnose_system, repaired_of
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import log_probability_effects_detectable
 from probewise.diagnosis.fit import Model, fit
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.templates import templates_of_effect
 from probewise.systems import Noise, Simulator, predict_system, table_for
 

@@ -15,8 +15,7 @@ from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import LEAST_VISIBLE, laplace_evidence, log_probability_effects_detectable, refined
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, fit
 from probewise.diagnosis.held_out import held_out_gain
-from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.noise import NoiseModel, white_noise, white_noise_of_recording
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.sensors import default_sensor

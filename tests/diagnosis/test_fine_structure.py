@@ -7,7 +7,7 @@ import pytest
 
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.sensors import default_sensor, fine_structure_slopes, with_free_form
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan, two_way_plan

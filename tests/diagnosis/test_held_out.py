@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.held_out import mean_gain_over_parts, predictive_log_densities
 from probewise.diagnosis.light_sensor import LightSensorApparatus
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise import NoiseLaw
 from probewise.recordings import Recording, paper_plan
 
 PAPER = Recording(paper_plan(), np.zeros(len(paper_plan())))

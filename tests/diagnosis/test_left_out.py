@@ -14,8 +14,7 @@ from probewise.diagnosis.diagnose_simulator import prepare_system, recording_fro
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.fit_simulator import repaired_of
-from probewise.diagnosis.noise_law import white_noise, white_noise_of_recording
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.noise import NoiseModel, white_noise, white_noise_of_recording
 from probewise.effects import Extent
 from probewise.effects.noise import dropouts
 from probewise.errors import ParameterError

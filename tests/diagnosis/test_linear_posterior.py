@@ -12,8 +12,7 @@ from refitted import refitted_with
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Model, fit
-from probewise.diagnosis.noise_law import white_noise
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.noise import NoiseModel, white_noise
 from probewise.diagnosis.samples import sample_model
 from probewise.systems import RunTable, Simulator
 

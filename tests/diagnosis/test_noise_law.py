@@ -15,8 +15,7 @@ from scipy.stats import norm
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit
-from probewise.diagnosis.noise_law import NoiseLaw, Tail
-from probewise.diagnosis.noise_models import NoiseModel, log_prior_of_lost_value
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, Tail, log_prior_of_lost_value
 from probewise.effects import Extent
 from probewise.effects.noise import correlated_noise, drifting_noise, dropouts, outliers, signal_dependent_noise
 from probewise.recordings import Recording, paper_plan, two_way_plan

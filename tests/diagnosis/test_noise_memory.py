@@ -12,8 +12,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.held_out import predictive_log_densities
-from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_models import innovations_given_rest, walk_given_readings, with_known_wide_readings
+from probewise.diagnosis.noise import NoiseLaw, innovations_given_rest, walk_given_readings, with_known_wide_readings
 
 _N = 40
 

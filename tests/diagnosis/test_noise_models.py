@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.special import gammaln, logsumexp
 
-from probewise.diagnosis.noise_law import (
+from probewise.diagnosis.noise import (
     NoiseLaw,
+    NoiseModel,
     n_rows_since_previous_usable,
     order_by_scan,
     previous_usable,
     white_noise,
 )
-from probewise.diagnosis.noise_models import NoiseModel
 from probewise.effects.noise import correlated_noise, noise_of_runs
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.systems import RunTable, Simulator, as_recording

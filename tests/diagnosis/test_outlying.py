@@ -15,7 +15,7 @@ from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
 from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import Covariate, significant_places, window_columns_and_bounds
-from probewise.diagnosis.noise_law import NoiseLaw, white_noise
+from probewise.diagnosis.noise import NoiseLaw, white_noise
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.recordings import Recording, paper_plan
 from probewise.systems import Simulator, table_for

@@ -15,7 +15,7 @@ from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
 from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_scan
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
-from probewise.diagnosis.noise_law import NoiseLaw, noise_statistics, white_noise
+from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, log_bayes_factors_of_pairs, templates_of_effect

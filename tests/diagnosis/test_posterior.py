@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.posterior import (
     QuadraticPredictions,
     draw_by_annealing,

@@ -15,7 +15,7 @@ from probewise.diagnosis.diagnosis import (
 )
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.locate import Place
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
 from probewise.recordings import Plan, Recording, Uniform
 

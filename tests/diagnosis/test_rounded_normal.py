@@ -12,8 +12,7 @@ from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.noise_law import NoiseLaw, RoundedNormal
-from probewise.diagnosis.noise_models import NoiseModel, rough_sd
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, RoundedNormal, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.search.search import noise_sd_about_given_null

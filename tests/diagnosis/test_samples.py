@@ -12,8 +12,7 @@ from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import FARTHEST, Model, fit
-from probewise.diagnosis.noise_law import white_noise
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.noise import NoiseModel, white_noise
 from probewise.diagnosis.samples import ModelSamples, sample_model, weights_beside_other_effects
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.sensors import CalibratedSensor, default_sensor, with_free_form

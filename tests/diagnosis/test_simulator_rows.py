@@ -15,7 +15,7 @@ from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_syst
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
 from probewise.diagnosis.simulator_rows import SimulatorApparatus, possible_run_commands
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects

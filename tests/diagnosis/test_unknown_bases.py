@@ -8,7 +8,7 @@ import pytest
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.light_sensor import varying_covariates
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.templates import TemplateBank
 from probewise.diagnosis.unknown_bases import PRODUCTS, bank_of_unknown_effects, bases_unlike_named
 from probewise.recordings import two_way_plan

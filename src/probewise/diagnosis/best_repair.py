@@ -26,8 +26,7 @@ from probewise.diagnosis.held_out import (
     predictive_log_densities,
 )
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
-from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_models import walk_given_readings
+from probewise.diagnosis.noise import NoiseLaw, walk_given_readings
 from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit

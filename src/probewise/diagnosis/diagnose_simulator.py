@@ -19,7 +19,7 @@ from probewise._words import count_with_noun
 from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_law import NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.noise import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import find_lost_readings
 from probewise.diagnosis.prepared import MOST_READINGS, Prepared, positions_in_stretches
 from probewise.diagnosis.search.search import search

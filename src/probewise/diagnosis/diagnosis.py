@@ -35,7 +35,7 @@ from probewise.diagnosis.findings import (
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.locate import ALARM, Place, places_of_effect, significant_places
-from probewise.diagnosis.noise_models import walk_given_readings
+from probewise.diagnosis.noise import walk_given_readings
 from probewise.diagnosis.prepared import Prepared, prepare, rows_to_diagnose
 from probewise.diagnosis.samples import ModelSamples, draw_models, sample_model
 from probewise.diagnosis.search.hypotheses import Searched, effects_out_of_vocabulary

@@ -16,8 +16,7 @@ from scipy.special import log_ndtr, logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, log_multiplicity, residual_degrees_of_freedom
-from probewise.diagnosis.noise_law import NoiseLaw, stacked_density
-from probewise.diagnosis.noise_models import NoiseModel, NoiseNodes
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, NoiseNodes, stacked_density
 from probewise.effects import NoiseEffect
 from probewise.sensor.stages import effects_with_columns
 

@@ -14,7 +14,7 @@ from probewise.diagnosis.evidence import Linearised, linearised_sizes
 from probewise.diagnosis.fit import fit, fit_each_start
 from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import ALARM, significant_places
-from probewise.diagnosis.noise_law import n_rows_since_previous_usable, noise_statistics, previous_usable
+from probewise.diagnosis.noise import n_rows_since_previous_usable, noise_statistics, previous_usable
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
 from probewise.diagnosis.search.hypotheses import ALIASED_NATS, Searched, WeighedFit, noise_effects_in_vocabulary

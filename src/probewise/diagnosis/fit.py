@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
+from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
 from probewise.effects import Effect
 from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Plan, Recording

@@ -17,8 +17,7 @@ from probewise.diagnosis.diagnose_simulator import notes_on_declared_noise, prep
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit, Model, fit_each_start
-from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw, white_noise_of_recording
-from probewise.diagnosis.noise_models import HIDDEN, NoiseModel
+from probewise.diagnosis.noise import HIDDEN, LEAST_SCALE, NoiseLaw, NoiseModel, white_noise_of_recording
 from probewise.diagnosis.outlying import note_on_improbable_rows
 from probewise.diagnosis.posterior import NUMBERS, HypothesisProblem, draw_by_importance
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node

@@ -10,8 +10,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, fit, residual_degrees_of_freedom
-from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_models import innovations_given_rest
+from probewise.diagnosis.noise import NoiseLaw, innovations_given_rest
 from probewise.recordings.plan import Recording
 
 LEAST_ROWS = 8

@@ -25,7 +25,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise import NoiseLaw
 from probewise.effects import Effect, HeavyTailedPrior
 from probewise.priors import Prior, Product, SharedScalePrior
 from probewise.recordings.plan import Recording

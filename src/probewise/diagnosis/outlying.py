@@ -18,7 +18,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
-from probewise.diagnosis.noise_law import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
+from probewise.diagnosis.noise import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import LARGEST_SIZE, MOST_OUTLYING, readings_lost_beyond_doubt

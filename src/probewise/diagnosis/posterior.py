@@ -33,7 +33,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
-from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw
+from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.diagnosis.simulator_fit import log_evidence_of
 from probewise.errors import NotConvergedError

@@ -14,8 +14,7 @@ from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fit import Fit, Model, Null, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_law import white_noise_of_recording
-from probewise.diagnosis.noise_models import rough_sd
+from probewise.diagnosis.noise import rough_sd, white_noise_of_recording
 from probewise.diagnosis.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,

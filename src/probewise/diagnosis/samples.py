@@ -22,7 +22,7 @@ from probewise.calibration.sensor_file import FittedSensor
 from probewise.diagnosis.best_repair import BestRepair, predicts_far_worse
 from probewise.diagnosis.evidence import Linearised, NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Null, Predictor, effect_values
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.posterior import n_tried, posterior_draws
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, effects_out_of_vocabulary

@@ -17,8 +17,7 @@ from scipy.special import ndtr, ndtri
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import covariance_root
 from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start
-from probewise.diagnosis.noise_law import LEAST_SCALE, NoiseLaw, white_noise_of_recording
-from probewise.diagnosis.noise_models import rough_sd
+from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, rough_sd, white_noise_of_recording
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Uniform
 from probewise.recordings.plan import Recording

@@ -25,7 +25,7 @@ from probewise.diagnosis.evidence import (
     whiten_to_unit_rms,
 )
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
-from probewise.diagnosis.noise_law import NoiseLaw
+from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
 from probewise.effects import Effect, name_of_first_copy
 from probewise.effects.reference import scan_indicator

@@ -14,8 +14,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.diagnose_simulator import recording_from_table
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, laplace_evidence
 from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.noise_law import white_noise
-from probewise.diagnosis.noise_models import NoiseModel
+from probewise.diagnosis.noise import NoiseModel, white_noise
 from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, starts_with_more_gaussians
 from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
 from probewise.effects import AGAIN, VOCABULARY, Effect, Extent, LightEffect

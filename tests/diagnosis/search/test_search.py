@@ -11,7 +11,7 @@ import pytest
 from probewise.calibration import read_sensor, write_sensor
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.noise_law import white_noise
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.search.search import UnknownEffects, prune_out_of_vocabulary, search
 from probewise.diagnosis.sensors import sensor_from_samples
 from probewise.experiment import experiment_for

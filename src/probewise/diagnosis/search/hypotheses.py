@@ -24,8 +24,7 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_law import NoiseLaw
-from probewise.diagnosis.noise_models import HIDDEN, NoiseModel, least_sd_given_rounding, rough_sd
+from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, least_sd_given_rounding, rough_sd
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds

@@ -21,7 +21,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model, Null, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise_law import MAD_OF_NORMAL, NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.noise import MAD_OF_NORMAL, NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds

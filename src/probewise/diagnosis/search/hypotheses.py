@@ -228,7 +228,7 @@ class NoiseModels:
         return self.prior.log_prior_on_noise(self._uncertain_names(names))
 
     def average_log_evidence(self, log_z: Mapping[Names, float]) -> float:
-        """Return the log of the evidences' average over noise models, by prior; minus infinity without any."""
+        """Return the log of the average of evidences by noise model, weighted by prior; minus infinity without any."""
         values = [value + self.log_prior(names) for names, value in log_z.items()]
         return float(logsumexp(values)) if values else -math.inf
 
@@ -518,12 +518,9 @@ def is_significantly_better(candidate: WeighedFit, parent: WeighedFit) -> bool:
 
 
 def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
-    return 2 * (_minus_log_likelihood(law, beyond.residuals) - _minus_log_likelihood(law, found.residuals)) > 3.0
-
-
-def _minus_log_likelihood(law: NoiseLaw, residuals: FloatArray) -> float:
-    whitened = law(residuals)[:, None]
-    return float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0])
+    whitened = law(np.stack([beyond.residuals, found.residuals], axis=1))
+    before, after = law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))
+    return bool(before - after > 1.5)
 
 
 def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:

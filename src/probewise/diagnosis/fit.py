@@ -119,13 +119,6 @@ class Null(Protocol):
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates z, (n_samples, n_params), to the model's own parameters: theta without the effects'."""
 
-    def coordinates(self, theta: FloatArray) -> FloatArray | None:
-        """Map parameters of its own to coordinates, each of one parameter, (n_samples, n_params) both.
-
-        None, the default, where a parameter has more than one coordinate, or is bounded by others.
-        """
-        return None
-
     def chain(self, plan: Plan, effects: Sequence[Effect], *, n_nodes: int) -> Predictor:
         """Build the model of a plan's readings, with effects; `n_nodes` for curved edges, as in `sensor.Chain`."""
 

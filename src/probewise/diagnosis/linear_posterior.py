@@ -31,6 +31,7 @@ from probewise.priors import Prior, Product, SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 from probewise.sensor.stages import effects_with_columns
+from probewise.systems import System
 
 _STRAIGHT = 0.2  # sd of a coordinate within which its value is as good as linear in it
 _SWEEPS = 10
@@ -142,61 +143,60 @@ class LinearView:
     function of the parameter; for one of an effect it is its coordinate, whose prior is standard normal. Many
     simulations are linear in a parameter, such as a starting level, but not in the coordinate of its uniform prior.
 
-    `model`: the model; `z`: coordinates at which the tangent touches, (n_params,); `view`: what is simulated there,
-    (n_points,); `slopes`: its derivatives, (n_params, n_points); 0 for coordinates of effects on the readings.
+    `model`: the model, of the simulator `system`; `z`: coordinates at which the tangent touches, (n_params,); `view`:
+    what is simulated there, (n_points,); `slopes`: its derivatives, (n_params, n_points); 0 for coordinates of effects
+    on the readings.
     """
 
     model: Model
+    system: System
     z: FloatArray
     view: FloatArray
     slopes: FloatArray
 
     @classmethod
     def of(cls, found: Fit) -> Self | None:
-        """Return the tangent at a fit; None if the model does not simulate readings, or not all of them are finite.
+        """Return the tangent at a fit of a simulator; None if not all of its readings are finite, or for a sensor.
 
-        A light sensor simulates what each of its Gaussians sees. Also None where parameters have no coordinates of
-        their own (`Null.coordinates`).
+        A light sensor simulates what each of its Gaussians sees.
         """
+        if not isinstance(found.model.sensor, System):
+            return None
         model, is_upstream = found.model, np.ones(found.model.n_params, dtype=np.bool_)
         for effect in filter(acts_on_readings, model.effects):
             is_upstream[model.coordinate_slice(effect.name)] = False
         upstream = np.flatnonzero(is_upstream)
         points, steps = difference_points_and_steps(found.z)
-        theta = model.sensor.theta(found.z[None, : model.sensor.n_params])
-        if model.sensor.coordinates(theta) is None:
-            return None
         views = model.chain.simulated_view(model.theta(points[[0, *(1 + upstream)]]), model.plan)
-        if not isinstance(views, np.ndarray) or not np.isfinite(views).all():
+        if not np.isfinite(views).all():
             return None
         slopes = np.zeros((model.n_params, views.shape[1]))
         slopes[upstream] = (views[1:] - views[0]) / steps[upstream, None]
-        return cls(model, found.z, views[0], slopes)
+        return cls(model, found.model.sensor, found.z, views[0], slopes)
 
     @cached_property
     def _n_own(self) -> int:
-        return self.model.sensor.n_params
+        return self.system.n_params
 
     def _theta_by_coordinates(self, z: FloatArray) -> FloatArray:
-        theta = self.model.sensor.theta
+        theta = self.system.theta
         return np.asarray((theta(z[:, : self._n_own] + _STEP) - theta(z[:, : self._n_own] - _STEP)) / (2 * _STEP))
 
     @cached_property
     def _theta_and_derivatives(self) -> tuple[FloatArray, FloatArray]:
         z = self.z[None]
-        return self.model.sensor.theta(z[:, : self._n_own]), self._theta_by_coordinates(z)
+        return self.system.theta(z[:, : self._n_own]), self._theta_by_coordinates(z)
 
     def straightened(self, z: FloatArray) -> FloatArray:
         """Return the straight coordinates of coordinates, (n_samples, n_params) both."""
         theta, derivatives = self._theta_and_derivatives
-        own = self.z[: self._n_own] + (self.model.sensor.theta(z[:, : self._n_own]) - theta) / derivatives
+        own = self.z[: self._n_own] + (self.system.theta(z[:, : self._n_own]) - theta) / derivatives
         return np.concatenate([own, z[:, self._n_own :]], axis=1)
 
     def coordinates(self, straight: FloatArray) -> FloatArray:
         """Return the coordinates of straight ones, (n_samples, n_params) both; infinite outside the prior's support."""
         theta, derivatives = self._theta_and_derivatives
-        own = self.model.sensor.coordinates(theta + (straight[:, : self._n_own] - self.z[: self._n_own]) * derivatives)
-        assert own is not None
+        own = self.system.coordinates(theta + (straight[:, : self._n_own] - self.z[: self._n_own]) * derivatives)
         return np.concatenate([own, straight[:, self._n_own :]], axis=1)
 
     def log_volume(self, z: FloatArray) -> FloatArray:

@@ -30,9 +30,8 @@ from probewise.effects.noise import (
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import has_value_per_run, names_of_jumps_in_sorted_rows
+from probewise.systems.forms.binding import has_value_per_run, names_in_definitions, names_of_jumps_in_sorted_rows
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.rates import names_in_definitions
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.stop import MeterStop
 from probewise.systems.table import append_tables, covariate_of_column, unused_name

@@ -45,6 +45,11 @@ Declared: TypeAlias = Mapping[str, tuple[Marginal, str]]
 """Prior and unit of each parameter, by name."""
 
 
+def priors_and_units(parameters: Declared) -> tuple[dict[str, Marginal], tuple[str, ...]]:
+    """Return the priors by name, and the units."""
+    return {name: prior for name, (prior, _) in parameters.items()}, tuple(unit for _, unit in parameters.values())
+
+
 def acting(formula: Callable[..., Any]) -> Act:
     """Return the act of a formula: a function of the value, the plan or table, and each parameter, (n_samples, 1)."""
     return lambda value, theta, plan: formula(value, plan, *(theta[:, k : k + 1] for k in range(theta.shape[1])))
@@ -118,9 +123,9 @@ class Effect:
         Formula of a proposal, which has no name in the vocabulary; otherwise empty.
     needs_rising_time
         Whether it looks back to earlier times of a run, which time must then not fall within.
-    where, source
-        Of a light sensor's effect: origin, scans, patterns; and a function that builds one with the same `act` and
-        `says`, by which a pickled effect finds them again.
+    where, form, source
+        Of a light sensor's effect: origin, scans, patterns; which of several formulas it has; and a function that
+        builds one with the same `act` and `says`, by which a pickled effect finds them again.
     """
 
     name: str
@@ -280,15 +285,17 @@ class StepEffect(Effect):
         return replace(self, change_points=self.change_points.fewer()) if self.is_thinned else self
 
     def variant_masks(self, plan: Any) -> VariantMasks | None:
-        """Return the masks of the rows after each candidate change point; None where a law goes on from there.
+        """Return the masks of the rows from each candidate change point on, or to its end; None where a law goes on.
 
         What is added to readings or poses, or to the gain, is nothing before it and the same everywhere after it.
         """
         if self.stage not in _ROW_BY_ROW:
             return None
+        middles = np.array([[0.5 * (prior.low + prior.high) for prior in last] for last in self.places])
         always, along = self.entries[0].copy(), self.change_points.variable_at_rows(plan)
-        always[:, -1] = -np.inf
-        return VariantMasks(always, np.array([along > 0.5 * (a + b) for a, b in self.change_points.intervals]))
+        always[:, -middles.shape[1] :] = -np.inf
+        end, begin = middles[:, :1], middles[:, -1:]
+        return VariantMasks(always, (along > begin) & ((along < end) | (end <= begin)))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         low, high = np.transpose(self.change_points.intervals)
@@ -365,27 +372,26 @@ class LightEffect:
     def bind(
         self,
         of: Extent,
-        parameters: Mapping[str, Marginal] | Prior,
-        units: tuple[str, ...],
+        parameters: Declared | tuple[Prior, tuple[str, ...]],
         act: Act,
         entries: FloatArray,
         says: Say,
         *,
         kind: type[Effect] = Effect,
-        where: Where = EVERYWHERE,
+        scans: tuple[str, ...] = (),
+        patterns: tuple[str, ...] = (),
         **more: Any,
     ) -> Effect:
-        """Return the effect with these parameters and functions, counting from the recording's origin if it counts."""
-        counted_from = ""
-        if self.counts:
-            where, at = replace(where, origin=of.origin), of.origin
-            if self.counts == "time" and at.time_s:
-                counted_from = f"time counts from {at.time_s:.12g} s"
-            elif self.counts == "place" and (at.x_mm or at.y_mm):
-                counted_from = f"X and Y count from ({at.x_mm:g}, {at.y_mm:g}) mm"
-        given = (self.name, self.stage, parameters, units, self.covariates, act, entries, says)
-        source = partial(_effect_there, self, of, where)
-        return kind(*given, counted_from=counted_from, where=where, source=source, **more)
+        """Return the effect with these parameters, or their prior and units, counting from the origin if it counts."""
+        counted_from, at = "", of.origin if self.counts else ZERO
+        if self.counts == "time" and at.time_s:
+            counted_from = f"time counts from {at.time_s:.12g} s"
+        elif self.counts == "place" and (at.x_mm or at.y_mm):
+            counted_from = f"X and Y count from ({at.x_mm:g}, {at.y_mm:g}) mm"
+        prior, units = parameters if isinstance(parameters, tuple) else priors_and_units(parameters)
+        given = (self.name, self.stage, prior, units, self.covariates, act, entries, says)
+        own = {"counted_from": counted_from, "where": Where(at, scans, patterns)}
+        return kind(*given, **{**own, "source": partial(_effect_there, self, of, scans), **more})
 
     def linear(
         self,
@@ -397,17 +403,15 @@ class LightEffect:
         *,
         positive: bool = False,
         sizes: Sequence[float] = (1.0,),
-        where: Where = EVERYWHERE,
-        kind: type[Effect] = Effect,
+        **more: Any,
     ) -> Effect:
         """Return the effect whose readings change in proportion to each parameter, by name in `units`.
 
         `sizes`, in typical ones, are tried in turn.
         """
-        parameters = dict.fromkeys(units, HeavyTailedPrior(typical, positive=positive))
-        entries, every = (typical * np.array(sizes))[:, None, None] * np.eye(len(units)), tuple(range(len(units)))
-        given = (of, parameters, tuple(units.values()), act, entries, says)
-        return self.bind(*given, amplitudes=every, where=where, kind=kind)
+        parameters = {name: (HeavyTailedPrior(typical, positive=positive), unit) for name, unit in units.items()}
+        entries = (typical * np.array(sizes))[:, None, None] * np.eye(len(units))
+        return self.bind(of, parameters, act, entries, says, amplitudes=tuple(range(len(units))), **more)
 
     def step(
         self, of: Extent, sizes: Mapping[str, tuple[float, str]], act: Act, says: Say, *, is_thinned: bool = True
@@ -419,19 +423,18 @@ class LightEffect:
         """
         if len(distinct_values(of.plan.time_s)) < 2:
             return None
-        points = ChangePoints.of(of.plan.time_s)
+        points, n = ChangePoints.of(of.plan.time_s), len(sizes)
         low, high = points.at[0], points.at[-1]
-        parameters = {name: HeavyTailedPrior(size) for name, (size, _) in sizes.items()}
         entries = np.diag([size for size, _ in sizes.values()])
         return self.bind(
             of,
-            {**parameters, "at_s": Uniform(low, high)},
-            (*(unit for _, unit in sizes.values()), "s"),
+            {name: (HeavyTailedPrior(size), unit) for name, (size, unit) in sizes.items()}
+            | {"at_s": (Uniform(low, high), "s")},
             lambda value, theta, plan: act(value, theta, plan.time_s > theta[:, -1:]),
-            np.column_stack([entries, np.full(len(sizes), (low + high) / 2)])[None, :, :],
+            np.column_stack([entries, np.full(n, (low + high) / 2)])[None, :, :],
             says,
             kind=StepEffect,
-            amplitudes=tuple(range(len(sizes))),
+            amplitudes=tuple(range(n)),
             change_points=points,
             is_thinned=is_thinned,
         )
@@ -441,11 +444,11 @@ def _attribute(module: str, name: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _effect_there(kind: LightEffect, of: Extent, where: Where) -> Effect:
-    """Return that of an effect's variants which is restricted to the same scans and patterns."""
+def _effect_there(kind: LightEffect, of: Extent, scans: tuple[str, ...]) -> Effect:
+    """Return that of an effect's variants which is restricted to the same scans."""
     found = kind.for_extent(of)
     assert found is not None
-    return next(variant for variant in found.variants() if variant.where == where)
+    return next(variant for variant in found.variants() if variant.scans == scans)
 
 
 def light_effect(

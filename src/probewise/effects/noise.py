@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -12,10 +11,20 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
-from probewise.effects.effect import Act, Effect, LightEffect, NoiseEffect, Say, in_words, light_effect
+from probewise.effects.effect import (
+    Act,
+    Declared,
+    Effect,
+    LightEffect,
+    NoiseEffect,
+    Say,
+    in_words,
+    light_effect,
+    priors_and_units,
+)
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import Extent
-from probewise.priors import LogHeavyTailedPrior, LogUniform, Marginal, Product, Uniform
+from probewise.priors import LogHeavyTailedPrior, LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseParameters, Stage
 
@@ -30,8 +39,7 @@ _DIGITS = 1e-6  # of a step: below this a difference is rounding
 def _on_noise(
     kind: LightEffect,
     of: Extent,
-    parameters: Mapping[str, Marginal],
-    units: tuple[str, ...],
+    parameters: Declared,
     act: Act,
     says: Say,
     n_nodes: tuple[int, ...] = (10,),
@@ -44,8 +52,9 @@ def _on_noise(
     """
     axes = [(np.arange(n) + 0.5) / n for n in n_nodes]
     u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
-    entries, nodes = Product(parameters).from_unit_cube(u)[:, None, :], n_nodes if from_prior else ()
-    return kind.bind(of, parameters, units, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes)
+    entries = Product(priors_and_units(parameters)[0]).from_unit_cube(u)[:, None, :]
+    nodes = n_nodes if from_prior else ()
+    return kind.bind(of, parameters, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes)
 
 
 @light_effect("correlated_noise", Stage.NOISE, "correlated noise", ("scan",))
@@ -55,8 +64,7 @@ def correlated_noise(kind: LightEffect, of: Extent) -> Effect:
     return _on_noise(
         kind,
         of,
-        {"rho": Uniform(-0.5, 0.95)},
-        ("1",),
+        {"rho": (Uniform(-0.5, 0.95), "1")},
         lambda noise, theta, plan: replace(noise, rho=theta[:, :1]),
         in_words(says),
         (28,),  # dense enough to integrate the posterior of a thousand readings
@@ -69,8 +77,7 @@ def signal_dependent_noise(kind: LightEffect, of: Extent) -> Effect:
     return _on_noise(
         kind,
         of,
-        {"ratio": LogUniform(0.05, 50.0)},
-        ("1",),
+        {"ratio": (LogUniform(0.05, 50.0), "1")},
         lambda noise, theta, plan: replace(noise, sd=noise.sd * np.sqrt(1 + theta[:, :1] * np.clip(noise.seen, 0, 1))),
         lambda mean, sd: (
             "the noise grows with the reading: its variance at the highest level is "
@@ -93,7 +100,7 @@ def drifting_noise(kind: LightEffect, of: Extent) -> Effect:
         return replace(noise, sd=noise.sd * theta[:, :1] ** (elapsed - 0.5))
 
     says = in_words("the sd of the noise at the end is {0} times that at the start")
-    return _on_noise(kind, of, {"growth": LogUniform(0.2, 5.0)}, ("1",), act, says)
+    return _on_noise(kind, of, {"growth": (LogUniform(0.2, 5.0), "1")}, act, says)
 
 
 @light_effect("random_walk", Stage.NOISE, "a random walk of the zero", ("time", "row", "run"))
@@ -105,8 +112,7 @@ def random_walk(kind: LightEffect, of: Extent) -> Effect:
     return _on_noise(
         kind,
         of,
-        {"sd_per_row": LogUniform(5e-3, 3.0)},
-        ("noise sd",),
+        {"sd_per_row": (LogUniform(5e-3, 3.0), "noise sd")},
         lambda noise, theta, table: replace(noise, walk=theta[:, :1], walked=_rows_walked(table)),
         in_words("the offset is a random walk with steps of sd {0} noise sds from row to row"),
         (16,),
@@ -225,8 +231,7 @@ def outliers(kind: LightEffect, of: Extent) -> Effect:
     return _on_noise(
         kind,
         of,
-        {"share": _SHARES, "size": LogUniform(2.5, LARGEST_SIZE)},
-        ("1", "noise sd"),
+        {"share": (_SHARES, "1"), "size": (LogUniform(2.5, LARGEST_SIZE), "noise sd")},
         lambda noise, theta, plan: replace(noise, wide_share=theta[:, :1], wide_times=theta[:, 1:2]),
         in_words("outliers: {0} % of the readings scatter {1} times as widely as the others", factors=(100,)),
         (4, 4),
@@ -329,8 +334,7 @@ def quantisation(kind: LightEffect, of: Extent) -> Effect | None:
     return _on_noise(
         kind,
         of,
-        {"step": LogUniform(1e-3 * of.span, 0.2 * of.span)},
-        ("reading",),
+        {"step": (LogUniform(1e-3 * of.span, 0.2 * of.span), "reading")},
         lambda noise, theta, plan: replace(noise, step=theta[:, :1]),
         in_words("the readings are rounded to steps of {0}, which were not declared", of.reading_unit),
         (16,),

@@ -17,7 +17,7 @@ from probewise.effects.effect import (
     Effect,
     LightEffect,
     Say,
-    Where,
+    acting,
     in_words,
     light_effect,
     one_of,
@@ -72,7 +72,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
             0.003 * of.length_mm,
             lambda value, theta, plan: _with_shifted_patterns(value, theta * scan_indicator(plan, (name,)), plan),
             in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others"),
-            where=Where(scans=(name,)),
+            scans=(name,),
         )
 
     names = tuple(dict.fromkeys(of.plan.scan_names))
@@ -229,7 +229,7 @@ def _patch(kind: LightEffect, of: Extent, size: str, unit: str, typical: float, 
             x, y = line.lab_coordinates_mm(along, np.zeros_like(along))
             patches.append(single_column_bank(typical, x, y, r))
         prior, units = PatchPrior(size, typical, line), (unit, "mm", "mm", "mm")
-        return kind.bind(of, prior, units, act, np.concatenate(patches), says)
+        return kind.bind(of, (prior, units), act, np.concatenate(patches), says)
 
     return one_of([on_line(line) for line in distinct_scan_lines(of.plan)])
 
@@ -241,8 +241,8 @@ _NEAR = "within {3} mm of the place ({1}, {2}) mm"
 def glint(kind: LightEffect, of: Extent) -> Effect | None:
     """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y)."""
 
-    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
+    @acting
+    def act(value: FloatArray, plan: Plan, amp: FloatArray, x: FloatArray, y: FloatArray, r: FloatArray) -> FloatArray:
         return value + amp * gaussian_bump((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r)
 
     says = f"{_NEAR} the readings are {{|0|}} too {{high/low}}, over black and white alike: a reflection"
@@ -411,7 +411,7 @@ def height_offset(kind: LightEffect, of: Extent) -> Effect | None:
             0.01 * _nominal_height_mm(of.plan),
             act,
             in_words(f"in {scans_in_words(scans)} the sensor hangs {{|0|}} mm {{higher/lower}} than in the others"),
-            where=Where(scans=scans),
+            scans=scans,
         )
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
@@ -503,8 +503,7 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
 
     return kind.bind(
         of,
-        {"share": LogUniform(1e-3, 0.7), "r_mm": LogUniform(narrowest_mm, widest_mm)},
-        ("1", "mm"),
+        {"share": (LogUniform(1e-3, 0.7), "1"), "r_mm": (LogUniform(narrowest_mm, widest_mm), "mm")},
         act,
         single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5)),
         in_words(
@@ -555,16 +554,15 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
         f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains: the edge "
         "{casts a shadow/reflects light}"
     )
-    found = kind.bind(
+    return kind.bind(
         of,
-        {"amp": HeavyTailedPrior(typical), "w": LogUniform(narrowest_mm, widest_mm)},
-        ("1", "mm"),
+        {"amp": (HeavyTailedPrior(typical), "1"), "w": (LogUniform(narrowest_mm, widest_mm), "mm")},
         act,
         single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6)),
         in_words(says, factors=(100,)),
-        where=Where(patterns=patterns),
+        patterns=patterns,
+        source=partial(edge_shadow_of_patterns, kind, of, patterns),
     )
-    return replace(found, source=partial(edge_shadow_of_patterns, kind, of, patterns))
 
 
 def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
@@ -603,8 +601,7 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
     far = farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
     return kind.bind(
         of,
-        {"share": HeavyTailedPrior(typical, positive=True), "dx_mm": reach, "dy_mm": reach},
-        ("1", "mm", "mm"),
+        {"share": (HeavyTailedPrior(typical, positive=True), "1"), "dx_mm": (reach, "mm"), "dy_mm": (reach, "mm")},
         act,
         single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()),
         in_words(

@@ -15,7 +15,7 @@ from probewise.effects.effect import (
     Effect,
     LightEffect,
     WaveEffect,
-    Where,
+    acting,
     in_words,
     light_effect,
     one_of,
@@ -139,7 +139,7 @@ def scan_angle_error(kind: LightEffect, of: Extent) -> Effect | None:
             lambda value, theta, plan: _turned(value, np.radians(theta) * scan_indicator(plan, scans)),
             in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"),
             sizes=(1.0, -8.0, 8.0, -14.0, 14.0),
-            where=Where(scans=scans),
+            scans=scans,
         )
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
@@ -206,7 +206,7 @@ def missing_tooth(kind: LightEffect, of: Extent) -> Effect | None:
         at, which = Uniform(low_mm, high_mm), Uniform(axis - 0.5, axis + 0.5)
         entry = np.array([[[typical_mm, (low_mm + high_mm) / 2, float(axis)]]])
         prior = Product({"amp_mm": HeavyTailedPrior(typical_mm), "at_mm": at, "axis": which})
-        return kind.bind(of, prior, ("mm", "mm", "1"), act, entry, says)
+        return kind.bind(of, (prior, ("mm", "mm", "1")), act, entry, says)
 
     places = [distinct_positions_mm(axis_mm) for axis_mm in (of.plan.x_mm, of.plan.y_mm)]
     thinned = [own[:: -(-len(own) // _MOST_PLACES)].tolist() for own in places]
@@ -253,17 +253,17 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
         return None
     typical_mm, longest_mm = 0.003 * of.length_mm, 2 * reach_mm
 
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        wave = np.sin(2 * np.pi / theta[:, 1:2] * (value.x_mm - of.origin.x_mm) + theta[:, 2:3])
-        return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
+    @acting
+    def act(value: Poses, plan: Plan, amp: FloatArray, period: FloatArray, phase: FloatArray) -> Poses:
+        wave = amp * np.sin(2 * np.pi / period * (value.x_mm - of.origin.x_mm) + phase)
+        return replace(value, x_mm=value.x_mm + wave)
 
     waves = np.linspace(1.0, longest_mm / 2 / shortest_mm, _N_PERIODS + 1)[1:]
     periods = np.append(longest_mm / 2 / waves, longest_mm / np.geomspace(1.05, 2.0, _N_LONG))
     amp, period = HeavyTailedPrior(typical_mm, positive=True), LogUniform(shortest_mm, longest_mm)
     return kind.bind(
         of,
-        {"amp_mm": amp, "period_mm": period, "phase": PHASE},
-        ("mm", "mm", "rad"),
+        {"amp_mm": (amp, "mm"), "period_mm": (period, "mm"), "phase": (PHASE, "rad")},
         act,
         sine_and_cosine_entries(typical_mm, np.maximum(periods, shortest_mm * 1.001)),
         in_words(
@@ -292,8 +292,7 @@ def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
     period, phase = LogUniform(shortest_mm, longest_mm), Uniform(-1.0, 1.0)
     return kind.bind(
         of,
-        {"amp_mm": HeavyTailedPrior(typical_mm), "period_mm": period, "phase": phase},
-        ("mm", "mm", "1"),
+        {"amp_mm": (HeavyTailedPrior(typical_mm), "mm"), "period_mm": (period, "mm"), "phase": (phase, "1")},
         act,
         single_column_bank(typical_mm, periods.ravel(), phases.ravel()),
         in_words(

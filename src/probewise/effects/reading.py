@@ -11,6 +11,7 @@ from probewise.effects.effect import (
     Effect,
     LightEffect,
     WaveEffect,
+    acting,
     in_words,
     light_effect,
     sine_and_cosine_entries,
@@ -50,8 +51,7 @@ def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
     """A bent response curve: u -> u^gamma, u the seen white fraction clipped to 0..1."""
     return kind.bind(
         of,
-        {"gamma": LogHeavyTailedPrior(0.1)},
-        ("1",),
+        {"gamma": (LogHeavyTailedPrior(0.1), "1")},
         lambda value, theta, plan: np.clip(value, 0.0, 1.0) ** theta[:, :1],
         single_column_bank(np.exp(0.1 * np.array([-1.0, 1.0]))),
         lambda mean, sd: (
@@ -68,15 +68,13 @@ def gain_drift(kind: LightEffect, of: Extent) -> Effect:
     """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since the origin, 0 before it."""
     shortest_s, longest_s = 0.01 * of.duration_s, 2 * of.duration_s
 
-    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        # A negative time would let the exponential overflow.
-        return value * (1 + theta[:, :1] * np.exp(-np.maximum(of.origin.seconds(plan), 0.0) / theta[:, 1:2]))
+    def since(plan: Plan) -> FloatArray:
+        return np.maximum(of.origin.seconds(plan), 0.0)  # a negative time would let the exponential overflow
 
     return kind.bind(
         of,
-        {"frac": HeavyTailedPrior(_SHARE), "tau_s": LogUniform(shortest_s, longest_s)},
-        ("1", "s"),
-        act,
+        {"frac": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")},
+        acting(lambda value, plan, frac, tau_s: value * (1 + frac * np.exp(-since(plan) / tau_s))),
         single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 7)),
         in_words(
             "the signal starts {|0|} % {too strong/too weak} at time 0 and settles with a time constant of {1} s: the "
@@ -222,14 +220,11 @@ def flicker(kind: LightEffect, of: Extent) -> Effect | None:
         return None
     n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, _MOST_FREQUENCIES))
 
-    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return value + theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * of.origin.seconds(plan) + theta[:, 2:3])
-
+    amp, alias_hz = HeavyTailedPrior(typical, positive=True), Uniform(_LOWEST_HZ, highest)
     return kind.bind(
         of,
-        {"amp": HeavyTailedPrior(typical, positive=True), "alias_hz": Uniform(_LOWEST_HZ, highest), "phase": PHASE},
-        ("reading", "Hz", "rad"),
-        act,
+        {"amp": (amp, "reading"), "alias_hz": (alias_hz, "Hz"), "phase": (PHASE, "rad")},
+        acting(lambda value, plan, a, hz, phase: value + a * np.sin(2 * np.pi * hz * of.origin.seconds(plan) + phase)),
         sine_and_cosine_entries(typical, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1]),
         lambda mean, sd: (
             f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], of.reading_unit)} at "
@@ -279,8 +274,7 @@ def lag(kind: LightEffect, of: Extent) -> Effect:
 
     return kind.bind(
         of,
-        {"tau_s": LogUniform(shortest_s, longest_s)},
-        ("s",),
+        {"tau_s": (LogUniform(shortest_s, longest_s), "s")},
         act,
         single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7)),
         in_words("each reading keeps part of the previous one, with a time constant of {0} s: the electronics lag"),
@@ -309,8 +303,7 @@ def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
     late = "{|0|} % of each rise of the signal comes late,"
     return kind.bind(
         of,
-        {"share": HeavyTailedPrior(_SHARE), "tau_s": LogUniform(shortest_s, longest_s)},
-        ("1", "s"),
+        {"share": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")},
         act,
         single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 6)),
         lambda mean, sd: in_words(f"{above if mean[0] > 0 else late} with a time constant of {{1}} s", factors=(100,))(
@@ -332,15 +325,10 @@ def saturation(kind: LightEffect, of: Extent) -> Effect:
     sharp = [(top - share * 0.8 * span, sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]
     soft = [(top + share * span, 0.1 * span) for share in (-0.2, -0.05, 0.1, 0.25)]
 
-    def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        level, softness = theta[:, :1], theta[:, 1:2]
-        return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
-
     return kind.bind(
         of,
-        {"level": Uniform(lowest, highest), "softness": LogUniform(sharpest, softest)},
-        ("reading", "reading"),
-        act,
+        {"level": (Uniform(lowest, highest), "reading"), "softness": (LogUniform(sharpest, softest), "reading")},
+        acting(lambda value, plan, level, soft: level - soft * np.logaddexp(0.0, (level - value) / soft)),
         np.array([*sharp, *soft])[:, None, :],
         lambda mean, sd: (
             f"no reading rises above {value_with_sd(mean[0], sd[0], unit)}: the electronics saturate, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -152,7 +152,7 @@ def predict_system(
     whole = _with_recorded_rows_before(fitted, own)
     before = len(whole) - len(own)
     system = replace(
-        System.of(fitted.simulator, _table_with_interpolated_inputs(fitted.simulator, whole)),
+        System.of(fitted.simulator, whole.with_columns(_interpolated_inputs(fitted.simulator, whole))),
         max_step=fitted.max_step,
         stiff=fitted.stiff,
         limited=False,  # noise decides which readings are at an end of the range
@@ -222,7 +222,6 @@ def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> RunTabl
 
 
 def _first_times(table: RunTable) -> dict[str, float]:
-    """Return the earliest time of each run."""
     return {
         name: float(table.time_s[rows].min()) for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)
     }
@@ -237,8 +236,7 @@ def _note_on_runs_started_again(fitted: FittedSystem, table: RunTable) -> tuple[
     if fitted.simulator.law is None or fitted.known is not None or fitted.recording == table_digest(table):
         return ()
     known = {name.partition("[")[2][:-1] for name in fitted.names if name.partition("[")[0] in fitted.simulator.per_run}
-    first = _first_times(table)
-    again = [name for name, time in first.items() if time > 0 and (not known or name in known)]
+    again = [name for name, time in _first_times(table).items() if time > 0 and (not known or name in known)]
     runs = f"run{'s' * (len(again) > 1)} {', '.join(again)}" if table.run else "the run"
     how = "started again at its first row here, as `states` says; give the recorded rows before it to go on from them"
     return (f"{runs}: {how}",) if again else ()
@@ -297,35 +295,27 @@ def _filled_table_and_unpredictable_mask(
     and those for which the simulator alone gives none, as a law from there to the end of the run. Raises ParameterError
     if no row can be predicted.
     """
-    few, lost = theta[:_FEW], np.zeros(len(table), dtype=np.bool_)
-    lacking = _incomplete_input_columns(chain.system.simulator, table)
-    whole = _table_with_interpolated_inputs(chain.system.simulator, table)
-    if not lacking or not np.isfinite(chain.predict(few, whole)).any():
+    few, lost, needed = theta[:_FEW], np.zeros(len(table), dtype=np.bool_), list[str]()
+    filled = _interpolated_inputs(chain.system.simulator, table)
+    whole, bare = table.with_columns(filled), chain.system.chain(table, ())
+    if not filled or not np.isfinite(chain.predict(few, whole)).any():
         return table, lost
-    bare, needed = chain.system.chain(table, ()), []
-    for name, values in lacking.items():
-        alone = whole.with_columns({name: values})
-        if np.isfinite(chain.predict(few, alone)).any(axis=0).all():
-            continue
-        needed.append(name)
-        lost |= ~np.isfinite(values)
-        lost |= ~np.isfinite(bare.predict(few[:, : chain.system.n_params], alone)).any(axis=0)
+    for name in filled:
+        alone = whole.with_columns({name: table.covariates[name]})
+        if not np.isfinite(chain.predict(few, alone)).any(axis=0).all():
+            needed.append(name)
+            lost |= ~np.isfinite(table.covariates[name])
+            lost |= ~np.isfinite(bare.predict(few[:, : chain.system.n_params], alone)).any(axis=0)
     if lost.all():
-        row = int(np.argmax(~np.isfinite(lacking[needed[0]]))) + table.first_line
+        row = int(np.argmax(~np.isfinite(table.covariates[needed[0]]))) + table.first_line
         raise ParameterError(f"column {needed[0]!r}", f"no number in row {row}", "a number where a prediction needs it")
-    return table.with_columns({name: whole.covariates[name] for name in needed}), lost
+    return table.with_columns({name: filled[name] for name in needed}), lost
 
 
-def _table_with_interpolated_inputs(simulator: Simulator, table: RunTable) -> RunTable:
-    """Return a table with all missing cells of its inputs interpolated within runs."""
-    lacking = _incomplete_input_columns(simulator, table)
-    return table.with_columns({name: table.interpolated_within_runs(values) for name, values in lacking.items()})
-
-
-def _incomplete_input_columns(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
-    """Return, by name, the columns of numbers with missing cells, except readings and their sd."""
-    others = simulator.reading, simulator.noise.sd
-    return {k: v for k, v in table.covariates.items() if k not in others and not np.isfinite(v).all()}
+def _interpolated_inputs(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
+    """Return, by name, the columns with missing cells, except readings and their sd, interpolated within runs."""
+    columns = {k: v for k, v in table.covariates.items() if k not in (simulator.reading, simulator.noise.sd)}
+    return {name: table.interpolated_within_runs(v) for name, v in columns.items() if not np.isfinite(v).all()}
 
 
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
@@ -335,42 +325,30 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
     earlier times, or this version has no such effect.
     """
     forms: Mapping[str, Any] = {}
-    if fitted.known is not None:
-        new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
-        forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
+    known = fitted.known
+    if known is not None:
+        new = [run for run in table.scan_names if run not in known.table.scan_names]
+        forms = rebind_forms(fitted.effects, fitted.simulator, known, more_runs=new)
         if any(form.needs_rising_time for form in forms.values()):
             table.require_rising_time()
-        lacking = _column_names_read_by_effects(fitted, forms) - set(table.covariates)
+        # A jump at a row may show along a column that it does not read.
+        along = {covariate for form in forms.values() if not jumps_at_row(form) for covariate in form.covariates}
+        columns = known.table.covariates.keys() - {fitted.simulator.reading} - table.covariates.keys()
+        lacking = [name for name in columns if covariate_of_column(name) in along]
         if lacking:
-            allowed = (
-                f"numbers in this column, which an effect of the model reads; the table has {', '.join(table.columns)}"
-            )
+            there = f"the table has {', '.join(table.columns)}"
+            allowed = f"numbers in this column, which an effect of the model reads; {there}"
             raise ParameterError(f"column {min(lacking)!r}", "missing or without numbers", allowed)
-    out = []
     for name in fitted.effects:
-        if name in forms:
-            out.append(forms[name])
-        elif name == random_walk.name:
-            out.append(random_walk())
-        elif name == noise_per_run.name:
-            seen = () if fitted.known is None else fitted.known.table.scan_names
-            out.append(noise_of_runs(tuple(dict.fromkeys((*seen, *table.scan_names)))))
-        elif name in EFFECTS:
-            out.append(EFFECTS[name]())
-        else:
+        if name not in forms and name not in EFFECTS and name not in (random_walk.name, noise_per_run.name):
             raise ParameterError("effects", name, "an effect that this version knows; diagnose again with it")
-    return cast(list[Effect], out)
-
-
-def _column_names_read_by_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
-    """Return the names of the recording's columns of numbers that effects act on or name in formulas.
-
-    A jump at a row may show along a column that it does not read.
-    """
-    assert fitted.known is not None
-    columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
-    along = {covariate for form in forms.values() if not jumps_at_row(form) for covariate in form.covariates}
-    return {name for name in columns if covariate_of_column(name) in along}
+    seen = () if known is None else known.table.scan_names
+    own: dict[str, Callable[[], Any]] = {
+        **EFFECTS,
+        random_walk.name: random_walk,
+        noise_per_run.name: lambda: noise_of_runs(tuple(dict.fromkeys((*seen, *table.scan_names)))),
+    }
+    return [forms[name] if name in forms else own[name]() for name in fitted.effects]
 
 
 def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -398,33 +376,32 @@ def _chain_samples_and_whether_drawn(
     The samples, (n_samples, n_params), and whether any parameter was drawn.
     """
     at = {name: k for k, name in enumerate(fitted.names)}
-    n, system = len(fitted.samples), chain.system
+    n, system, is_drawn = len(fitted.samples), chain.system, False
     fixed = {f"{form.name}.{name}" for form in chain.effects for name in getattr(form, "fixed", ())}
     out = np.empty((n, len(chain.names)))
     for k, name in enumerate(chain.names):
         if name in at:
             out[:, k] = fitted.samples[:, at[name]]
-        elif name in fixed:  # a file of an earlier version lacks it
+            continue
+        if name in fixed:  # a file of an earlier version lacks it
             out[:, k] = 0.0
-        elif name in system.marginals:
-            prior = system.marginals[name]
-            known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{name.split('[')[0]}[")]]
-            if known.shape[1] < _LEAST_RUNS:
-                # One stratified draw from the prior for each sample.
-                out[:, k] = prior.from_unit((rng.permutation(n) + rng.random(n)) / n)
-                continue
-            drawn = draw_value_for_new_run(ndtri(np.clip(prior.to_unit(known), _EDGE, 1 - _EDGE)), rng=rng)
-            out[:, k] = prior.from_unit(np.clip(ndtr(drawn), _EDGE, 1 - _EDGE))
-        else:
-            per_run = (own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}."))
-            effect = next(per_run, None)
-            if effect is None:  # its effect, bound to the recording again, has other parameters
-                raise ParameterError("names", fitted.names, f"all parameters of the effects; {name} is missing")
-            known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
+            continue
+        is_drawn, prior = True, system.marginals.get(name)
+        effect = next((own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}.")), None)
+        if prior is None and effect is None:  # its effect, bound to the recording again, has other parameters
+            raise ParameterError("names", fitted.names, f"all parameters of the effects; {name} is missing")
+        of = f"{effect}." if prior is None else f"{name.split('[')[0]}["
+        known = fitted.samples[:, [j for own, j in at.items() if own.startswith(of)]]
+        if prior is None:
             positive = effect == noise_per_run.name  # positive parameters scatter in the logarithm
             drawn = draw_value_for_new_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
-    return out, any(name not in at and name not in fixed for name in chain.names)
+        elif known.shape[1] < _LEAST_RUNS:  # one stratified draw from the prior for each sample
+            out[:, k] = prior.from_unit((rng.permutation(n) + rng.random(n)) / n)
+        else:
+            drawn = draw_value_for_new_run(ndtri(np.clip(prior.to_unit(known), _EDGE, 1 - _EDGE)), rng=rng)
+            out[:, k] = prior.from_unit(np.clip(ndtr(drawn), _EDGE, 1 - _EDGE))
+    return out, is_drawn
 
 
 def draw_value_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:

@@ -10,26 +10,59 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import AGAIN, PROPOSAL
+from probewise.effects import AGAIN, PROPOSAL, name_without_copy_suffix
 from probewise.effects.effect import Act, StepEffect, WaveEffect
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.inputs import INPUT_WORDS, driving_columns, forms_on_inputs
-from probewise.systems.forms.parameters import PARAMETER_WORDS, forms_of_extras, forms_on_parameters
-from probewise.systems.forms.rates import RATE_WORDS, forms_on_rates
-from probewise.systems.forms.readings import READING_WORDS, forms_on_readings
+from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
+from probewise.systems.forms.modulations import forms_of_extras, forms_on_parameters
+from probewise.systems.forms.rates import forms_on_rates
+from probewise.systems.forms.readings import forms_on_readings
 from probewise.systems.forms.reference import Form, ReferenceFit
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import RunTable, covariate_of_column
 
-WORDS: Mapping[str, str] = MappingProxyType(READING_WORDS | INPUT_WORDS | PARAMETER_WORDS | RATE_WORDS)
-"""A noun phrase for each form, with places for its targets."""
-
+WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "offset_step": "a jump of all readings",
+        "gain_step": "a jump of the readings' gain",
+        "offset_per_run": "an offset that differs from run to run",
+        "gain_per_run": "a gain that differs from run to run",
+        "delay": "a delay of the readings",
+        "settling": "readings that settle at the start of each run",
+        "interference": "a wave in the readings",
+        "sensitivity": "readings that depend on {0}",
+        "curve": "readings that follow a curve of {0}",
+        "friction": "dry friction of {0}",
+        "clock_drift": "a clock that runs fast or slow",
+        "input_offset": "an offset of {0}",
+        "input_gain": "a wrong scale of {0}",
+        "input_delay": "a late effect of {0}",
+        "input_saturation": "a limit of {0}",
+        "dead_zone": "a dead zone of {0}",
+        "periodic_error": "a periodic error of {0}",
+        "backlash": "backlash (play) of {0}",
+        "drifts": "a drift of {0}",
+        "steps": "a jump of {0}",
+        "differs": "{0} that differs from run to run",
+        "depends": "{0} that depends on {1}",
+        "damping": "damping of {0}",
+        "drag": "drag on {0}",
+        "forcing": "a constant force on {0}",
+        "periodic_forcing": "a periodic force on {0}",
+        "cubic": "a cubic term of {1} in the rate of {0}",
+        "quadratic": "a quadratic term of {1} in the rate of {0}",
+        "coupling": "a coupling of {1} to {0}",
+        "limit": "a bound of {0}",
+    }
+)
+"""A noun phrase for each form, with places for its targets, to follow "the model leaves out"."""
 
 _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
+_KINDS_OF_TERMS = "damping", "drag", "friction", "forcing", "periodic_forcing", "cubic", "quadratic", "coupling"
 _IN_ORDER = frozenset({"offset_step", "gain_step", "steps", "hysteresis", "backlash", "lag", "delay", "input_delay"})
 
 
@@ -79,6 +112,21 @@ def names_of_jumps_in_sorted_rows(effects: Mapping[str, Any]) -> frozenset[str]:
 def jumps_at_row(effect: Any) -> bool:
     """Return whether an effect has a change point that is counted in rows."""
     return isinstance(effect, StepEffect) and effect.change_points.by_row
+
+
+def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset[str]:
+    """Return those names of effects and formulas in the rate of a state that is another state by definition.
+
+    A bound is none of them: a position may stop, though its rate is the speed.
+    """
+    places = tuple(
+        begin
+        for state in about.states_with_rates_by_definition
+        for begin in (*(f"{kind}:{state}" for kind in _KINDS_OF_TERMS), f"formula:rate:{state}")
+    )
+    return frozenset(
+        name for name in names if f"{name_without_copy_suffix(name)}:".startswith(tuple(f"{p}:" for p in places))
+    )
 
 
 @dataclass(frozen=True, eq=False)

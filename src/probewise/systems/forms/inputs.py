@@ -199,16 +199,3 @@ def _moves_both_ways(values: FloatArray, table: RunTable) -> bool:
         return False
     still = rounding_error(values)
     return bool((moves > still).mean() > _FORTH_AND_BACK and (moves < -still).mean() > _FORTH_AND_BACK)
-
-
-INPUT_WORDS = {
-    "clock_drift": "a clock that runs fast or slow",
-    "input_offset": "an offset of {0}",
-    "input_gain": "a wrong scale of {0}",
-    "input_delay": "a late effect of {0}",
-    "input_saturation": "a limit of {0}",
-    "dead_zone": "a dead zone of {0}",
-    "periodic_error": "a periodic error of {0}",
-    "backlash": "backlash (play) of {0}",
-}
-"""A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
-from probewise.effects import name_without_copy_suffix
 from probewise.effects.effect import (
     PHASE,
     Declared,
@@ -67,21 +66,6 @@ _TERMS: dict[str, tuple[Callable[[Any], Any], int, str]] = {
     "coupling": (lambda r: -r, 1, "a term -a {0}"),
 }
 """The term of each kind, of unit amplitude, as a function of a state; its degree in the state; and its words."""
-
-
-def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset[str]:
-    """Return those names of effects and formulas in the rate of a state that is another state by definition.
-
-    A bound is none of them: a position may stop, though its rate is the speed.
-    """
-    places = tuple(
-        begin
-        for state in about.states_with_rates_by_definition
-        for begin in (*(f"{kind}:{state}" for kind in RATE_WORDS if kind != "limit"), f"formula:rate:{state}")
-    )
-    return frozenset(
-        name for name in names if f"{name_without_copy_suffix(name)}:".startswith(tuple(f"{p}:" for p in places))
-    )
 
 
 def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> Iterator[Form]:
@@ -189,17 +173,3 @@ def _rms_rate(about: ReferenceFit, state: str) -> float:
         rates.append(np.diff(values[rows])[there] / gaps[there])
     joined = np.concatenate(rates)
     return float(np.sqrt(np.mean(joined**2))) or 1.0
-
-
-RATE_WORDS = {
-    "damping": "damping of {0}",
-    "drag": "drag on {0}",
-    "friction": "dry friction of {0}",
-    "forcing": "a constant force on {0}",
-    "periodic_forcing": "a periodic force on {0}",
-    "cubic": "a cubic term of {1} in the rate of {0}",
-    "quadratic": "a quadratic term of {1} in the rate of {0}",
-    "coupling": "a coupling of {1} to {0}",
-    "limit": "a bound of {0}",
-}
-"""A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

@@ -397,18 +397,3 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
         ends = Clipping(prior, middle, levels, float(top + 1e3 * span))
         says = ends.says(about.system.simulator.reading, about.reading_unit)
         yield from about.clipped("saturation", Stage.SATURATION, ends, about.reading_unit, ("level",), ends.act, says)
-
-
-READING_WORDS = {
-    "offset_step": "a jump of all readings",
-    "gain_step": "a jump of the readings' gain",
-    "offset_per_run": "an offset that differs from run to run",
-    "gain_per_run": "a gain that differs from run to run",
-    "delay": "a delay of the readings",
-    "settling": "readings that settle at the start of each run",
-    "interference": "a wave in the readings",
-    "sensitivity": "readings that depend on {0}",
-    "curve": "readings that follow a curve of {0}",
-    "friction": "dry friction of {0}",
-}
-"""A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

@@ -22,8 +22,8 @@ from probewise.effects.effect import (
     Fixed,
     Say,
     StepEffect,
-    VariantMasks,
     in_words,
+    priors_and_units,
     single_column_bank,
     thinned,
 )
@@ -87,28 +87,17 @@ class BlockForm(StepEffect):
     most: int = _BLOCK_ENDS
 
     @cached_property
-    def _ends(self) -> list[tuple[tuple[float, float], tuple[float, float] | None]]:
-        """Intervals of the begin and of the end, None for a step, of each variant."""
-        thinner = replace(self.change_points, at=thinned(np.array(self.change_points.at), self.most))
-        return [*((begin, None) for begin in self.change_points.intervals), *combinations(thinner.intervals, 2)]
-
-    @property
-    def places(self) -> Sequence[tuple[Uniform, ...]]:
+    def places(self) -> Sequence[tuple[Uniform, ...]]:  # type: ignore[override]
         """The priors of end and begin in each variant."""
-        n_steps = len(self.change_points.intervals)
-        never = replace(self.never, odds=max(len(self._ends) - n_steps, 1) / (_BLOCKS * n_steps))
-        return [(never if end is None else Uniform(*end), Uniform(*begin)) for begin, end in self._ends]
+        begins, thinner = self.change_points.intervals, thinned(np.array(self.change_points.at), self.most)
+        blocks = list(combinations(replace(self.change_points, at=thinner).intervals, 2))
+        never = replace(self.never, odds=max(len(blocks), 1) / (_BLOCKS * len(begins)))
+        steps = [(never, Uniform(*begin)) for begin in begins]
+        return [*steps, *((Uniform(*end), Uniform(*begin)) for begin, end in blocks)]
 
     def with_fewer_variants(self) -> Self:
         """Return the form with fewer begins and ends."""
         return replace(self, change_points=self.change_points.fewer(), most=_FEW_BLOCK_ENDS)
-
-    def variant_masks(self, plan: Any) -> VariantMasks | None:
-        """Return the masks of the rows from each begin to each end."""
-        along, always = self.change_points.variable_at_rows(plan), self.entries[0].copy()
-        always[:, 1:] = -np.inf
-        between = [(sum(begin) / 2, np.inf if end is None else sum(end) / 2) for begin, end in self._ends]
-        return VariantMasks(always, np.array([(along > begin) & (along < end) for begin, end in between]))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Redraw end and begin: a variant by `weights`, (n_variants,), each uniform within its interval."""
@@ -437,9 +426,9 @@ class ReferenceFit:
         Those declared as AMPLITUDE or POSITIVE, of 1 in the `entries`, get their typical size. For it `guess`, by
         default a noise sd, is an amplitude so small that the readings change in proportion.
         """
-        priors = {own: prior for own, (prior, _) in parameters.items()}
+        priors, units = priors_and_units(parameters)
         amplitudes = tuple(k for k, prior in enumerate(priors.values()) if prior is AMPLITUDE or prior is POSITIVE)
-        given = (name, stage, priors, tuple(unit for _, unit in parameters.values()), covariates, act, entries, says)
+        given = (name, stage, priors, units, covariates, act, entries, says)
         form = kind(*given, **{"amplitudes": amplitudes, **more})
         if not amplitudes:
             yield form

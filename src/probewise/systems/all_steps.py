@@ -26,8 +26,7 @@ from probewise.systems.integrate import (
     step_in_part,
     time_gaps,
 )
-from probewise.systems.law import LawWithEffects
-from probewise.systems.law_inputs import LawInputs
+from probewise.systems.law import LawInputs, LawWithEffects
 from probewise.systems.step import Steps
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory

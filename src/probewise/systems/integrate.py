@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
-from probewise.systems.law import LawWithEffects
-from probewise.systems.law_inputs import LawInputs, StepInputs, StepPart, of_columns, values_at_rows
+from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.simulator import Law
 from probewise.systems.step import FOURTH_ORDER, N_LONGER, Rosenbrock, RungeKutta, Steps, Terms
 

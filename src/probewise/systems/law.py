@@ -1,17 +1,24 @@
-"""A law with what effects add to it, and its readings."""
+"""A law with what effects add to it, its readings, and its parameters and columns between the rows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ShapeError
 from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.simulator import Law
+from probewise.systems.step import Steps
+from probewise.systems.table import RunTable
+
+_ROUNDING = 16  # last digits of a time by which two times may differ by rounding alone
+
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -150,3 +157,291 @@ def readings_of_states(
     except ValueError:
         allowed = f"{first.shape} or one that broadcasts to it: a number for each sample and row"
         raise ShapeError(f"observe returns an array of shape {out.shape}; allowed: {allowed}") from None
+
+
+Line = tuple[Any, Any]
+"""A value at the beginning of a gap between rows, and its rise over the gap or its slope in time."""
+
+
+def rounding_of_times(times: FloatArray) -> float:
+    """Return the difference of two times that may be that of rounding alone."""
+    return float(_ROUNDING * np.spacing(np.abs(times).max()))
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """All rows of a table on one line of time, run after run, so that one search finds the rows of all runs.
+
+    `rows` are in the order of the line, `at` their places on it, `is_first` marks the first of each run, and `rounding`
+    may be the difference of two places by rounding alone. Each run is from `first` to `last`, as printed, and `shift`
+    places its times on the line, (n_runs,) each; `margin` beyond either end is of no other run.
+    """
+
+    rows: IntArray
+    at: FloatArray
+    is_first: BoolArray
+    rounding: float
+    first: FloatArray
+    last: FloatArray
+    shift: FloatArray
+    margin: float
+
+    @classmethod
+    def of(cls, table: RunTable) -> Timeline:
+        """Place the rows of a table."""
+        rows = np.concatenate(table.rows_by_scan())
+        run, time = table.scan[rows], table.time_s[rows]
+        is_first = np.append(True, run[1:] != run[:-1])
+        begins = np.flatnonzero(is_first)
+        first, last = time[begins], time[np.append(begins[1:], len(time)) - 1]
+        width = float((last - first).max()) or 1.0
+        shift = 2 * width * np.arange(len(first)) - first
+        at = time + shift[run]
+        rounding = rounding_of_times(np.append(table.time_s, at[-1]))
+        return cls(rows, at, is_first, rounding, first, last, shift, 0.25 * width)
+
+
+@dataclass(frozen=True, eq=False)
+class LateColumn:
+    """A column that acts after a dead time, (n_samples, 1); before a run, its first value holds.
+
+    `values` and `slopes` are those of the rows on the timeline, (1 or n_samples, n_points); `breaks` are the places on
+    it at which the column itself jumps, or bends where it is `linear`.
+    """
+
+    timeline: Timeline
+    values: FloatArray
+    slopes: FloatArray
+    breaks: FloatArray
+    dead_time: FloatArray
+    linear: bool
+
+    @classmethod
+    def of(cls, timeline: Timeline, column: FloatArray, dead_time: FloatArray, *, linear: bool) -> LateColumn:
+        """Find where a column, (n_points,) or (n_samples, n_points), jumps or bends."""
+        values = np.atleast_2d(column)[:, timeline.rows]
+        gap = np.append(np.diff(timeline.at), 1.0)
+        ends = np.append(timeline.is_first[1:], True) | (gap <= 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes = np.where(ends, 0.0, np.diff(values, axis=1, append=0.0) / gap) if linear else np.zeros((1, 1))
+        course = slopes if linear else values
+        changes = np.any(np.diff(course, axis=1, prepend=course[:, :1]) != 0, axis=0)
+        if linear:
+            changes |= timeline.is_first | np.append(False, gap[:-1] <= 0)
+        else:
+            changes &= ~timeline.is_first
+        return cls(timeline, values, slopes, timeline.at[changes], dead_time, linear)
+
+    def next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
+        """Return the time of the next break after `now`, (n_samples, n_columns); infinite if none is left."""
+        line = self.timeline
+        earlier = np.clip(now - self.dead_time, line.first[run] - line.margin, line.last[run] + line.margin)
+        sought = earlier + line.shift[run] + line.rounding
+        at = np.append(self.breaks, np.inf)[np.searchsorted(self.breaks, sought, side="right")]
+        return np.asarray(at - line.shift[run] + self.dead_time)
+
+    def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> Line:
+        """Return its straight line around the times `at`, (n_samples, n_columns): value at `start`, slope in time."""
+        line, earlier = self.timeline, at - self.dead_time
+        before = earlier < line.first[run]
+        inside = np.clip(earlier, line.first[run], line.last[run]) + line.shift[run]
+        row = np.searchsorted(line.at, inside, side="right") - 1
+        row = np.where(before, np.flatnonzero(line.is_first)[run], row)
+        value = _of_rows(self.values, row)
+        if not self.linear:
+            return value, 0.0
+        slope = np.where(before, 0.0, _of_rows(self.slopes, row))
+        return value + slope * (start - self.dead_time - (line.at[row] - line.shift[run])), slope
+
+
+def _of_rows(values: FloatArray, row: IntArray) -> FloatArray:
+    """Take values (1 or n_samples, n_points) at rows (1 or n_samples, n_columns)."""
+    sample = np.arange(len(values))[:, None] if len(values) > 1 else 0
+    return np.asarray(values[sample, row])
+
+
+@dataclass(frozen=True, eq=False)
+class StepInputs:
+    """Parameters and columns, in that order, by name: `held` over a gap, read-only, or on straight `lines` over it.
+
+    Over a table arrays are (1 or n_samples, n_places, n_runs), those of a constant (1 or n_samples, 1, 1 or n_runs);
+    of some steps (1 or n_samples, n_columns), with a column for each step and run, the runs of a step in turn, or 1.
+    """
+
+    held: tuple[Mapping[str, Any], Mapping[str, Any]]
+    lines: tuple[Mapping[str, Line], Mapping[str, Line]]
+
+    def __call__(self, share: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
+        (p, u), (moving, sloping) = self.held, self.lines
+        return _values_on_lines(p, moving, share), _values_on_lines(u, sloping, share)
+
+    def mapped(self, chosen: Callable[[Any], Any]) -> StepInputs:
+        """Return them with a function applied to every array."""
+        p, u = ({name: chosen(values) for name, values in each.items()} for each in self.held)
+        for values in (*p.values(), *u.values()):
+            values.setflags(False)
+        moving, sloping = ({name: (chosen(v), chosen(d)) for name, (v, d) in each.items()} for each in self.lines)
+        return StepInputs((p, u), (moving, sloping))
+
+
+def _values_on_lines(held: Mapping[str, Any], lines: Mapping[str, Line], share: Any) -> Mapping[str, Any]:
+    if not lines:
+        return held
+    out = dict(held)
+    for name, (low, rise) in lines.items():
+        out[name] = value = low + share * rise
+        value.setflags(False)  # of writing; a keyword would double the time
+    return out
+
+
+StepPart = tuple[IntArray | None, StepInputs, Any, Any]
+"""A part of some steps in which no input jumps or bends: columns, inputs, begin and length.
+
+The first are indices of columns of the states' arrays, None: all; the last are shares of the gap between rows, numbers
+or arrays with one value per column.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class LawInputs:
+    """Parameters and columns of a law over the table of its steps, the columns with a dead time, and jumps."""
+
+    steps: Steps
+    over_table: StepInputs
+    late: Mapping[str, LateColumn] = field(default_factory=dict)
+    jumps: tuple[Jump, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        motion: LawWithEffects,
+        steps: Steps,
+        parameters: Mapping[str, FloatArray],
+        columns: Mapping[str, NDArray[Any]],
+    ) -> LawInputs:
+        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
+
+        Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `motion`
+        has their drifts and jumps, and the columns that are late.
+        """
+        rows, table, linear = steps.row_by_position_and_run, steps.table, motion.law.hold == "linear"
+        held: dict[str, Any] = {}
+        moving: dict[str, Line] = {}
+        for name, values in parameters.items():
+            for jump in motion.jumps:
+                if jump.parameter == name:  # it is added where it is, within a gap
+                    values = values - jump.size * (table.time_s > jump.at)
+            own = values_at_rows(values, rows)
+            if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
+                held[name] = own[:, :1]
+            elif linear:
+                moving[name] = own, np.diff(own, axis=1)
+            elif name in motion.drifts:
+                moving[name] = own, motion.drifts[name][:, :, None] * steps.gaps
+            else:
+                held[name] = own
+        still: dict[str, Any] = {}
+        sloping: dict[str, Line] = {}
+        for name, values in columns.items():
+            own = values_at_rows(values, rows)
+            if name == table.time or (linear and values.dtype == np.float64):
+                sloping[name] = own, np.diff(own, axis=1)
+            else:
+                still[name] = own
+        over_table = StepInputs((read_only_views(held), read_only_views(still)), (moving, sloping))
+        late = {}
+        if motion.dead_times:
+            timeline = Timeline.of(table)
+            for name, dead_time in motion.dead_times.items():
+                late[name] = LateColumn.of(timeline, columns[name], dead_time, linear=linear)
+        return cls(steps, over_table, late, motion.jumps)
+
+    def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
+        """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""
+
+        def in_gaps(values: Any) -> Any:
+            if values.shape[1] > 1:
+                return values[:, gaps].reshape(len(values), -1)
+            constant = values[:, 0]
+            return np.tile(constant, (1, n_gaps)) if n_gaps > 1 and constant.shape[1] > 1 else constant
+
+        return self.over_table.mapped(in_gaps)
+
+    def parts_of_steps(
+        self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any, *, whole: bool
+    ) -> Iterator[StepPart]:
+        """Divide steps where inputs jump or bend, a late column or a parameter with a jump; yield the parts in turn.
+
+        `gap` is that of each step, (n_steps,), with the shares of it at which the step begins, and that it takes:
+        numbers, or one per step and run. Each part has all columns of the states if `whole`, so that runs are together;
+        else those alone that have one.
+        """
+        if not (self.late or self.jumps):
+            yield None, inputs, begin, length
+            return
+        rows = self.steps.row_by_position_and_run
+        run = np.tile(np.arange(rows.shape[1]), len(gap))
+        n_columns = len(run)
+        start, gap_s = self.steps.table.time_s[rows[gap]].ravel(), self.steps.gaps[gap].ravel()
+        end = np.broadcast_to(begin + length, n_columns)
+        share = np.broadcast_to(begin, (1, n_columns))
+        columns = np.arange(n_columns)
+        while True:
+            now, last = start + share * gap_s, start + end * gap_s
+            stop = self._next_break(now, run)
+            over = ~(stop < last)
+            part = self._with_breaks(inputs, 0.5 * (now + np.where(over, last, stop)), run, start, gap_s)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                until = np.where(over, end, (stop - start) / gap_s)
+            yield None if len(columns) == n_columns else columns, part, share, until - share
+            going = ~over.all(axis=0)
+            if not going.any():
+                return
+            share = until
+            if not whole:
+                some = np.flatnonzero(going)
+                columns, run = columns[some], run[some]
+                start, gap_s, end, share = start[some], gap_s[some], end[some], share[:, some]
+                inputs = inputs.mapped(partial(of_columns, columns=some))
+
+    def _next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
+        """Return the time of the next jump or bend of an input after `now`, of that shape; infinite if none is left."""
+        rounding = rounding_of_times(self.steps.table.time_s)
+        out: Any = np.inf
+        for late in self.late.values():
+            out = np.minimum(out, late.next_break(now, run))
+        for jump in self.jumps:
+            out = np.minimum(out, np.where(jump.at > now + rounding, jump.at, np.inf))
+        return np.asarray(out)
+
+    def _with_breaks(
+        self, inputs: StepInputs, at: FloatArray, run: IntArray, start: FloatArray, gap_s: FloatArray
+    ) -> StepInputs:
+        """Return inputs with the late columns and the parameters with jumps as they are around the times `at`."""
+        (p, u), (moving, sloping) = map(dict, inputs.held), map(dict, inputs.lines)
+        for name, late in self.late.items():
+            value, slope = late.line_at(at, run, start)
+            if late.linear:
+                sloping[name] = value, slope * gap_s
+            else:
+                u[name] = value
+        for jump in self.jumps:
+            name, own = jump.parameter, jump.size * (at > jump.at)
+            if name in moving:
+                moving[name] = moving[name][0] + own, moving[name][1]
+            else:
+                p[name] = p[name] + own
+        return StepInputs((read_only_views(p), read_only_views(u)), (moving, sloping))
+
+
+def of_columns(values: Any, columns: IntArray) -> Any:
+    """Return some columns of values by column, (n_columns,) or (n, n_columns); a number is that of all columns."""
+    return values[..., columns] if np.ndim(values) and values.shape[-1] > 1 else values
+
+
+def values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
+    """Index values (n_points,) or (n_samples, n_points) by rows (n_places, n_runs); (n, 1) becomes (n, 1, 1)."""
+    if values.ndim == 1:
+        return np.asarray(values[rows][None])
+    return values[:, :, None] if values.shape[1] == 1 else np.asarray(values[:, rows])

@@ -382,10 +382,10 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
     pairs = [(taus[i], taus[j]) for i in range(_N_SETTLING) for j in range(i + _APART, _N_SETTLING)]
     bank = np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs])
-    size, tau = (AMPLITUDE, unit), (between, about.time_unit)
+    parameters: Declared = dict.fromkeys("ab", (AMPLITUDE, unit))
+    parameters |= dict.fromkeys(("tau1", "tau2"), (between, about.time_unit))
     text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
-    own = (text, {"a": size, "b": size, "tau1": tau, "tau2": tau}, change, ("time", "run"), bank)
-    yield from _proposal(about, *own, guess=1.0, expression=text)
+    yield from _proposal(about, text, parameters, change, ("time", "run"), bank, guess=1.0, expression=text)
 
 
 def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:

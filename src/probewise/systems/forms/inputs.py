@@ -26,7 +26,7 @@ from probewise.systems.forms.reference import (
     ReferenceFit,
     clipping_between,
 )
-from probewise.systems.law_inputs import rounding_of_times
+from probewise.systems.law import rounding_of_times
 from probewise.systems.table import RunTable, covariate_of_column
 
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings

@@ -11,7 +11,7 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
-from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Fixed, acting, in_words, single_column_bank
+from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Declared, Fixed, acting, in_words, single_column_bank
 from probewise.effects.reading import decaying_sum
 from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
@@ -77,7 +77,8 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
         variants: list[Form] = []
         for is_smooth in (False, True):
             value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
-            own, bank = {"tau_s": (prior, unit), _SMOOTH: (of_flag, "1")}, single_column_bank(prior_sizes(prior), value)
+            own: Declared = {"tau_s": (prior, unit), _SMOOTH: (of_flag, "1")}
+            bank = single_column_bank(prior_sizes(prior), value)
             given = (name, Stage.LAG, own, ("previous",), act, in_words(says, unit), bank)
             variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
         first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
@@ -265,8 +266,8 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         size = value_with_sd(mean[0], sd[0], unit)
         return f"{about.system.simulator.reading} has dry friction of {name}: {size} times {by}"
 
-    parameters, bank = {"a": (AMPLITUDE, unit), "width": (Fixed(0.0, _NONE * low), name)}, [[[1.0, 0.5 * _NONE * low]]]
-    own = (parameters, (covariate_of_column(name),), act, says, np.array(bank))
+    parameters: Declared = {"a": (AMPLITUDE, unit), "width": (Fixed(0.0, _NONE * low), name)}
+    own = (parameters, (covariate_of_column(name),), act, says, single_column_bank(1.0, 0.5 * _NONE * low))
     for sign in about.form(f"friction:{name}", Stage.OFFSET, *own):
         if low < high:
             widths = single_column_bank(sign.entries[0, 0, 0], np.geomspace(low, high, N_SIZES))
@@ -371,7 +372,7 @@ def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
     z = f"z from 0 at {low:.4g} to 1 at {high:.4g} {about.reading_unit}"
     bend = f"y + a (hi - lo) (z^power - z) with {z}, a = {{0}}, power = {{1}}"
     says = in_words(f"{about.system.simulator.reading} has a bent response, {bend}")
-    parameters = {"a": (AMPLITUDE, "1"), "power": (LogUniform(0.4, 5.0), "1")}
+    parameters: Declared = {"a": (AMPLITUDE, "1"), "power": (LogUniform(0.4, 5.0), "1")}
     own = (parameters, ("level",), act, says, single_column_bank(1.0, np.array([0.5, 1.5, 2.0, 3.0, 4.0])))
     yield from about.form("nonlinearity", Stage.BEND, *own, guess=about.sd / (high - low))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -32,7 +32,7 @@ from probewise.sensor import Stage
 from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.integrate import integrate_states
 from probewise.systems.law import LawWithEffects
-from probewise.systems.simulator import Simulator
+from probewise.systems.simulator import Law, Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
@@ -87,7 +87,7 @@ class BlockForm(StepEffect):
     most: int = _BLOCK_ENDS
 
     @cached_property
-    def places(self) -> Sequence[tuple[Uniform, ...]]:  # type: ignore[override]
+    def places(self) -> Sequence[tuple[Uniform, ...]]:
         """The priors of end and begin in each variant."""
         begins, thinner = self.change_points.intervals, thinned(np.array(self.change_points.at), self.most)
         blocks = list(combinations(replace(self.change_points, at=thinner).intervals, 2))
@@ -158,10 +158,9 @@ def rows_are_in_order(simulator: Simulator, table: RunTable) -> bool:
 
 def note_on_row_order(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
     """Return a note where rows are in no order of recording; else ()."""
-    chance = chance_of_sorted_readings(simulator, table)
-    if chance > _BY_CHANCE:
+    if rows_are_in_order(simulator, table):
         return ()
-    once_in = 1 / max(chance, 1e-300)
+    once_in = 1 / max(chance_of_sorted_readings(simulator, table), 1e-300)
     return (
         f"rows are in no order of recording: wherever the other columns are equal, {simulator.reading} is sorted, by "
         f"chance once in {once_in:.0e} tables; nothing is asked that needs their order, such as a jump at a row, "
@@ -293,8 +292,7 @@ class ReferenceFit:
             for name, values in self.states.items()
         }
         try:
-            with np.errstate(all="ignore"):
-                rates = call_on_read_only(law.rates, *map(read_only_views, (s, p, u)))
+            rates = _rates_of(law, s, p, u)
         except Exception:  # a user's function may refuse states that no reading asks for
             return frozenset()
         return frozenset(
@@ -313,10 +311,7 @@ class ReferenceFit:
         columns = columns_without_reading(self.system.simulator, self.table)
         there = {name: values[None, :] for name, values in self.states.items()}
         nudged = there | {state: there[state] + _NUDGE * np.ptp(there[state])}
-        with np.errstate(all="ignore"):
-            given = read_only_views(parameters), read_only_views(columns)
-            rates = (call_on_read_only(law.rates, read_only_views(s), *given) for s in (nudged, there))
-            apart = np.subtract(*(each[other] for each in rates))
+        apart = np.subtract(*(_rates_of(law, s, parameters, columns)[other] for s in (nudged, there)))
         return bool(np.any(np.abs(apart) > 0))
 
     @cached_property
@@ -480,6 +475,13 @@ class ReferenceFit:
         first, last = int(there[0]), int(there[-1])
         low, high = float(tried[first]), float(tried[last if last > first else min(last + 1, len(tried) - 1)])
         return LogUniform(low, high) if low < high else None
+
+
+def _rates_of(law: Law, *given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the rates of a law, of states, parameters and columns."""
+    with np.errstate(all="ignore"):
+        rates: Mapping[str, Any] = call_on_read_only(law.rates, *map(read_only_views, given))
+    return rates
 
 
 def prior_sizes(prior: LogUniform) -> FloatArray:

@@ -18,6 +18,7 @@ from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, Uni
 from probewise.recordings.plans import with_jittered_times
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, Poses, Stage
+from probewise.world import concealed
 
 PLAN = with_jittered_times(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
@@ -69,6 +70,10 @@ def test_every_effect_keeps_the_contract(name):
         assert any(c.isdigit() for c in said)
         assert all(scan in said for scan in variant.scans)
     assert EFFECTS[name]().prior.names == names  # a sensor file needs its function only, whatever the prior's scale
+
+
+def test_every_effect_has_a_counterpart_in_the_world_that_conceals():
+    assert [name for name in VOCABULARY if not hasattr(concealed, name)] == []
 
 
 @pytest.mark.parametrize("name", [name for name, kind in EFFECTS.items() if kind.stage is not Stage.NOISE])

@@ -37,9 +37,8 @@ from probewise.systems.forms.binding import sorting_column
 from probewise.systems.forms.reference import note_on_row_order
 from probewise.systems.forms.stop import (
     MeterStop,
-    find_meter_stop_and_mask,
     is_signal_beyond,
-    possible_meter_stops_and_masks,
+    meter_stops_and_masks,
 )
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
@@ -119,7 +118,7 @@ def without_readings_at_scattered_stop(
 
     The stop, None if there is none, counts only if a fit to the other readings predicts these beyond it.
     """
-    for stop, rows in possible_meter_stops_and_masks(recording, system.simulator.reading):
+    for stop, rows in meter_stops_and_masks(recording, system.simulator.reading, scattered=True):
         without = _without_rows_at_stop(recording, stop, rows)
         if without.usable.sum() < system.least_readings:
             continue
@@ -288,7 +287,7 @@ def prepare_system(
     plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)
-    stopped = find_meter_stop_and_mask(as_recording(simulator, table), simulator.reading)
+    stopped = next(meter_stops_and_masks(as_recording(simulator, table), simulator.reading), None)
     stop = None if stopped is None else stopped[0]
     recording = recording if stopped is None else _without_rows_at_stop(recording, *stopped)
     least = system.least_readings if with_effects else system.n_params + 1

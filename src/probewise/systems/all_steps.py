@@ -51,8 +51,13 @@ LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Mapping[str, FloatArra
 
 @dataclass(frozen=True, eq=False)
 class KnownTrajectory:
-    """A solved trajectory: theta (n_params,), states (n_states, n_steps + 1, n_runs), `bands` its Jacobian if known."""
+    """A trajectory solved over some steps, with some effects.
 
+    It has theta (n_params,), states (n_states, n_steps + 1, n_runs), and `bands`, its Jacobian, if known.
+    """
+
+    steps: Hashable
+    effects: Hashable
     theta: FloatArray
     states: FloatArray
     bands: list[FloatArray] = field(default_factory=list)
@@ -60,18 +65,13 @@ class KnownTrajectory:
 
 @dataclass(eq=False)
 class TrajectoryCache:
-    """Cache of solved trajectories by (steps, effects).
+    """Cache of solved trajectories: those of the steps and effects that were added to last come last.
 
     `n_refused` counts how often in a row the law raised an error for all steps together, and none step by step.
     """
 
-    known: dict[tuple[Hashable, Hashable], list[KnownTrajectory]] = field(default_factory=dict)
+    known: list[KnownTrajectory] = field(default_factory=list)
     n_refused: int = 0
-
-    @property
-    def useless(self) -> bool:
-        """Whether the law seems unable to evaluate all steps at once, as rates for one value per run only are."""
-        return self.n_refused >= _REFUSALS
 
     def known_and_nearest_indices(
         self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
@@ -81,30 +81,22 @@ class TrajectoryCache:
         Samples are theta, (n_samples, n_params); the indices are (n_samples,). Without a trajectory of these effects,
         those of others are returned, compared by the first `n_own` parameters; without any, both results are empty.
         """
-        own, width = self.known.get((steps, effects), []), theta.shape[1]
+        every = [each for each in self.known if each.steps == steps]
+        own, width = [each for each in every if each.effects == effects], theta.shape[1]
         if not own:
-            own = [each for (other, _), known in self.known.items() if other == steps for each in known]
-            width = n_own
+            own, width = every, n_own
         if not own:
             return [], np.zeros(0, dtype=np.int64)
         there = np.stack([each.theta[:width] for each in own])
         apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
         return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
 
-    def add(self, steps: Hashable, effects: Hashable, more: Sequence[KnownTrajectory]) -> None:
-        """Add trajectories; beyond 48 in all, drop the oldest of the (steps, effects) added to least recently."""
-        if not more:
-            return
-        own = self.known.pop((steps, effects), [])  # those used last come last
-        self.known[steps, effects] = [*own, *more]
-        excess = sum(map(len, self.known.values())) - _MOST_KNOWN
-        while excess > 0:
-            key = next(iter(self.known))
-            dropped = min(excess, len(self.known[key]))
-            self.known[key] = self.known[key][dropped:]
-            excess -= dropped
-            if not self.known[key]:
-                del self.known[key]
+    def add(self, more: Sequence[KnownTrajectory]) -> None:
+        """Add trajectories of the same steps and effects; beyond 48 in all, drop the first."""
+        of = [(each.steps, each.effects) for each in more[:1]]
+        others = [each for each in self.known if (each.steps, each.effects) not in of]
+        again = [each for each in self.known if (each.steps, each.effects) in of]
+        self.known = [*others, *again, *more][-_MOST_KNOWN:]
 
 
 def integrate_from_known_trajectories(
@@ -127,7 +119,7 @@ def integrate_from_known_trajectories(
     samples together.
     """
     n_samples = len(theta)
-    if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
+    if n_samples * steps.n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
         states_by_name = integrate_states(motion, steps, parameters, columns)
         return states_by_name, n_parts_of_steps(motion, steps) * evaluations_per_step(motion, steps.method)
@@ -140,8 +132,8 @@ def integrate_from_known_trajectories(
                 solved, new = _solve_all_steps(law_and_inputs, steps, known, nearest)
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
-            found = [KnownTrajectory(theta[k].copy(), states[:, k].copy(), bands) for k, bands in new.items()]
-            memory.add(steps, effects, found)
+            own = ((theta[k].copy(), states[:, k].copy(), bands) for k, bands in new.items())
+            memory.add([KnownTrajectory(steps, effects, *each) for each in own])
             memory.n_refused = 0
         except Exception:  # of the law: for these samples, or for more columns than there are runs
             refused = True
@@ -156,7 +148,7 @@ def integrate_from_known_trajectories(
             states[:, left] = there
         cost += n_parts_of_steps(motion, steps)
         finite = np.flatnonzero(np.isfinite(there).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
-        memory.add(steps, effects, [KnownTrajectory(theta[left[k]], there[:, k]) for k in finite])
+        memory.add([KnownTrajectory(steps, effects, theta[left[k]], there[:, k]) for k in finite])
     assert states is not None
     motion = law_and_inputs(np.arange(1))[0]
     cost *= evaluations_per_step(motion, steps.method)

@@ -7,7 +7,7 @@ from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit_simulator import repaired_of
 from probewise.systems import RunTable, Simulator, as_recording, predict_system, table_for
-from probewise.systems.forms.stop import find_meter_stop_and_mask
+from probewise.systems.forms.stop import meter_stops_and_masks
 
 _N, _SD = 240, 0.05
 
@@ -25,7 +25,7 @@ def _table(readings):
 
 def _stop(table, **more):
     simulator = _simulator(**more)
-    return find_meter_stop_and_mask(as_recording(simulator, RunTable(table, time=None, run=None)))
+    return next(meter_stops_and_masks(as_recording(simulator, RunTable(table, time=None, run=None))), None)
 
 
 def test_a_meter_that_stops_after_its_noise_is_seen():

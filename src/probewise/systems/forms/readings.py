@@ -184,11 +184,13 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     span = float(np.ptp(about.predicted)) or about.sd
 
     def added(name: str, how: Modulation) -> Iterator[Form]:
-        act: Act = lambda value, theta, rows: value + how.at_rows(theta, rows)  # noqa: E731
-        return modulated_form(about, name, Stage.OFFSET, how, act, about.sd, reading, unit)
+        own = (about.sd, reading, unit)
+        return modulated_form(about, name, Stage.OFFSET, how, lambda y, theta, rows: y + how.at_rows(theta, rows), *own)
 
     def scaled(name: str, how: Modulation) -> Iterator[Form]:
-        act: Act = lambda value, theta, rows: zero + (value - zero) * (1 + how.at_rows(theta, rows))  # noqa: E731
+        def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+            return zero + (value - zero) * (1 + how.at_rows(theta, rows))
+
         gain = f"the gain of {reading}"
         return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, gain, "1", ("level",))
 

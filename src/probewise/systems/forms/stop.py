@@ -69,28 +69,16 @@ def _unchanged(noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoisePa
     return noise
 
 
-def find_meter_stop_and_mask(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:
-    """Find a stop at the largest or smallest reading; return it and the mask of the rows there, (n_points,), or None.
-
-    At least eight readings, five of them in succession, must equal that reading exactly: noise makes readings differ,
-    unless the meter saturates after the noise. None also if rounding is too coarse to tell, or if that end was
-    declared.
-    """
-    return next(_stops_and_masks(recording, reading, scattered=False), None)
-
-
-def possible_meter_stops_and_masks(
-    recording: Recording, reading: str = "the reading"
+def meter_stops_and_masks(
+    recording: Recording, reading: str = "the reading", *, scattered: bool = False
 ) -> Iterator[tuple[MeterStop, BoolArray]]:
-    """Yield stops at the largest and smallest reading that eight rows have exactly, wherever they are in the table.
+    """Yield stops at the largest and smallest reading, with the mask of the rows there, (n_points,).
 
-    Few other readings may have an exact equal. Lost readings look alike: only a fit tells whether the signal is beyond
-    (`is_signal_beyond`). A declared end is no stop.
+    At least eight readings must equal that reading exactly, five of them in succession: noise makes readings differ,
+    unless the meter saturates after the noise. Where they are `scattered`, few other readings may have an exact equal;
+    lost readings look alike, and only a fit tells whether the signal is beyond (`is_signal_beyond`). None where
+    rounding is too coarse to tell, or at an end that was declared.
     """
-    return _stops_and_masks(recording, reading, scattered=True)
-
-
-def _stops_and_masks(recording: Recording, reading: str, *, scattered: bool) -> Iterator[tuple[MeterStop, BoolArray]]:
     usable = np.flatnonzero(recording.usable)
     readings, scan = recording.readings[usable], recording.plan.scan[usable]
     in_turn = (np.diff(usable) == 1) & (np.diff(scan) == 0)  # of successive rows of a run
@@ -108,7 +96,9 @@ def _stops_and_masks(recording: Recording, reading: str, *, scattered: bool) -> 
             is_stop = n_each[n_each > 1].sum() / max(n_each.sum(), 1) <= _OFTEN
         else:
             elsewhere = steps[~stands[1:][in_turn]]
-            is_stop = np.mean(elsewhere == 0) <= _OFTEN and _longest_streak(stands, in_turn) >= _LEAST_IN_TURN
+            follows = np.append(False, stands[:-1] & stands[1:] & in_turn)
+            streaks = np.diff(np.flatnonzero(np.append(~follows, True)))  # of rows at the stop, or one elsewhere
+            is_stop = np.mean(elsewhere == 0) <= _OFTEN and streaks.max() >= _LEAST_IN_TURN
         if is_stop:
             yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), there
 
@@ -120,12 +110,3 @@ def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
     """
     beyond = (predicted - stop.level) * (1.0 if stop.is_ceiling else -1.0)
     return bool(np.mean(beyond > -2 * sd) >= _NEARLY_ALL and np.median(beyond) > 0)
-
-
-def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:
-    """Return the largest number of successive rows at the stop; `in_turn` marks rows that follow the one before."""
-    longest = current = int(stands[0])
-    for at, follows in zip(stands[1:].tolist(), in_turn.tolist(), strict=True):
-        current = (current + 1 if follows else 1) if at else 0
-        longest = max(longest, current)
-    return longest

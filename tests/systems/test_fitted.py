@@ -12,7 +12,8 @@ from scipy.special import ndtri
 from probewise.errors import FileError, ParameterError
 from probewise.systems import FittedSystem, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import StoredFit, extract_stored_fit, rebind_forms
+from probewise.systems.forms.binding import extract_stored_fit, rebind_forms
+from probewise.systems.forms.reference import StoredFit
 
 
 def test_what_is_written_is_read_back_bit_for_bit():

@@ -31,7 +31,6 @@ from probewise.sensor.stages import Poses, Stage
 
 _STILL_MM = 1e-6  # a smaller step of an axis is rounding
 _TURN_DEG = 3.0  # of a mount set by eye
-_LARGE_SCALES = (-0.3, -0.1, 0.1, 0.3)
 _FURTHER = "{|0|} degrees further {anticlockwise/clockwise} than commanded"
 _UNIT_MM = 10.0
 _MOST_PLACES = 160
@@ -109,8 +108,9 @@ def position_scale(kind: LightEffect, of: Extent) -> Effect:
         return replace(value, x_mm=x, y_mm=y)
 
     says = "the arm moves {0} % too far along X and {1} % along Y: the scale of its positions is wrong"
-    found = kind.linear(of, {"x": "1", "y": "1"}, typical, act, in_words(says, factors=(100, 100)))
-    return replace(found, entries=np.array([typical, *_LARGE_SCALES])[:, None, None] * np.eye(2))
+    return kind.linear(
+        of, {"x": "1", "y": "1"}, typical, act, in_words(says, factors=(100, 100)), sizes=(1, -30, -10, 10, 30)
+    )
 
 
 @light_effect(

@@ -28,7 +28,8 @@ from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.io import read_text
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import Stage
-from probewise.systems.forms.binding import StoredFit, counts_from_far_origin
+from probewise.systems.forms.binding import counts_from_far_origin
+from probewise.systems.forms.reference import StoredFit
 from probewise.systems.simulator import Simulator, fingerprint_of_text, run_simulator_text
 from probewise.systems.table import RunTable
 

@@ -19,7 +19,6 @@ from probewise.systems.table import RunTable
 
 _ROUNDING = 16  # last digits of a time by which two times may differ by rounding alone
 
-
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
 

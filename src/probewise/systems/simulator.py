@@ -27,14 +27,11 @@ _OF_SYSTEM = ("reading", "unit", "time", "time_unit", "run", "parameters", "per_
 _OF_LAW = ("states", "hold", "max_step_s")
 _NAMES = (*_OF_SYSTEM, "simulate", *_OF_LAW, "rates", "observe", "vectorized", "extra")  # in a file
 
-
 Values: TypeAlias = Mapping[str, Any]
 """Parameters by name: floats, or arrays that broadcast against the rows."""
 
-
 Columns: TypeAlias = Mapping[str, NDArray[Any]]
 """Columns of the table by name, (n_points,)."""
-
 
 Simulate: TypeAlias = Callable[[Values, Columns], FloatArray]
 """Function of parameters and columns; returns noise-free readings.
@@ -42,17 +39,13 @@ Simulate: TypeAlias = Callable[[Values, Columns], FloatArray]
 (n_points,), or (n_samples, n_points) where parameters are (n_samples, 1).
 """
 
-
 Rates: TypeAlias = Callable[[Values, Values, Values], Mapping[str, Any]]
 """Function of states, parameters and columns; returns the rate of each state; arrays broadcast."""
-
 
 Observe: TypeAlias = Callable[[Values, Values, Values], Any]
 """Function of states, parameters and columns; returns the noise-free reading."""
 
-
 Hold: TypeAlias = Literal["previous", "linear"]
-
 
 _OF_NOISE = (name for name, kind in EFFECTS.items() if kind.stage is Stage.NOISE)
 _TAKEN = (*_OF_NOISE, *RARE_EFFECTS, "unknown", "clean")  # names that no effect of a user may have
@@ -81,10 +74,7 @@ class Noise:
         if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
             meant = f"; was {{'sd': {given}}} meant?" if isinstance(given, int | float) else ""
             raise ParameterError("noise", given, f'a dict with some of "sd", "step", "range", "zero"{meant}')
-        ends = given.get("range", (None, None))
-        if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
-            raise ParameterError('noise["range"]', ends, _A_RANGE)
-        return cls(given.get("sd"), given.get("step"), (ends[0], ends[1]), given.get("zero", 0.0))
+        return cls(**given)
 
     def __post_init__(self) -> None:
         if not (self.sd is None or isinstance(self.sd, str) or _is_positive_number(self.sd)):
@@ -93,9 +83,10 @@ class Noise:
             raise ParameterError('noise["step"]', self.step, "a number greater than 0, or None")
         if not _is_finite_number(self.zero):
             raise ParameterError('noise["zero"]', self.zero, "a finite number, the reading at zero signal")
-        low, high = (bound if end is None else end for end, bound in zip(self.range, (-np.inf, np.inf), strict=True))
-        if not (_is_number(low) and _is_number(high) and low < high):
+        is_pair = isinstance(self.range, Sequence) and not isinstance(self.range, str) and len(self.range) == 2
+        if not is_pair or not (_is_number(self.ends[0]) and _is_number(self.ends[1]) and self.ends[0] < self.ends[1]):
             raise ParameterError('noise["range"]', self.range, _A_RANGE)
+        object.__setattr__(self, "range", tuple(self.range))
 
     @property
     def ends(self) -> tuple[float, float]:

@@ -44,7 +44,6 @@ _LATER = 1e-4  # of a step, for the rates' change with time: inputs between rows
 # Evaluations of the eighth order, in those of the fourth, up to which its far smaller error is worth them.
 _DEARER = 1.5
 
-
 Rates = Callable[[Mapping[str, Any], Any], Mapping[str, Any]]
 """Rate of each state, from states (n_samples, n_runs) and a share of the gap between two rows."""
 
@@ -145,7 +144,6 @@ class RungeKutta:
 
 
 FOURTH_ORDER = RungeKutta(((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))
-
 
 N_LONGER = 3
 """Steps of fourth order that have as many evaluations as one of eighth order."""

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray
 from probewise.effects import AGAIN, PROPOSAL, name_without_copy_suffix
-from probewise.effects.effect import Act, StepEffect, WaveEffect
+from probewise.effects.effect import StepEffect, WaveEffect
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform
-from probewise.sensor import Stage
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
 from probewise.systems.forms.modulations import forms_of_extras, forms_on_parameters
 from probewise.systems.forms.rates import forms_on_rates
 from probewise.systems.forms.readings import forms_on_readings
-from probewise.systems.forms.reference import Form, ReferenceFit
+from probewise.systems.forms.reference import Form, ReferenceFit, StoredFit
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import RunTable, covariate_of_column
@@ -129,52 +127,6 @@ def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset
     )
 
 
-@dataclass(frozen=True, eq=False)
-class StoredFit:
-    """The part of a reference fit that rebinding needs: its table, and predicted readings and states, (n_points,) each.
-
-    `sd` is the noise sd of a reading, by which outlying readings are told where a bend gets its ends. `held` are the
-    columns that the model holds constant from row to row.
-    """
-
-    table: RunTable
-    predicted: FloatArray
-    sd: float
-    states: Mapping[str, FloatArray] = field(default_factory=dict)
-    held: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class _StoredReferenceFit(ReferenceFit):
-    """A reference fit known by its stored predictions: nothing is simulated; amplitudes of priors are arbitrary."""
-
-    known: StoredFit | None = None
-
-    @property
-    def predicted(self) -> FloatArray:
-        assert self.known is not None
-        return self.known.predicted
-
-    @property
-    def states(self) -> dict[str, FloatArray]:
-        assert self.known is not None
-        return dict(self.known.states)
-
-    @property
-    def can_fit_value_per_run(self) -> bool:
-        return len(self.table.scan_names) > 1
-
-    def state_drives_rate(self, state: str, other: str) -> bool:
-        return False  # it matters to priors only
-
-    def is_held_between_rows(self, column: str) -> bool:
-        assert self.known is not None
-        return column in self.known.held
-
-    def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
-        return np.ones(len(settings))
-
-
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:
     """Return the part of a reference fit from which its forms can be bound again."""
     held = tuple(name for name in driving_columns(about) if about.is_held_between_rows(name))
@@ -214,7 +166,7 @@ def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit
     if not wanted:
         return {}
     system = System(simulator, known.table.scan_names)
-    about = _StoredReferenceFit(system, known.table, np.zeros(system.n_params), known.sd, known=known)
+    about = ReferenceFit(system, known.table, np.zeros(system.n_params), known.sd, known=known)
     found = bind_forms(about)
     if any(name.startswith(PROPOSAL) for name in wanted):
         found |= {form.name: form for form in formula_forms(about)}

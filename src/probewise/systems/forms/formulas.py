@@ -382,8 +382,8 @@ def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
     taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
     pairs = [(taus[i], taus[j]) for i in range(_N_SETTLING) for j in range(i + _APART, _N_SETTLING)]
     bank = np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs])
-    parameters: Declared = dict.fromkeys("ab", (AMPLITUDE, unit))
-    parameters |= dict.fromkeys(("tau1", "tau2"), (between, about.time_unit))
+    size, tau = (AMPLITUDE, unit), (between, about.time_unit)
+    parameters: Declared = {"a": size, "b": size, "tau1": tau, "tau2": tau}
     text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
     yield from _proposal(about, text, parameters, change, ("time", "run"), bank, guess=1.0, expression=text)
 

@@ -230,11 +230,27 @@ ONE_AMPLITUDE = np.ones((1, 1, 1))  # template bank
 
 
 @dataclass(frozen=True, eq=False)
+class StoredFit:
+    """The part of a reference fit that rebinding needs: its table, and predicted readings and states, (n_points,) each.
+
+    `sd` is the noise sd of a reading, by which outlying readings are told where a bend gets its ends. `held` are the
+    columns that the model holds constant from row to row.
+    """
+
+    table: RunTable
+    predicted: FloatArray
+    sd: float
+    states: Mapping[str, FloatArray] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class ReferenceFit:
     """The fit to which forms are bound: standard-normal coordinates `z` (n_params,), and the noise sd of a reading.
 
     A form of typical size changes its readings by one sd (rms), so that no quantity needs a declared range. `misfit` is
-    the rms of the fit's residuals in sds: amplitudes may be larger by this factor.
+    the rms of the fit's residuals in sds: amplitudes may be larger by this factor. Where the fit is `known` by what was
+    stored of it, nothing is simulated, every form counts as visible, and amplitudes of priors are arbitrary.
     """
 
     system: System
@@ -242,6 +258,7 @@ class ReferenceFit:
     z: FloatArray
     sd: float
     misfit: float = field(default=1.0, kw_only=True)
+    known: StoredFit | None = field(default=None, kw_only=True)
 
     @cached_property
     def rows_are_in_order(self) -> bool:
@@ -256,6 +273,8 @@ class ReferenceFit:
     @cached_property
     def predicted(self) -> FloatArray:
         """Readings that the fit predicts, (n_points,), without noise and effects."""
+        if self.known is not None:
+            return self.known.predicted
         predicted: FloatArray = self.system.chain(self.table, ()).predict(self.theta, self.table)[0]
         return predicted
 
@@ -263,8 +282,8 @@ class ReferenceFit:
     def states(self) -> dict[str, FloatArray]:
         """Each state at the rows, (n_points,), by name; none without a law."""
         system = self.system
-        if system.simulator.law is None:
-            return {}
+        if self.known is not None or system.simulator.law is None:
+            return {} if self.known is None else dict(self.known.states)
         columns = columns_without_reading(system.simulator, self.table)
         parameters = system.parameters(self.theta, self.table)
         found = integrate_states(system.simulator.law, system.steps(self.table), parameters, columns)
@@ -305,7 +324,7 @@ class ReferenceFit:
     def state_drives_rate(self, state: str, other: str) -> bool:
         """Return whether the rate of the state `other` depends on `state` at some row of the table."""
         law = self.system.simulator.law
-        if law is None:
+        if law is None or self.known is not None:  # it matters to priors only
             return False
         parameters = self.system.parameters(self.theta, self.table)
         columns = columns_without_reading(self.system.simulator, self.table)
@@ -331,7 +350,7 @@ class ReferenceFit:
     def can_fit_value_per_run(self) -> bool:
         """Whether there are several runs, with at least three rows each on average."""
         n_runs = len(self.table.scan_names)
-        return n_runs > 1 and len(self.table) >= _ROWS_OF_A_RUN * n_runs
+        return n_runs > 1 and (self.known is not None or len(self.table) >= _ROWS_OF_A_RUN * n_runs)
 
     @property
     def time_unit(self) -> str:
@@ -357,6 +376,8 @@ class ReferenceFit:
 
     def is_held_between_rows(self, column: str) -> bool:
         """Return whether the model holds a column until the next row, so that a value acts on later readings only."""
+        if self.known is not None:
+            return column in self.known.held
         if self.system.simulator.law is not None:
             return self.system.simulator.law.hold == "previous"
         rows = max(self.table.rows_by_scan(), key=len)
@@ -372,6 +393,8 @@ class ReferenceFit:
 
         The change is that of a trial form, which applies `act` with the parameters `settings` (n_settings, n_params).
         """
+        if self.known is not None:
+            return np.ones(len(settings))
         with np.errstate(over="ignore", invalid="ignore"):  # a setting may carry a law away: it is not finite
             return np.asarray(np.sqrt(np.mean(self.change_of_readings(stage, act, settings) ** 2, axis=1)) / self.sd)
 

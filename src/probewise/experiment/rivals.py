@@ -114,7 +114,7 @@ def rivals_of(
     for name, wide in ({**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD).items():
         plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
         extent = Extent(min(dark, bright), max(dark, bright), plan)
-        effect = cast(LightEffect, VOCABULARY[name]).for_extent(extent)
+        effect = VOCABULARY[name].for_extent(extent)
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
     extent = Extent(min(dark, bright), max(dark, bright), _plan_there_and_back(_SCAN_MM, height_mm))

@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import NestedResult, SliceMove, run
 from probewise.nested.check import check_and_repeat
+from probewise.nested.problem import Evaluator
 from probewise.nested.sampler import run_once
 
 
@@ -69,7 +70,7 @@ def misled(max_cost: float, seed: int = 5) -> tuple[NestedResult, NestedResult]:
     wrong = dataclasses.replace(sound, log_z=sound.log_z + 8 * sound.log_z_error)
     result = check_and_repeat(
         wrong,
-        known,
+        Evaluator(known),
         SliceMove(),
         run_once,
         max_cost=max_cost,

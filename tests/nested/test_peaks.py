@@ -14,7 +14,7 @@ from probewise.nested import NestedResult, SliceMove, refine
 from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import Clusters
 from probewise.nested.moves import HoppingMove
-from probewise.nested.peaks import MissedPeaks, climb_to_top, find_missed_peaks, gaussian_of_last_live_points
+from probewise.nested.peaks import climb_to_top, find_missed_peaks, peak_of_last_live_points
 from probewise.nested.problem import Bound, Evaluator, Samplable
 from probewise.nested.sampler import run_once
 
@@ -47,14 +47,17 @@ def robbed() -> NestedResult:
     return run_once(Two(veil=-50.0), rng=np.random.default_rng(1), n_live=100)
 
 
-def missing_from(run: NestedResult, problem: Samplable, max_calls: float) -> MissedPeaks:
-    return find_missed_peaks(run, problem, max_calls=max_calls, rng=np.random.default_rng(2))
+def missing_from(run: NestedResult, problem: Samplable) -> tuple[list[np.ndarray], int]:
+    """Samples about the peaks that a run has missed, and the evaluations that they cost."""
+    evaluate = Evaluator(problem)
+    found = find_missed_peaks(run, evaluate, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
+    return found, evaluate.n_calls
 
 
 def checked(run: NestedResult, problem: Samplable, max_cost: float) -> NestedResult:
     rng = np.random.default_rng(3)
     return check_and_repeat(
-        run, problem, SliceMove(), run_once, max_cost=max_cost, max_calls=None, least_live=20, rng=rng
+        run, Evaluator(problem), SliceMove(), run_once, max_cost=max_cost, max_calls=None, least_live=20, rng=rng
     )
 
 
@@ -64,12 +67,10 @@ def share_of_second(run: NestedResult) -> float:
 
 def test_a_mode_without_live_points_is_found_as_wide_as_it_is(robbed: NestedResult) -> None:
     assert share_of_second(robbed) < 1e-6
-    missing = missing_from(robbed, Two(), 10 * robbed.n_calls)
-    (theta,) = missing.lost
-    assert not missing.above
+    (theta,), n_calls = missing_from(robbed, Two())
     assert np.allclose(theta.mean(axis=0), 0.5, atol=0.01)
     assert np.allclose(theta.std(axis=0), 0.02, rtol=0.4)
-    assert missing.n_calls < robbed.n_calls / 3
+    assert n_calls < robbed.n_calls / 3
 
 
 def test_a_refinement_of_a_run_that_was_not_checked_looks_for_lost_modes_itself(robbed: NestedResult) -> None:
@@ -79,7 +80,7 @@ def test_a_refinement_of_a_run_that_was_not_checked_looks_for_lost_modes_itself(
     )
     assert found.log_z == without.log_z
     assert without.sound
-    assert "a part of the posterior that the live points have lost has a log Z of about" in found.warnings[-1]
+    assert any("that the live points have lost or never met has a log Z of about" in note for note in found.warnings)
     assert 0 < found.n_calls - without.n_calls < 2 * robbed.n_calls
 
 
@@ -98,7 +99,7 @@ def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed:
     assert result.log_z == robbed.log_z
     assert result.check is not None
     assert abs(result.check.log_z - Two().log_z) < 3.9 * result.check.log_z_error
-    (said,) = (note for note in result.warnings if "that the live points have lost has a log Z of about" in note)
+    (said,) = (note for note in result.warnings if "have lost or never met has a log Z of about" in note)
     weighed = float(said.split("about ")[1].split(",")[0])
     assert weighed == pytest.approx(result.check.log_z + math.log(SHARE), abs=0.5)
     assert result.n_calls <= 1.9 * robbed.n_calls
@@ -108,10 +109,9 @@ def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed:
 def test_where_nothing_was_missed_nothing_is_doubted_for_a_third_of_the_cost(name: str) -> None:
     known = problems.problem(name)
     run = run_once(known, rng=np.random.default_rng(4), n_live=100)
-    missing = missing_from(run, known, 10 * run.n_calls)
-    assert not missing.above
-    assert not missing.lost or not checked(run, known, 5.0).warnings  # the eggbox may lose half of one of its peaks
-    assert missing.n_calls < run.n_calls / 3
+    missing, n_calls = missing_from(run, known)
+    assert not missing or not checked(run, known, 5.0).warnings  # the eggbox may lose half of one of its peaks
+    assert n_calls < run.n_calls / 3
 
 
 @pytest.mark.slow
@@ -123,7 +123,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_doubts_the_run() -> None:
         run = run_once(known, rng=np.random.default_rng([seed, 20]), n_live=300)
         assert run.log_z < known.log_z - 3  # not met by the run
         result = checked(run, known, 2.0)
-        said = any("narrow peak" in note for note in result.warnings)
+        said = any("never met" in note for note in result.warnings)
         right.append(said and result.check is not None and abs(result.check.log_z - known.log_z) < 1.5)
     assert any(right)
 
@@ -157,7 +157,7 @@ def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
     known = problems.problem("Rosenbrock 2-D")
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     evaluate = Evaluator(known)
-    start = gaussian_of_last_live_points(run, evaluate)
+    start = peak_of_last_live_points(run, evaluate)
     top = climb_to_top(start, evaluate, max_calls=run.n_calls, rng=np.random.default_rng(2))
     best = known.log_likelihood(np.ones((1, 2)))[0]
     assert best - 0.01 < top.height <= best + 1e-9
@@ -165,16 +165,17 @@ def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_that_ended_on_an_arm_is_repeated_and_right(on_an_arm: NestedResult) -> None:
+def test_a_run_that_ended_on_an_arm_is_doubted_or_right(on_an_arm: NestedResult) -> None:
     problem = Cross(-math.inf)
-    missing = find_missed_peaks(on_an_arm, problem, max_calls=on_an_arm.n_calls, rng=np.random.default_rng(3))
-    (theta,) = missing.lost
-    assert np.abs(theta.mean(axis=0)).max() < 0.01  # at the cross' middle, where most of the evidence is
+    found, _ = missing_from(on_an_arm, problem)
+    # At the cross' middle, where most of the evidence is.
+    assert any(np.abs(theta.mean(axis=0)).max() < 0.01 for theta in found)
     result = checked(on_an_arm, problem, 5.0)
     assert on_an_arm.log_z < problem.known.log_z - 10
-    assert abs(result.log_z - problem.known.log_z) < 3.9 * result.log_z_error
-    assert result.log_z_error < 2
-    assert result.n_calls <= 5 * on_an_arm.n_calls
+    assert result.check is not None
+    assert abs(result.check.log_z - problem.known.log_z) < 3.9 * result.check.log_z_error
+    right = abs(result.log_z - problem.known.log_z) < 3.9 * result.log_z_error < 7.8
+    assert right or any("lost or never met" in note or "errors apart" in note for note in result.warnings)
 
 
 def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another() -> None:

@@ -6,16 +6,15 @@ twice as long and compresses by few nats: it runs from a prior near the posterio
 Where the posterior fills so much of the prior that this saves nothing, it is a small run of the same problem.
 
 Parts of the posterior without live points escape both. So `probewise.nested.peaks` looks for missed peaks first, and
-the prior of the second estimate gets a part about each: its posterior tells which of them matter. Where one that the
-live points have lost does, the run is repeated with moves that hop between all parts.
+the prior of the second estimate gets a part about each: its posterior tells which of them matter. The repetition hops
+between all parts.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,26 +22,24 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError, message_of
 from probewise.nested.clusters import Clusters, find_clusters
-from probewise.nested.evidence import warning_of_few_lineages, warning_of_few_possible_draws
+from probewise.nested.evidence import MOST_MEMORY, warning_of_few_lineages, warning_of_few_possible_draws
 from probewise.nested.moves import HoppingMove, Move, SliceMove
-from probewise.nested.peaks import MissedPeaks, find_missed_peaks
-from probewise.nested.problem import Samplable, space_of
+from probewise.nested.peaks import find_missed_peaks
+from probewise.nested.problem import Evaluator, Samplable
 from probewise.nested.repartition import repartitioned
-from probewise.nested.result import Check, NestedResult, Samples
+from probewise.nested.result import Check, NestedResult
 
 DISAGREE = 2.5
 """Difference of two estimates of log Z, in combined standard errors, above which they disagree."""
 
-_APART = 2.0  # errors, above which the second estimate is repeated with more live points
 _N_SAMPLES = 2000
 _GAIN = 0.8  # share of the first run's nats, below which the second estimate is one from near the posterior
-_AGAIN = 2.2  # times the first run's evaluations: what it costs to repeat it with chains twice as long
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
 _SAMPLES_IN_CLUSTER = 20  # per parameter: with fewer, repeated samples look like a cluster
-_MET = 0.5  # of the share of a part: with more, a run has met it
-_MATTERS = 0.25  # errors by which a lost part raises log Z, above which the run is repeated
-_MISSING = 1.0  # the same, above which it is a doubt
+_MET = 0.5  # of the share of a peak: with more, a run has met it
+_AGAIN = 2.2  # times the first run's evaluations: what it costs to repeat it with chains twice as long
+_MISSING = 1.0  # errors by which a missed peak raises log Z, above which it is a doubt
 
 Search = Callable[..., NestedResult]
 """Function that runs nested sampling once, without a check, as `run_once` does."""
@@ -76,86 +73,63 @@ class _Budget:
 
 @dataclass(frozen=True, eq=False)
 class _SecondEstimate:
-    """A second estimate of the evidence: one or two runs of `problem`, with `n_live` points in the first of them."""
+    """A `run` by the method `name`, whose posterior says how much each missed peak holds.
 
-    problem: Samplable
-    n_live: int
+    `parts`: `n_met` clusters of the first run's samples and then the missed peaks, in the coordinates into which
+    `enter` maps parameters; None if no peak was missed.
+    """
+
     name: str
-    runs: tuple[NestedResult, ...] = ()
-
-    @property
-    def log_z_and_error(self) -> tuple[float, float]:
-        return weighted_mean_and_error([a.log_z for a in self.runs], [a.log_z_error for a in self.runs])
+    run: NestedResult
+    parts: Clusters | None
+    n_met: int
+    enter: Callable[[FloatArray], FloatArray]
 
     def distance(self, run: NestedResult) -> float:
         """Return a run's log Z minus this estimate's, in combined standard errors."""
-        log_z, error = self.log_z_and_error
-        return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
+        return (run.log_z - self.run.log_z) / max(math.hypot(_error_to_trust(run), self.run.log_z_error), 1e-12)
 
-    def disagrees_or_is_doubtful(self, run: NestedResult, most: float) -> bool:
-        return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
+    def doubts(self, run: NestedResult) -> list[str]:
+        """Return doubts about a run in words: missed peaks, and evidences that disagree or do not tell."""
+        return [*self.missing_part_in_words(run), *self.disagreement_in_words(run)]
 
-
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """The parts of a posterior as clusters in the sampling coordinates: those of a run's samples, then missed peaks.
-
-    `second` is a run from near all of them, whose posterior says how much each holds.
-    """
-
-    modes: Clusters
-    enter: Callable[[FloatArray], FloatArray]
-    n_met: int
-    n_lost: int
-    second: NestedResult
-
-    @classmethod
-    def of(cls, theta: FloatArray, problem: Samplable, peaks: MissedPeaks, second: NestedResult) -> _Parts:
-        """Return the parts, from posterior samples of a run, (n, n_params), and the peaks that it has missed."""
-        enter = space_of(problem.prior, getattr(problem, "periodic", ())).enter
-        u, least = enter(theta), _SAMPLES_IN_CLUSTER * theta.shape[1]
-        clusters = find_clusters(u, least=least)
-        home = clusters.assign(u)
-        met = [u[home == k] for k in range(len(clusters))]
-        if min(map(len, met)) < least:  # the last division of space may leave a cluster with fewer
-            met = [u]
-        modes = Clusters.from_groups([*met, *map(enter, (*peaks.lost, *peaks.above))])
-        return cls(modes, enter, len(met), len(peaks.lost), second)
-
-    def missing_shares(self, run: Samples) -> tuple[float, float]:
-        """Return the shares of the posterior in lost and in higher peaks of which a run has less than half."""
-        has, wanted = (
-            np.bincount(self.modes.assign(self.enter(each.theta)), each.weight, len(self.modes))[self.n_met :]
-            for each in (run, self.second)
-        )
-        missing = np.where(has < _MET * wanted, wanted, 0.0)
-        return float(missing[: self.n_lost].sum()), float(missing[self.n_lost :].sum())
-
-    def doubts(self, run: Samples) -> tuple[str, ...]:
-        """Return doubts in words, at most one a kind of part, about what a run lacks."""
-        lost, above = self.missing_shares(run)
-        mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
-        if _rise_in_errors(run, lost) > _MISSING:
-            notes.append(
-                "a part of the posterior that the live points have lost has a log Z of about "
-                f"{self.second.log_z + math.log(lost):.2f}, {mine}; use more n_live or a greater max_cost"
+    def missing_part_in_words(self, run: NestedResult) -> list[str]:
+        """Describe the missed peaks that matter and of which a run has less than half; empty without any."""
+        share = 0.0
+        if self.parts is not None:
+            has, wanted = (
+                np.bincount(self.parts.assign(self.enter(each.theta)), each.weight, len(self.parts))[self.n_met :]
+                for each in (run, self.run)
             )
-        if _rise_in_errors(run, above) > DISAGREE:
-            notes.append(
-                "a narrow peak that no live point met lies above the run's end: its log Z is about "
-                f"{self.second.log_z + math.log(above):.1f}, {mine}; use more n_live or a prior about the peak"
-            )
-        return tuple(notes)
+            share = float(wanted[has < _MET * wanted].sum())
+        if -math.log1p(-min(share, 1 - 1e-15)) <= _MISSING * _error_to_trust(run):
+            return []
+        return [
+            "a part of the posterior that the live points have lost or never met has a log Z of about "
+            f"{self.run.log_z + math.log(share):.2f}, this run's is {run.log_z:.2f} ± {run.log_z_error:.2f}; use more "
+            "n_live, or a prior about it"
+        ]
+
+    def disagreement_in_words(self, run: NestedResult) -> list[str]:
+        """Describe that the evidences disagree, or that this one is itself doubtful; empty if neither."""
+        if abs(self.distance(run)) > DISAGREE:
+            return [
+                f"{self.name} gives log Z = {self.run.log_z:.2f} ± {self.run.log_z_error:.2f}, this run "
+                f"{run.log_z:.2f} ± {run.log_z_error:.2f}: {abs(self.distance(run)):.1f} errors apart; chains are too "
+                "short or a part of the posterior was lost; use a greater steps_per_param, more n_live, or a greater "
+                "max_cost"
+            ]
+        return [f"{self.name}, which checks the evidence, is itself doubtful: {w}" for w in self.run.warnings[:1]]
 
 
-def _rise_in_errors(run: Samples, share: float) -> float:
-    """Return by how many of its errors a run's log Z would rise with a share of the posterior that it lacks."""
-    return -math.log1p(-min(share, 1 - 1e-15)) / max(run.log_z_error, 1e-12)
+def _error_to_trust(run: NestedResult) -> float:
+    """Return a run's error, but no more than few lineages can tell: a greater one would excuse any disagreement."""
+    return run.log_z_error * math.sqrt(min(MOST_MEMORY / run.memory, 1.0))
 
 
 def check_and_repeat(
     first: NestedResult,
-    problem: Samplable,
+    evaluate: Evaluator,
     move: Move,
     search: Search,
     *,
@@ -163,120 +137,92 @@ def check_and_repeat(
     max_calls: int | None,
     least_live: int,
     rng: np.random.Generator,
-    executor: Executor | None = None,
-    n_workers: int | None = None,
+    repeat: bool = True,
 ) -> NestedResult:
-    """Check a run that its stopping rule ended; repeat it with longer chains where the second estimate disagrees.
+    """Check a run that its stopping rule ended; `repeat` it with longer chains where there are doubts.
 
     Limits on all evaluations, those of `first` included: `max_cost` times those of `first`, and `max_calls`, if not
-    None. `least_live`: fewest live points allowed for the problem. `executor` and `n_workers` are for the search of
-    missed peaks; `search` brings its own.
+    None. `least_live`: fewest live points allowed for the problem. `evaluate`: of the problem, for the search of missed
+    peaks; `search` brings its own.
 
-    Return the first run, or a repetition: with hops between modes where `first` lost one, or with longer chains if only
-    that agrees with the second estimate. `check` holds the second estimate; None if it failed or did not end, which
-    adds a warning. A warning is also added if the two still disagree. `n_calls` counts all evaluations.
+    Return the first run, or a repetition if only that has no doubts. `check` holds the second estimate; None if it
+    failed or did not end, which adds a warning. `n_calls` counts all evaluations.
     """
-    limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
-    budget = _Budget(search, limit, first.n_calls, rng)
-    now, longer = first, _with_longer_chains(move)
-    notes: tuple[str, ...]
+    limit = min(max_cost * first.n_calls, math.inf if max_calls is None else max_calls)
+    budget, now, check = _Budget(search, limit, first.n_calls, rng), first, None
     try:
-        peaks = find_missed_peaks(
-            first, problem, max_calls=budget.left, rng=rng, executor=executor, n_workers=n_workers
-        )
-        budget.spent += peaks.n_calls
-        theta = first.samples(_N_SAMPLES, rng=rng)
-        plan = _plan_second_estimate(first, theta, problem, peaks, least_live)
-        found = budget.run(plan.problem, plan.n_live, longer)
-        if found is None:
+        chain = _with_longer_chains(move)
+        second = _second_estimate(first, evaluate, budget, chain, least_live)
+        if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
-            doubt = (
-                f"{plan.name}, which checks the evidence, did not end within max_cost and max_calls "
+            notes = [
+                "a second estimate, which checks the evidence, did not end within max_cost and max_calls "
                 f"({int(limit)} evaluations in all); use a greater limit, or max_cost=1 for no check"
-            )
-            return replace(first, n_calls=budget.spent, warnings=(*first.warnings, doubt))
-        second, modes, above = replace(plan, runs=(found,)), None, 0.0
-        parts = _Parts.of(theta, problem, peaks, found) if peaks.lost or peaks.above else None
-        if parts is not None:
-            lost, above = parts.missing_shares(first)
-            if _rise_in_errors(first, lost) > _MATTERS:
-                modes = parts.modes
-                chain = move if isinstance(move, SliceMove) else SliceMove()
-                now = budget.run(problem, first.n_live, chain, modes) or first
-        # Neither chains nor hops lead to a peak above the end.
-        if _rise_in_errors(now, above) <= DISAGREE:
-            if second.disagrees_or_is_doubtful(now, _APART):
-                second = _with_more_live_points(second, now, first, longer, budget)
-            if second.disagrees_or_is_doubtful(now, DISAGREE):
-                again = budget.run(problem, first.n_live, longer, modes)
-                if again is not None and not again.warnings and not second.disagrees_or_is_doubtful(again, DISAGREE):
-                    now = again
-        notes = () if parts is None else parts.doubts(now)
-        now = _with_check_stored(now, second, sum(r.n_calls for r in second.runs) + peaks.n_calls)
+            ]
+        else:
+            n_check, notes = budget.spent - first.n_calls, second.doubts(first)
+            if notes and repeat and not second.run.warnings:
+                again = budget.run(evaluate.problem, first.n_live, chain, second.parts)
+                if again is not None and not again.warnings and not second.doubts(again):
+                    now, notes = again, []
+            log_z, error = second.run.log_z, second.run.log_z_error
+            check = Check(second.name, log_z, error, second.distance(now), n_check)
+            if not notes:
+                # A poorly known share of possible hypotheses, or error, no longer matters once both agree.
+                settled = [warning_of_few_possible_draws(now.log_start, now.log_start_error, now.n_live)]
+                settled += [warning_of_few_lineages(now.memory)] if error < now.log_z_error else []
+                now = replace(now, warnings=tuple(note for note in now.warnings if note not in settled))
     except Exception as error:
         # A second estimate may evaluate hypotheses that the first run never met. Whatever a check meets, a posterior
         # narrower than floats among it, the run that ended is kept.
         why = str(error) if isinstance(error, NotConvergedError) else message_of(error)
-        notes = (f"the second pass, which checks the evidence, failed: {why}",)
-    return replace(now, n_calls=budget.spent, warnings=(*now.warnings, *notes))
+        notes = [f"a second estimate, which checks the evidence, failed: {why}"]
+    return replace(now, n_calls=budget.spent, check=check, warnings=(*now.warnings, *notes))
 
 
-def doubts_of_missed_parts(
-    run: NestedResult, judged: Samples, problem: Samplable, search: Search, *, rng: np.random.Generator
-) -> tuple[tuple[str, ...], int]:
-    """Look for parts of the posterior that a run has missed; weigh any by a second estimate with a part about each.
+def _second_estimate(
+    first: NestedResult, evaluate: Evaluator, budget: _Budget, chain: SliceMove, least_live: int
+) -> _SecondEstimate | None:
+    """Run from near the posterior and the missed peaks, or a small run; None if it did not end.
 
-    Return doubts about `judged`, such as a refinement of the run, in words; and the number of evaluations, at most
-    twice those of the run.
+    Where the two estimates disagree it is repeated with more live points.
     """
-    peaks = find_missed_peaks(run, problem, max_calls=run.n_calls, rng=rng)
-    budget = _Budget(search, 2 * run.n_calls, peaks.n_calls, rng)
-    if not (peaks.lost or peaks.above):
-        return (), budget.spent
-    theta = run.samples(_N_SAMPLES, rng=rng)
-    plan = _plan_second_estimate(run, theta, problem, peaks, least_live=run.n_live)
-    found = budget.run(plan.problem, plan.n_live, _with_longer_chains(SliceMove()))
-    if found is None:
-        return (f"{plan.name}, which weighs a peak that the run may have missed, did not end",), budget.spent
-    return _Parts.of(theta, problem, peaks, found).doubts(judged), budget.spent
-
-
-def _plan_second_estimate(
-    first: NestedResult, theta: FloatArray, problem: Samplable, peaks: MissedPeaks, least_live: int
-) -> _SecondEstimate:
-    """Plan a second estimate from near the posterior samples `theta` and the missed peaks, or by a small run."""
+    problem, enter, n_before = evaluate.problem, evaluate.space.enter, evaluate.n_calls
+    invertible = hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")
+    peaks = find_missed_peaks(first, evaluate, max_calls=budget.left, rng=budget.rng) if invertible else []
+    budget.spent += evaluate.n_calls - n_before
+    theta = first.samples(_N_SAMPLES, rng=budget.rng)
     least = max(least_live, min(_LEAST_LIVE, first.n_live))
-    near = None
+    name, posed, n_live = "a second run with longer chains", problem, max(first.n_live // 8, least)
     if first.information > 0 and hasattr(problem.prior, "log_prob"):
         with contextlib.suppress(ParameterError, np.linalg.LinAlgError):  # too few samples, or they hardly vary
-            near = repartitioned(problem, theta, peaks=(*peaks.lost, *peaks.above))
-    if near is not None and near.prior.has_invertible_axes:
-        possible = first.log_weight > -math.inf
-        gained = first.log_likelihood[possible] + near.prior.log_prior_ratio(first.theta[possible])
-        # With a log Z that is far too large the nats come out too few, or negative.
-        nats = float(first.weight[possible] @ gained) - first.log_z
-        if peaks.lost or peaks.above or nats < _GAIN * first.information:
-            wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
-            enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
-            n_live = int(max(min(wanted, enough, first.n_live / 2), least))
-            return _SecondEstimate(near, n_live, "a second pass from near the posterior")
-    return _SecondEstimate(problem, max(first.n_live // 8, least), "a second run with longer chains")
-
-
-def _with_more_live_points(
-    second: _SecondEstimate, now: NestedResult, first: NestedResult, chain: SliceMove, budget: _Budget
-) -> _SecondEstimate:
-    """Repeat a second estimate with more live points, as many as `now` has or the budget allows; combine the two runs.
-
-    The new run replaces a first one with warnings.
-    """
-    again_costs = _AGAIN * first.n_calls
-    room = budget.left - again_costs if budget.left > again_costs else budget.left
-    n_live = int(min(max(second.n_live, now.n_live), room / second.runs[0].n_calls * second.n_live))
-    found = budget.run(second.problem, n_live, chain) if n_live > second.n_live else None
+            near = repartitioned(problem, theta, peaks=peaks)
+            possible = first.log_weight > -math.inf
+            gained = first.log_likelihood[possible] + near.prior.log_prior_ratio(first.theta[possible])
+            # With a log Z that is far too large the nats come out too few, or negative.
+            nats = float(first.weight[possible] @ gained) - first.log_z
+            if near.prior.has_invertible_axes and (peaks or nats < _GAIN * first.information):
+                wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
+                enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
+                name, posed = "a second pass from near the posterior", near
+                n_live = int(max(min(wanted, enough, first.n_live / 2), least))
+    found = budget.run(posed, n_live, chain)
     if found is None:
-        return second
-    return replace(second, runs=(found,) if second.runs[0].warnings else (*second.runs, found))
+        return None
+    met, parts = [enter(theta)], None
+    if peaks:
+        fewest = _SAMPLES_IN_CLUSTER * theta.shape[1]
+        clusters = find_clusters(met[0], least=fewest)
+        home = clusters.assign(met[0])
+        if np.bincount(home, minlength=len(clusters)).min() >= fewest:  # the last division of space may leave fewer
+            met = [met[0][home == k] for k in range(len(clusters))]
+        parts = Clusters.from_groups([*met, *map(enter, peaks)])
+    second, again = _SecondEstimate(name, found, parts, len(met), enter), _AGAIN * first.n_calls
+    room = budget.left - again if budget.left > again else budget.left
+    n_more = int(min(first.n_live, n_live * room / found.n_calls))
+    if second.disagreement_in_words(first) and not second.missing_part_in_words(first) and n_more > n_live:
+        second = replace(second, run=budget.run(posed, n_more, chain) or found)
+    return second
 
 
 def _with_longer_chains(move: Move) -> SliceMove:
@@ -288,35 +234,3 @@ def _with_longer_chains(move: Move) -> SliceMove:
         steps_per_param=2.0 * max(chain.steps_per_param, least.steps_per_param),
         fewest_steps=2 * max(chain.fewest_steps, least.fewest_steps),
     )
-
-
-def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
-    """Return the inverse-variance weighted mean of independent estimates of log Z, and its error."""
-    # A constant likelihood has an exact evidence: the error is nought, or a last digit.
-    weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
-    return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
-
-
-def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
-    """Store the check in the result, with a warning where the estimates disagree or the second one has warnings.
-
-    If they agree, drop the warnings on few possible draws and on few lineages that the check has settled.
-    """
-    (log_z, error), distance, name = second.log_z_and_error, second.distance(now), second.name
-    warnings = now.warnings
-    if abs(distance) > DISAGREE:
-        warnings = (
-            *warnings,
-            f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, this run {now.log_z:.2f} ± {now.log_z_error:.2f}: "
-            f"{abs(distance):.1f} errors apart; chains are too short or a part of the posterior was lost; "
-            "use a greater steps_per_param, more n_live, or a greater max_cost",
-        )
-    elif second.runs[-1].warnings:
-        warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {second.runs[-1].warnings[0]}")
-    else:
-        # A poorly known share of possible hypotheses, or error, no longer matters once a second estimate agrees.
-        settled = [warning_of_few_possible_draws(now.log_start, now.log_start_error, now.n_live)]
-        if error < now.log_z_error:
-            settled.append(warning_of_few_lineages(now.memory))
-        warnings = tuple(note for note in warnings if note not in settled)
-    return replace(now, check=Check(name, log_z, error, distance, n_check), warnings=warnings)

@@ -26,7 +26,7 @@ DOUBTFUL_P_VALUE = 1e-4
 _N_SIMULATIONS = 200
 _SIMULATED_AT_A_TIME = 100_000
 _MOST_WINDOWS, _LEAST_LAG = 32, 4  # of lineages
-_MOST_MEMORY = 10.0  # lineage variance above which a run descends from too few lineages to estimate its error
+MOST_MEMORY = 10.0  # lineage variance above which a run descends from too few lineages to estimate its error
 _FAR = 4.0  # posterior sds: what lies farther has next to no weight
 _FEWEST_STEPS = 30.0  # between floating-point numbers, from quartile to quartile
 
@@ -281,7 +281,7 @@ def warning_of_coarse_coordinates(names: Sequence[str], u: FloatArray, weight: F
 
 def warning_of_few_lineages(memory: float) -> str | None:
     """Return a warning if the lineage variance exceeds 10, so that the error from it is uncertain; else None."""
-    if memory <= _MOST_MEMORY:
+    if memory <= MOST_MEMORY:
         return None
     return (
         f"memory is {memory:.0f}: so few lineages lead to the posterior that the error is itself uncertain; "

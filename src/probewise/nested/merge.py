@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._kinds import require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested.check import DISAGREE, weighted_mean_and_error
+from probewise.nested.check import DISAGREE
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate, n_independent
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
 
@@ -141,6 +141,13 @@ def n_alive_at_death(
     """
     birth, death = birth_rows(log_likelihood, label, log_birth, birth_label), np.arange(len(label))
     return np.asarray(np.searchsorted(np.sort(birth), death) - death)
+
+
+def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
+    """Return the inverse-variance weighted mean of independent estimates of log Z, and its error."""
+    # A constant likelihood has an exact evidence: the error is nought, or a last digit.
+    weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
+    return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _averaged_check(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError
-from probewise.nested.check import doubts_of_missed_parts
+from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     MOST_LOST,
@@ -23,9 +23,10 @@ from probewise.nested.importance import (
     fit_wide_and_narrow_proposals,
     mixture_of_proposals,
 )
+from probewise.nested.moves import SliceMove
 from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult
-from probewise.nested.sampler import run_once
+from probewise.nested.sampler import least_live, run_once
 from probewise.nested.weights import n_effective, resampled_rows
 
 _MOST_FITTED = 2000
@@ -71,8 +72,8 @@ def refine(
     n_draws
         Number of final draws, 100 or more; each of two pilot rounds takes a quarter of that, at least 100, in addition.
     look
-        Whether to look for parts of the posterior that the run has missed, if the run has no check (it was made with
-        `max_cost=1`): for at most about a quarter of the run's evaluations. A part that matters is a warning.
+        Whether to check the run, if it has no check (it was made with `max_cost=1`), for at most as many evaluations
+        again. Parts of the posterior that it has missed are among the warnings.
 
     Raises
     ------
@@ -104,12 +105,20 @@ def refine(
             known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
     found = draw_and_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng)
     found = with_error_of_lost_parts(found, n_lineages, space, rng)
-    warnings = _inherited_warnings(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
-        # A generator of its own: the refined evidence is the same with and without the look.
-        missed, n_calls = doubts_of_missed_parts(result, found, problem, run_once, rng=rng.spawn(1)[0])
-        found, warnings = replace(found, n_calls=found.n_calls + n_calls), (*warnings, *missed)
-    return replace(found, warnings=(*found.warnings, *warnings))
+        checked = check_and_repeat(
+            result,
+            Evaluator(problem),
+            SliceMove(),
+            run_once,
+            max_cost=2.0,
+            max_calls=None,
+            least_live=least_live(len(result.names)),
+            rng=rng.spawn(1)[0],  # of its own: the refined evidence is the same with and without the look
+            repeat=False,
+        )
+        found, result = replace(found, n_calls=found.n_calls + checked.n_calls - result.n_calls), checked
+    return replace(found, warnings=(*found.warnings, *_inherited_warnings(found, result)))
 
 
 @own_arithmetic

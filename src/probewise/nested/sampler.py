@@ -245,15 +245,13 @@ def run(
         try:
             result = check_and_repeat(
                 result,
-                posed,
+                Evaluator(posed, executor=executor, n_parts=n_workers),
                 moving,
                 partial(once, return_interrupted=False),
                 max_cost=max_cost,
                 max_calls=max_calls,
                 least_live=least_live(len(result.names)),
                 rng=checking,
-                executor=executor,
-                n_workers=n_workers,
             )
         except KeyboardInterrupt:
             if not return_interrupted:

@@ -222,7 +222,6 @@ class HeldOutSamples:
 
 def draw_and_weigh(
     proposal: Proposal,
-    prior_share: float,
     held: HeldOutSamples | None,
     space: Space,
     evaluate: Evaluator,
@@ -230,28 +229,17 @@ def draw_and_weigh(
     n_draws: int,
     rng: np.random.Generator,
 ) -> Weighted:
-    """Draw from a mixture of a proposal and the prior, evaluate, and weight the draws.
+    """Make `n_draws` from a proposal, evaluate, and weight them.
 
-    `prior_share`: share of the `n_draws` from the prior. `held`: posterior samples that correct the evidence by bridge
-    sampling, or None. If no draw is possible, log Z is -inf.
+    `held`: posterior samples that correct the evidence by bridge sampling, or None. If no draw is possible, log Z is
+    -inf.
     """
-    # At least one draw is the proposal's: a share below 1, such as 0.9999 of 2000, may round to all of them.
-    n_prior = min(round(prior_share * n_draws), n_draws - 1)
-
-    def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:
-        """Return the log density of the mixture from which the draws come; `log_density` is the prior's."""
-        log_fitted = proposal.log_density(x)
-        if not n_prior:
-            return log_fitted
-        share = n_prior / n_draws
-        return np.asarray(np.logaddexp(log_fitted + math.log1p(-share), log_density + math.log(share)))
-
-    x = np.concatenate([proposal.draw(n_draws - n_prior, rng=rng), space.draw(n_prior, rng=rng)])
+    x = proposal.draw(n_draws, rng=rng)
     theta, log_density = space.leave(x)
     possible = np.flatnonzero(np.isfinite(log_density))
     theta, log_density = theta[possible], log_density[possible]
     log_likelihood = evaluate.log_likelihood(theta) if possible.size else np.empty(0)
-    log_ratio = log_density + log_likelihood - log_proposal(x[possible], log_density)
+    log_ratio = log_density + log_likelihood - proposal.log_density(x[possible])
     alive = np.isfinite(log_ratio)
     if not alive.any():
         nothing = np.empty(0)
@@ -262,7 +250,7 @@ def draw_and_weigh(
     k = pareto_k(log_ratio)
     held_ratio, n_held = np.empty(0), 0.0
     if held is not None and len(held.x):
-        held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
+        held_ratio = held.log_density + held.log_likelihood - proposal.log_density(held.x)
         n_held = held.n_independent
     log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, n_held)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).

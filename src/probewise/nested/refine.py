@@ -36,7 +36,6 @@ _MOST_HELD = 1000
 _N_UPDATED = 1000  # samples of the old posterior whose likelihood is evaluated anew
 _APART = 4.0  # errors between the log Z of draws and of the refined run, above which they disagree
 _N_PILOTS = 2
-_PRIOR_SHARE = 0.1  # of an update's draws: they cover regions without samples of the old posterior, and bound weights
 _FIRST = 0.75  # share of the better form of density in the mixture
 
 Posterior: TypeAlias = NestedResult | Weighted
@@ -93,9 +92,7 @@ def refine(
     known = [fitted]
     for _ in range(_N_PILOTS):
         proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
-        pilots = [
-            draw_and_weigh(p, 0.0, None, space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals
-        ]
+        pilots = [draw_and_weigh(p, None, space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         better = pilots[first]
         # The other form keeps a share: it may cover what the better one does not.
@@ -103,7 +100,7 @@ def refine(
         best = mixture_of_proposals(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
             known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
-    found = draw_and_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng)
+    found = draw_and_weigh(best, held, space, evaluate, n_draws=n_draws, rng=rng)
     found = with_error_of_lost_parts(found, n_lineages, space, rng)
     if look and isinstance(result, NestedResult) and result.check is None:
         checked = check_and_repeat(
@@ -132,10 +129,10 @@ def update(
 ) -> Weighted:
     """Update a posterior with new readings by importance sampling.
 
-    The previous samples are reweighted by the new readings' likelihood, and a proposal is fitted to the samples. Draws
-    from a mixture of the proposal and the prior are weighted against the whole new problem, so the evidence is absolute
-    and errors do not accumulate from reading to reading. Where the new readings are surprising (too few effective
-    samples or too heavy a tail of the weights), `fall_back` starts from scratch.
+    The previous samples are reweighted by the new readings' likelihood, and refined as those of a run are. The draws
+    are weighted against the whole new problem, so the evidence is absolute and errors do not accumulate from reading to
+    reading. Where the new readings are surprising (too few effective samples or too heavy a tail of the weights),
+    `fall_back` starts from scratch.
 
     Parameters
     ----------
@@ -147,7 +144,7 @@ def update(
         Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`; then its samples are
         returned, and its result as `run`.
     n_draws
-        Number of draws; the cost is this many evaluations plus one per old sample, at most 1000.
+        Number of draws, 100 or more; half as many are pilots, and each old sample, at most 1000, is evaluated once.
 
     Raises
     ------
@@ -161,22 +158,23 @@ def update(
     require_callable(
         "fall_back", fall_back, "a function that solves the problem, such as lambda: run(problem, rng=rng)"
     )
-    n_draws = checked_whole("n_draws", n_draws)
-    evaluate, space = _evaluator_and_space(problem, previous, "previous")
+    n_draws = checked_whole("n_draws", n_draws, least=100)
+    evaluate, _ = _evaluator_and_space(problem, previous, "previous")
     rows = np.unique(previous.draw_rows(_N_UPDATED, rng=rng))
-    theta = previous.theta[rows]
-    log_weight = previous.log_weight[rows] + evaluate.log_likelihood(theta) - previous.log_likelihood[rows]
+    theta, before = previous.theta[rows], previous.log_weight[rows]
+    log_likelihood = evaluate.log_likelihood(theta)
     # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
-    log_weight = log_weight + np.maximum(-math.log(_N_UPDATED) - previous.log_weight[rows], 0.0)
+    log_weight = np.maximum(before, -math.log(_N_UPDATED)) + log_likelihood - previous.log_likelihood[rows]
     n_eff, k = n_effective(log_weight), math.inf
     # Without parameters there is no density to fit: the fallback evaluates the only hypothesis.
     if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
-        fitted = _resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng)
-        proposal = fit_wide_and_narrow_proposals(fitted, rng=rng)[-1]
-        found = draw_and_weigh(proposal, _PRIOR_SHARE, None, space, evaluate, n_draws=n_draws, rng=rng)
-        found = with_error_of_lost_parts(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
+        total = float(logsumexp(log_weight))
+        now = previous.log_z + total, math.hypot(previous.log_z_error, n_eff**-0.5)
+        n_own = effective_lineages(previous) * n_eff / len(rows)
+        old = Weighted(evaluate.names, theta, log_likelihood, log_weight - total, *now, n_own, 0, pareto_k=-math.inf)
+        found = refine(old, problem, rng=rng, n_draws=n_draws, look=False)
         if found.sound:
-            return found
+            return replace(found, n_calls=found.n_calls + evaluate.n_calls)
         k = found.pareto_k
     fallen = fall_back()
     samples = fallen.names, fallen.theta, fallen.log_likelihood, fallen.log_weight

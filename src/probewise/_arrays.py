@@ -9,7 +9,7 @@ from typing import Any, ParamSpec, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
@@ -48,8 +48,7 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
     try:
         array = np.asarray(values)
         texts = array.dtype == np.object_ and any(isinstance(v, str | bytes) for v in array.ravel())
-        if texts or array.dtype.kind not in "biufO":
-            raise ParameterError(name, values, allowed)
+        require(not texts and array.dtype.kind in "biufO", name, values, allowed)
         return array.astype(np.float64)
     except ParameterError:
         raise

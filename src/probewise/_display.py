@@ -51,7 +51,8 @@ class ShowsItself:
             said = str(self)
         except Exception:  # what is half made is shown in tracebacks and debuggers too
             return f"<{type(self).__name__}>"
-        return said if said.startswith("<") else f"<{type(self).__name__}: {_first_line(said)}>"
+        first_line = " ".join(said.partition("\n")[0].split())
+        return said if said.startswith("<") else f"<{type(self).__name__}: {first_line}>"
 
     def _repr_html_(self) -> str:
         importlib.import_module("probewise.report.notebook")
@@ -62,7 +63,3 @@ class ShowsItself:
 
     def _repr_pretty_(self, printer: Printer, cycle: bool) -> None:
         printer.text(str(self))
-
-
-def _first_line(text: str) -> str:
-    return " ".join(text.partition("\n")[0].split())

@@ -15,7 +15,7 @@ from typing import TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise.errors import ParameterError, UnitWarning, did_you_mean
+from probewise.errors import ParameterError, UnitWarning, did_you_mean, require
 
 _FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST = 10_000_000  # of anything that is counted: more fill the memory
@@ -43,8 +43,7 @@ def checked_number(name: str, value: object, allowed: str = "a number") -> float
 def checked_finite_number(name: str, value: object, allowed: str = "a finite number") -> float:
     """Return a finite real number as a float, or raise ParameterError."""
     number = checked_number(name, value, allowed)
-    if not math.isfinite(number):
-        raise ParameterError(name, value, allowed)
+    require(math.isfinite(number), name, value, allowed)
     return number
 
 
@@ -127,19 +126,12 @@ def require_like(name: str, value: object, attributes: Sequence[str], allowed: s
     if isinstance(value, type):
         raise ParameterError(name, value, f"{allowed}; this is the class, a value of it is {value.__name__}(...)")
     for attribute in attributes:
-        if not hasattr(value, attribute):
-            raise ParameterError(name, value, allowed)
+        require(hasattr(value, attribute), name, value, allowed)
 
 
 def require_callable(name: str, value: object, allowed: str) -> None:
     """Raise ParameterError unless `value` can be called."""
-    if not callable(value):
-        raise ParameterError(name, value, allowed)
-
-
-def require_accepts_named(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
-    """Raise ParameterError unless `value` can be called with keyword arguments of these names."""
-    _require_accepts_call(name, value, f"{allowed} {name}({', '.join(arguments)})", (), dict.fromkeys(arguments))
+    require(callable(value), name, value, allowed)
 
 
 def require_accepts_positional(name: str, value: object, n_arguments: int, allowed: str) -> None:
@@ -162,7 +154,8 @@ def _require_accepts_call(
 
 def require_progress(value: object, allowed: str = "a function") -> None:
     """Raise ParameterError unless `value` can be called as a `Progress`: stage, done, total, note."""
-    require_accepts_named("progress", value, ("stage", "done", "total", "note"), allowed)
+    names = dict.fromkeys(("stage", "done", "total", "note"))
+    _require_accepts_call("progress", value, f"{allowed} progress({', '.join(names)})", (), names)
 
 
 def checked_text(name: str, value: object, allowed: str = "a text") -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_texts
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 
 MIN_SAMPLES = 500
 """Least number of posterior samples in a file: fewer do not give 95 % intervals."""
@@ -35,8 +35,7 @@ class NamedSamples(ShowsItself):
 
     def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return the central interval (low, high) that holds a share `mass` of the samples, by parameter name."""
-        if not 0 < mass < 1:
-            raise ParameterError("mass", mass, "greater than 0, less than 1")
+        require(0 < mass < 1, "mass", mass, "greater than 0, less than 1")
         low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
         return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
 
@@ -60,8 +59,7 @@ def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
     samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)
     if samples.ndim != 2 or samples.shape[1] != len(names):
         raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(names)})")
-    if len(samples) < MIN_SAMPLES:
-        raise ParameterError("n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
+    require(len(samples) >= MIN_SAMPLES, "n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
     if noise_sd.shape != (len(samples),):
         raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one per sample")
     require_finite("samples", samples)

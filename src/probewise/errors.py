@@ -88,6 +88,12 @@ class ParameterError(ProbewiseError, ValueError):
         return type(self), (self.name, self.value, self.allowed)
 
 
+def require(holds: object, name: str, value: object, allowed: str) -> None:
+    """Raise ParameterError, of an argument's name and value and what is allowed, unless a condition holds."""
+    if not holds:
+        raise ParameterError(name, value, allowed)
+
+
 class ShapeError(ProbewiseError, ValueError):
     """Report arrays whose shapes do not fit together."""
 

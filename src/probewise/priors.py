@@ -6,8 +6,8 @@ The packages of shapes, sensors and effects all import this module, so it import
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,7 +16,7 @@ from scipy.special import erfc, gammainc, gammaincc, gammainccinv, gammaincinv, 
 
 from probewise._arrays import FloatArray, floats
 from probewise._kinds import checked_number, require_kind, require_like
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 
 __all__ = [
     "Joint",
@@ -77,7 +77,7 @@ class Marginal(Protocol):
     """A distribution of one parameter; its methods take and return arrays of any one shape."""
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function: probability in 0..1 -> value."""
+        """Evaluate the quantile function: probability in 0..1 -> value; 0 and 1 map to the ends, infinite or not."""
         ...
 
     def to_unit(self, value: FloatArray) -> FloatArray:
@@ -85,8 +85,16 @@ class Marginal(Protocol):
         ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape."""
+        """Return the natural log of the density, any shape; -inf outside the support."""
         ...
+
+
+def _require_arguments(marginal: Any, kind: type[Any], holds: Callable[..., bool], allowed: str) -> None:
+    """Raise ParameterError unless the arguments of a kind of distribution are numbers for which a condition holds."""
+    values = {field.name: getattr(marginal, field.name) for field in fields(kind)}
+    for name, value in values.items():
+        checked_number(name, value)
+    require(holds(*values.values()), f"{kind.__name__}({', '.join(values)})", (*values.values(),), allowed)
 
 
 @dataclass(frozen=True)
@@ -97,21 +105,15 @@ class Uniform:
     high: float
 
     def __post_init__(self) -> None:
-        for name in ("low", "high"):
-            checked_number(name, getattr(self, name))
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
-            raise ParameterError("Uniform(low, high)", (self.low, self.high), "finite, low < high")
+        _require_arguments(self, Uniform, lambda low, high: -math.inf < low < high < math.inf, "finite, low < high")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape: `u` in 0..1 -> low..high."""
         return self.low + (self.high - self.low) * u
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape: low..high -> 0..1."""
         return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape; -inf outside the bounds."""
         inside = (value >= self.low) & (value <= self.high)
         return np.where(inside, -math.log(self.high - self.low), -np.inf)
 
@@ -127,22 +129,16 @@ class LogUniform:
     high: float
 
     def __post_init__(self) -> None:
-        for name in ("low", "high"):
-            checked_number(name, getattr(self, name))
-        if not (0 < self.low < self.high < math.inf):
-            raise ParameterError("LogUniform(low, high)", (self.low, self.high), "0 < low < high, finite")
+        _require_arguments(self, LogUniform, lambda low, high: 0 < low < high < math.inf, "0 < low < high, finite")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape: equal steps of `u` are equal ratios."""
         return np.asarray(self.low * (self.high / self.low) ** u)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape."""
         within = np.clip(value, self.low, self.high)
         return np.asarray(np.log(within / self.low) / math.log(self.high / self.low))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape; -inf outside the bounds."""
         inside = (value >= self.low) & (value <= self.high)
         safe = np.where(inside, value, self.low)
         return np.where(inside, -np.log(safe) - math.log(math.log(self.high / self.low)), -np.inf)
@@ -159,21 +155,15 @@ class Normal:
     sd: float
 
     def __post_init__(self) -> None:
-        for name in ("mean", "sd"):
-            checked_number(name, getattr(self, name))
-        if not (math.isfinite(self.mean) and 0 < self.sd < math.inf):
-            raise ParameterError("Normal(mean, sd)", (self.mean, self.sd), "finite, sd > 0")
+        _require_arguments(self, Normal, lambda mean, sd: math.isfinite(mean) and 0 < sd < math.inf, "finite, sd > 0")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape; 0 and 1 map to the infinities."""
         return self.mean + self.sd * np.asarray(ndtri(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape."""
         return np.asarray(ndtr((value - self.mean) / self.sd))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape."""
         z = (value - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - math.log(self.sd * math.sqrt(2 * math.pi)))
 
@@ -189,22 +179,16 @@ class LogNormal:
     log_sd: float
 
     def __post_init__(self) -> None:
-        for name in ("median", "log_sd"):
-            checked_number(name, getattr(self, name))
-        if not (0 < self.median < math.inf and 0 < self.log_sd < math.inf):
-            raise ParameterError("LogNormal(median, log_sd)", (self.median, self.log_sd), "greater than 0, finite")
+        _require_arguments(self, LogNormal, lambda *both: all(0 < x < math.inf for x in both), "greater than 0, finite")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape."""
         return np.asarray(self.median * np.exp(self.log_sd * ndtri(u)))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape."""
         with np.errstate(divide="ignore"):
             return np.asarray(ndtr(np.log(np.maximum(value, 0.0) / self.median) / self.log_sd))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape; -inf at and below zero."""
         safe = np.where(value > 0, value, self.median)
         z = np.log(safe / self.median) / self.log_sd
         density = -0.5 * z * z - np.log(safe * self.log_sd * math.sqrt(2 * math.pi))
@@ -233,23 +217,19 @@ class Product:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters, in the order of `marginals`."""
         return tuple(self.marginals)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map each column of the unit cube by its own marginal, (n_samples, n_params) -> same shape."""
         u = checked_columns(u, self.names)
         columns = [m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())]
         return np.stack(columns, axis=-1) if columns else u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map each column of the parameters by its own marginal, (n_samples, n_params) -> same shape."""
         theta = checked_columns(theta, self.names)
         columns = [m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())]
         return np.stack(columns, axis=-1) if columns else theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = checked_columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
@@ -272,23 +252,19 @@ class Joint:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters of all parts, in order."""
         return tuple(name for part in self.parts for name in part.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the columns of each part by that part, (n_samples, n_params) -> same shape."""
         u = checked_columns(u, self.names)
         columns = [p.from_unit_cube(c) for p, c in self._parts_with_columns(u)]
         return np.concatenate(columns, axis=-1) if columns else u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map the columns of each part by that part, (n_samples, n_params) -> same shape."""
         theta = checked_columns(theta, self.names)
         columns = [p.to_unit_cube(c) for p, c in self._parts_with_columns(theta)]
         return np.concatenate(columns, axis=-1) if columns else theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = checked_columns(theta, self.names)
         total = np.zeros(len(theta))
         for part, columns in self._parts_with_columns(theta):
@@ -306,8 +282,7 @@ def require_prior(name: str, prior: object, *more: str) -> None:
     allowed = "a prior of named parameters, such as Product({'x_mm': Uniform(0.0, 1.0)})"
     require_like(name, prior, ("names", "from_unit_cube"), allowed)
     missing = [method for method in more if not hasattr(prior, method)]
-    if missing:
-        raise ParameterError(name, prior, f"a prior with {' and '.join(missing)}; see probewise.priors.Prior")
+    require(not missing, name, prior, f"a prior with {' and '.join(missing)}; see probewise.priors.Prior")
 
 
 def checked_columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
@@ -344,8 +319,7 @@ class HeavyTailedPrior:
     largest: float = SMALLEST_AND_LARGEST[1]
 
     def __post_init__(self) -> None:
-        if not 0 < self.typical < math.inf:
-            raise ParameterError("HeavyTailedPrior(typical)", self.typical, "greater than 0, finite")
+        require(0 < self.typical < math.inf, "HeavyTailedPrior(typical)", self.typical, "greater than 0, finite")
         if not 0 < self.smallest < self.largest:
             raise ParameterError("HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {self.largest:g}")
 
@@ -355,7 +329,6 @@ class HeavyTailedPrior:
         return self.typical * _relative_component_sds(self.smallest, self.largest)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape."""
         x = np.asarray(value, dtype=np.float64)[..., None] / self.component_sds
         terms = np.exp(-0.5 * x * x) / (self.component_sds * math.sqrt(2 * math.pi))
         with np.errstate(divide="ignore"):
@@ -365,7 +338,6 @@ class HeavyTailedPrior:
         return np.where(np.asarray(value) >= 0, density + math.log(2.0), -np.inf)
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape."""
         u = np.asarray(u, dtype=np.float64)
         if self.positive:
             tail, sign = (1.0 - u) / 2, np.ones_like(u)
@@ -382,7 +354,6 @@ class HeavyTailedPrior:
         return np.asarray(sign * self.typical * x)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape."""
         value = np.asarray(value, dtype=np.float64)
         tail = np.asarray(0.5 * erfc(np.abs(value)[..., None] / (self.component_sds * math.sqrt(2))).mean(axis=-1))
         if self.positive:
@@ -421,16 +392,13 @@ class LogHeavyTailedPrior:
         return HeavyTailedPrior(self.typical_log, smallest=self.smallest)
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape."""
         return np.exp(self._prior_of_log.from_unit(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Evaluate the cumulative distribution function, any shape; 0 at and below zero."""
         value = np.asarray(value, dtype=np.float64)
         return np.where(value > 0, self._prior_of_log.to_unit(np.log(np.where(value > 0, value, 1.0))), 0.0)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Return the natural log of the density, any shape; -inf at and below zero."""
         value = np.asarray(value, dtype=np.float64)
         safe = np.where(value > 0, value, 1.0)
         return np.where(value > 0, self._prior_of_log.log_prob(np.log(safe)) - np.log(safe), -np.inf)
@@ -469,19 +437,16 @@ class SharedScalePrior:
         return _tabulated_radii(len(self.names), self.each.smallest, self.each.largest)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """Map the unit cube to values, (n_samples, n_values) -> same shape."""
         z = ndtri(np.clip(checked_columns(u, self.names), _FARTHEST_SD, 1 - _FARTHEST_SD))
         length = np.linalg.norm(z, axis=1, keepdims=True)
         return np.asarray(self.typical * z * self._radii.ratio(length))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map values to the unit cube, (n_samples, n_values) -> same shape."""
         values = checked_columns(theta, self.names) / self.typical
         size = np.linalg.norm(values, axis=1, keepdims=True)
         return np.asarray(ndtr(values / self._radii.ratio_at_size(size)))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Return the log density of values, (n_samples, n_values) -> (n_samples,)."""
         values = checked_columns(theta, self.names)
         n, sds = len(self.names), self.component_sds
         squares = np.sum(values**2, axis=1)[:, None]

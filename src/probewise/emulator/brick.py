@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from probewise.emulator.inputs import InputPorts, Sensor, empty_port
 from probewise.emulator.motors import Motor, OutputPorts
 from probewise.emulator.protocol import Clock, RefusedError, Status, build_reply, parse_request
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 
 ADDRESS = bytes.fromhex("0016530A0B0C")
 SLEEP_MIN = (0, 2, 5, 10, 30, 60)
@@ -53,8 +53,7 @@ class Brick:
     ) -> None:
         if not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable() or any(ord(c) > 255 for c in name):
             raise ParameterError("name", name, f"1 to {_LONGEST_NAME} printable characters of Latin-1")
-        if sleep_min not in SLEEP_MIN:
-            raise ParameterError("sleep_min", sleep_min, f"one of {', '.join(map(str, SLEEP_MIN))}")
+        require(sleep_min in SLEEP_MIN, "sleep_min", sleep_min, f"one of {', '.join(map(str, SLEEP_MIN))}")
         self._clock, self._sleep_s = clock, 60.0 * sleep_min
         self._began_s = self._awake_s = clock()
         self._full_mv, self._sag_mv_min = full_mv, sag_mv_min

@@ -25,7 +25,7 @@ from probewise.emulator.protocol import (
     framed,
     parse_request,
 )
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError, ParameterError, require
 
 
 def _usually(rate: float) -> Any:
@@ -55,8 +55,7 @@ class Faults:
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name in ("late_s", "sag"):
-                if not 0 <= value < float("inf"):
-                    raise ParameterError(item.name, value, "0 or more")
+                require(0 <= value < float("inf"), item.name, value, "0 or more")
             elif not 0 <= value <= 1:
                 raise ParameterError(item.name, value, "a probability, 0 to 1")
 
@@ -70,8 +69,7 @@ class Faults:
         faults = cls()
         for text in texts:
             name, equals, value = text.partition("=")
-            if name not in _USUAL:
-                raise ParameterError("--fault", text, f"one of {', '.join(_USUAL)}, optionally followed by =RATE")
+            require(name in _USUAL, "--fault", text, f"one of {', '.join(_USUAL)}, optionally followed by =RATE")
             names = ("late", "late_s") if name == "late" else (name,)
             try:
                 numbers = [float(part) for part in value.split(",")] if equals else [_USUAL[name]]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, IntArray, array_or_none, floats
 from probewise._kinds import require_kind, require_mapping
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.patterns import PATTERNS, Pattern
 from probewise.recordings.table import number_text
@@ -62,13 +62,11 @@ def columns_by_name(table: TableLike) -> dict[str, Any]:
     names: Any = getattr(table, "columns", None)  # of a data frame, pandas or polars
     if isinstance(table, Mapping) or names is None:
         names = table.keys() if hasattr(table, "keys") else getattr(getattr(table, "dtype", None), "names", None)
-    if names is None:
-        raise ParameterError("table", table, "columns by name: a dict of arrays, or a data frame")
+    require(names is not None, "table", table, "columns by name: a dict of arrays, or a data frame")
     columns: dict[str, Any] = {}
     for name in names:
         own = str(name).strip()
-        if own in columns:
-            raise ParameterError("columns", own, "each name once, also without the blanks around it")
+        require(own not in columns, "columns", own, "each name once, also without the blanks around it")
         columns[own] = table[name]
     return columns
 
@@ -213,8 +211,7 @@ def require_patterns(patterns: Mapping[str, Pattern]) -> None:
     """Raise ParameterError unless every value is a pattern; a dict of a pattern's fields is the usual mistake."""
     for name, pattern in patterns.items():
         require_kind("a name in patterns", name, str, "a text")
-        if not isinstance(pattern, PATTERNS):
-            raise ParameterError(f"patterns[{name!r}]", pattern, A_PATTERN)
+        require(isinstance(pattern, PATTERNS), f"patterns[{name!r}]", pattern, A_PATTERN)
 
 
 def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:
@@ -247,14 +244,12 @@ def how_to_describe_pattern(name: str, known: Sequence[str]) -> str:
 
 def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> list[str]:
     """Return one name per reading, stripped; ShapeError for another number, ParameterError if one is missing."""
-    if not isinstance(values, Iterable):
-        raise ParameterError(name, values, "a text, or one per reading")
+    require(isinstance(values, Iterable), name, values, "a text, or one per reading")
     cells = list(values)
     if len(cells) != n_points:
         raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one per reading, or a single text")
     for k, cell in enumerate(cells):
-        if _is_missing(cell):
-            raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
+        require(not _is_missing(cell), f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
     texts, own = list(map(text_of_name, cells)), dict[str, str]()
     for k, text in enumerate(texts):
         if text not in own:
@@ -273,8 +268,7 @@ def text_of_name(value: object) -> str:
 
 def _checked_name(what: str, text: str) -> str:
     """Return a name without surrounding blanks, as in a file; raise ParameterError if it is not printable."""
-    if not text.strip().isprintable():
-        raise ParameterError(what, text, "a printable text, without line ends")
+    require(text.strip().isprintable(), what, text, "a printable text, without line ends")
     return text.strip()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise.errors import FileError, ParameterError, shortened
+from probewise.errors import FileError, ParameterError, require, shortened
 from probewise.recordings.images import is_file_name_without_path, read_image
 from probewise.recordings.io import parse_json_file_text, read_text
 from probewise.recordings.patterns import PATTERNS, Image, Pattern
@@ -197,8 +197,7 @@ def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pa
 
 
 def _pattern_fields(pattern: Pattern) -> dict[str, object]:
-    if type(pattern) not in _KIND_OF:
-        raise ParameterError("pattern", type(pattern).__name__, f"one of {', '.join(_KINDS)}")
+    require(type(pattern) in _KIND_OF, "pattern", type(pattern).__name__, f"one of {', '.join(_KINDS)}")
     out: dict[str, object] = {"kind": _KIND_OF[type(pattern)]}
     for field in fields(pattern):
         value = getattr(pattern, field.name)

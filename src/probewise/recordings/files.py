@@ -14,7 +14,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
 from probewise._writing import is_device_or_pipe, write_bytes_atomically, write_text_atomically
-from probewise.errors import FileError, ParameterError, shown
+from probewise.errors import FileError, ParameterError, require, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
@@ -102,8 +102,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     Raises ParameterError if the format cannot hold the plan.
     """
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
-        if name != name.strip() or not name.isprintable():
-            raise ParameterError("name", name, _A_NAME)
+        require(name == name.strip() and name.isprintable(), "name", name, _A_NAME)
     clash = [name for name in plan.covariates if name in (*_KNOWN, SESSION, "")]
     if clash:
         raise ParameterError("covariate", clash[0], "a name that is no column of the format")
@@ -143,8 +142,7 @@ def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> li
 
 def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
     """Write the images, the description, then the table, each atomically."""
-    if path.suffix.lower() == ".json":
-        raise ParameterError("path", str(path), "the name of the CSV; the JSON goes beside it")
+    require(path.suffix.lower() != ".json", "path", str(path), "the name of the CSV; the JSON goes beside it")
     if unknown := sorted({name for name, _ in plan.rows_by_pattern()} - set(plan.patterns)):
         raise ParameterError("pattern", unknown[0], "a pattern that plan.patterns describes")
     text = description_text(plan.instrumentation, plan.patterns)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from probewise._arrays import FloatArray
-from probewise.errors import FileError, ParameterError
+from probewise.errors import FileError, ParameterError, require
 from probewise.recordings.io import read_bytes
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -58,8 +58,7 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
         out = io.BytesIO()
         np.save(out, values, allow_pickle=False)
         return out.getvalue()
-    if suffix.lower() != ".png":
-        raise ParameterError("image file suffix", suffix, "'.png' or '.npy'")
+    require(suffix.lower() == ".png", "image file suffix", suffix, "'.png' or '.npy'")
     grey = np.rint(values)
     if np.abs(grey - values).max(initial=0.0) > 1e-9:
         raise ParameterError("image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255")

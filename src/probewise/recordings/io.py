@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError, PipeWarning, message_of, shown
+from probewise.errors import FileError, PipeWarning, message_of, require, shown
 
 
 def read_bytes(path: Path, what: str) -> bytes:
@@ -199,6 +199,5 @@ def shipped(name: str) -> Path:
 
     Raises ParameterError if there is no recording of that name.
     """
-    if name not in SHIPPED:
-        raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
+    require(name in SHIPPED, "name", name, " or ".join(repr(known) for known in SHIPPED))
     return Path(str(resources.files("probewise"))) / "data" / f"{name}.csv"

@@ -16,7 +16,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, floats
 from probewise._kinds import checked_finite_number, checked_pair
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 
 
 class _CheckedPattern:
@@ -32,8 +32,7 @@ class _CheckedPattern:
             object.__setattr__(self, field.name, value)
 
     def _require_positive(self, name: str) -> None:
-        if not getattr(self, name) > 0:
-            raise ParameterError(name, getattr(self, name), "a number greater than 0")
+        require(getattr(self, name) > 0, name, getattr(self, name), "a number greater than 0")
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,7 @@ class Quadrant(_CheckedPattern):
         super().__post_init__()
         allowed = "(1, 1), (1, -1), (-1, 1) or (-1, -1)"
         dx, dy = checked_pair("direction", self.direction, allowed)
-        if not abs(dx) == abs(dy) == 1:
-            raise ParameterError("direction", self.direction, allowed)
+        require(abs(dx) == abs(dy) == 1, "direction", self.direction, allowed)
         object.__setattr__(self, "direction", (int(dx), int(dy)))
 
 
@@ -120,8 +118,7 @@ class Stripes(_CheckedPattern):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require_positive("period_mm")
-        if not 0 <= self.duty <= 1:
-            raise ParameterError("duty", self.duty, "a number from 0 to 1")
+        require(0 <= self.duty <= 1, "duty", self.duty, "a number from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -152,8 +149,7 @@ class Image(_CheckedPattern):
         super().__post_init__()
         self._require_positive("pixel_mm")
         albedo = floats(self.albedo, "albedo")
-        if albedo.ndim != 2:
-            raise ParameterError("albedo", f"an array of shape {albedo.shape}", "(n_rows, n_columns), numbers 0 to 1")
+        require(albedo.ndim == 2, "albedo", f"an array of shape {albedo.shape}", "(n_rows, n_columns), numbers 0 to 1")
         object.__setattr__(self, "albedo", albedo)
 
 

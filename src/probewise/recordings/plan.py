@@ -23,7 +23,7 @@ from probewise._arrays import (
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise._words import unit_after_number
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 from probewise.recordings.columns import (
     A_PATTERN,
     SESSION,
@@ -439,10 +439,7 @@ class Recording(ShowsItself):
         """
         columns = columns_by_name(table)
         missing = [name for name in ("reading", "x_mm", "y_mm") if name not in columns]
-        if missing:
-            raise ParameterError(
-                "columns", tuple(columns), f"{', '.join(missing)} among them; rename the table's columns"
-            )
+        require(not missing, "columns", tuple(columns), f"{', '.join(missing)} among them; rename the table's columns")
         turn_deg, turn_rad = columns.get("orientation_deg"), columns.get("orientation_rad", 0.0)
         if turn_deg is not None:
             if "orientation_rad" in columns:

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Quadrant, Uniform
 from probewise.recordings.plan import Instrumentation, Plan
 
@@ -87,8 +87,7 @@ def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 
     `plan`: A plan in order of time; `rng`: source of randomness; `share`: largest change of an interval as a share of
     it, 0 to 1.
     """
-    if not 0 <= share <= 1:
-        raise ParameterError("share", share, "0 to 1")
+    require(0 <= share <= 1, "share", share, "0 to 1")
     intervals = np.diff(plan.time_s, prepend=0.0)
     time_s = np.round(np.cumsum(intervals * rng.uniform(1 - share, 1 + share, len(plan))), 3).astype(np.float64)
     covariates = dict(plan.covariates)

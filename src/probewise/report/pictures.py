@@ -9,7 +9,7 @@ from itertools import zip_longest
 import numpy as np
 from PIL import Image
 
-from probewise.errors import ParameterError
+from probewise.errors import require
 
 _COLOURS = 256
 _FRAME_S, _LAST_S = 0.8, 3.0
@@ -40,8 +40,7 @@ def _paste_side_by_side(left: bytes, right: bytes) -> bytes:
 
 def animated_gif(frames: Sequence[bytes], *, frame_s: float = _FRAME_S, last_s: float = _LAST_S) -> bytes:
     """Join one or more PNGs into an animated GIF that loops for ever; smaller ones lie at the upper left."""
-    if not frames:
-        raise ParameterError("frames", 0, "one picture or more")
+    require(frames, "frames", 0, "one picture or more")
     pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     size = (max(p.width for p in pictures), max(p.height for p in pictures))
     sheets = []

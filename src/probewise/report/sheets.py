@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.arm.fitting import spread_mark_places
 from probewise.effects.reference import orientation_deg
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.recordings import Disc, HalfPlane, Image, Pattern, Plan, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.recordings.patterns import where_white_in_words
 
@@ -87,8 +87,7 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     Return the tiles row by row from below, each row from the left. ParameterError if it needs more than 400 pages, or
     the paper is unknown.
     """
-    if paper not in PAPERS_MM:
-        raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
+    require(paper in PAPERS_MM, "paper", paper, " or ".join(PAPERS_MM))
     width, height = PAPERS_MM[paper]
     ways = [(_pages_across_and_up(sheet, page), page) for page in ((width, height), (height, width))]
     (n_columns, n_rows), page = min(ways, key=lambda way: way[0][0] * way[0][1])
@@ -104,13 +103,10 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
         low, high = (x_mm[column], y_mm[row]), (x_mm[column + 1], y_mm[row + 1])
         beyond = (OVERLAP_MM * (column < n_columns - 1), OVERLAP_MM * (row < n_rows - 1))
         tiles.append(Tile(column, row, low, high, page, beyond))
-    return tuple(tile for tile in tiles if not sheet.skips_blank_pages or _has_drawing(sheet, tile))
-
-
-def _has_drawing(sheet: Sheet, tile: Tile) -> bool:
-    """Return whether a line or a cross of the sheet lies inside the page, not only along its edge."""
-    points = points_of_lines(sheet)
-    return bool(((points > tile.low_mm) & (points < tile.high_mm)).all(axis=1).any())
+    if not sheet.skips_blank_pages:
+        return tuple(tiles)
+    points = points_of_lines(sheet)  # inside a page, not only along its edge
+    return tuple(t for t in tiles if ((points > t.low_mm) & (points < t.high_mm)).all(axis=1).any())
 
 
 def points_of_lines(sheet: Sheet) -> FloatArray:

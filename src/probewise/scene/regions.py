@@ -8,7 +8,7 @@ A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. It m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, singledispatch
 from itertools import pairwise
@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, frozen_int, read_only_floats, require_finite
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 from probewise.recordings import patterns as kinds
 from probewise.recordings.patterns import Pattern
 
@@ -280,8 +280,7 @@ def _count_ray_crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArra
 def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
     """Return the even-odd inside's boundary, (n_pieces, 2, 2), from edges (n_edges, 2, 2), split where they meet."""
     size = float(np.ptp(edges.reshape(-1, 2), axis=0).max())
-    if size == 0:
-        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
+    require(size != 0, "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
     pieces: dict[tuple[tuple[float, float], tuple[float, float]], None] = {}
     for start, end in edges:
         cuts = {0.0, 1.0}
@@ -313,8 +312,7 @@ def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
         sides = _count_ray_crossings(edges[None], np.stack([middle + left, middle - left]))[0] % 2
         if sides[0] != sides[1]:
             kept.append(ends if sides[0] else ends[::-1])
-    if not kept:
-        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
+    require(kept, "vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
     return np.stack(kept)
 
 
@@ -652,24 +650,20 @@ def region_of(pattern: Pattern) -> Region:
 
     Raises ParameterError if the pattern is of no known kind, or its numbers describe no area.
     """
-    match pattern:
-        case kinds.Uniform(level):
-            return UniformRegion(np.array([level]))
-        case kinds.HalfPlane(normal, offset, inside, outside):
-            return HalfPlaneRegion(np.array([normal]), np.array([offset]), inside, outside)
-        case kinds.Quadrant(corner, direction, inside, outside):
-            return QuadrantRegion(np.array([corner]), np.array([direction]), inside, outside)
-        case kinds.Disc(center, radius, inside, outside):
-            return disc_region(np.array([center]), np.array([radius]), inside=inside, outside=outside)
-        case kinds.Polygon(vertices, inside, outside):
-            return PolygonRegion.from_even_odd_vertices(np.array(vertices), inside=inside, outside=outside)
-        case kinds.Stripes(normal, period, duty, phase, inside, outside):
-            return StripesRegion(
-                np.array([normal]), np.array([period]), np.array([duty]), np.array([phase]), inside, outside
-            )
-        case kinds.Ramp(normal, per_mm):
-            return RampRegion(np.array([normal]), np.array([per_mm]))
-        case kinds.Image(albedo, pixel, origin, _):
-            return ImageRegion(albedo, pixel, origin)
-        case _:
-            raise ParameterError("pattern", pattern, "a pattern of probewise.recordings.patterns")
+    if isinstance(pattern, kinds.Uniform):
+        return UniformRegion(np.array([pattern.albedo]))
+    if isinstance(pattern, kinds.Image):
+        return ImageRegion(pattern.albedo, pattern.pixel_mm, pattern.origin_mm)
+    require(type(pattern) in _REGIONS, "pattern", pattern, "a pattern of probewise.recordings.patterns")
+    return _REGIONS[type(pattern)](**vars(pattern))
+
+
+# Regions, or what builds them, with the fields of a pattern as arguments.
+_REGIONS: Mapping[type[Pattern], Callable[..., Region]] = {
+    kinds.HalfPlane: HalfPlaneRegion,
+    kinds.Quadrant: QuadrantRegion,
+    kinds.Disc: disc_region,
+    kinds.Polygon: PolygonRegion.from_even_odd_vertices,
+    kinds.Stripes: StripesRegion,
+    kinds.Ramp: RampRegion,
+}

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_number, require_kind
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.priors import Prior, Product
 from probewise.recordings.columns import require_patterns
 from probewise.recordings.patterns import Pattern
@@ -88,8 +88,7 @@ class OneRegionForAllNames(Mapping[str, Region]):
     region: Region
 
     def __getitem__(self, name: str) -> Region:
-        if not isinstance(name, str):
-            raise ParameterError("pattern name", name, "a text")
+        require(isinstance(name, str), "pattern name", name, "a text")
         return self.region
 
     def __iter__(self) -> Iterator[str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import checked_number, checked_pair, checked_whole, require_kind, require_like
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.priors import Prior, Product, Uniform, checked_columns
 from probewise.scene.regions import (
     EllipseRegion,
@@ -71,8 +71,7 @@ class Field:
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm"):
             value = checked_number(name, getattr(self, name))
-            if not 0 < value < math.inf:
-                raise ParameterError(name, value, "greater than 0, finite")
+            require(0 < value < math.inf, name, value, "greater than 0, finite")
 
 
 @dataclass(frozen=True)
@@ -122,8 +121,7 @@ def _require_bounds_fit_field(shape: Circle | Ellipse | Rectangle | RegularPolyg
     field, bounds = shape.field, getattr(shape, name)
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
-    if not 0 < low < high < math.inf:
-        raise ParameterError(name, bounds, "0 < low < high, finite")
+    require(0 < low < high < math.inf, name, bounds, "0 < low < high, finite")
     if shape.inside and 2 * reach * high >= min(field.width_mm, field.height_mm):
         raise ParameterError(
             f"{type(shape).__name__}(inside=True)",
@@ -416,8 +414,7 @@ class AnyOf:
         require_kind("shapes", self.shapes, Mapping, "shapes by name: {'circle': Circle(), 'rectangle': Rectangle()}")
         for name, shape in self.shapes.items():
             require_shape(shape, f"shapes[{name!r}]")
-        if not self.shapes:
-            raise ParameterError("shapes", dict(self.shapes), "one shape or more, by name")
+        require(self.shapes, "shapes", dict(self.shapes), "one shape or more, by name")
         weights = tuple(self.weights) or (1.0,) * len(self.shapes)
         if len(weights) != len(self.shapes) or not all(0 < w < math.inf for w in weights):
             raise ParameterError("weights", self.weights, f"{len(self.shapes)} numbers greater than 0")

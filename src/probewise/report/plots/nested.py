@@ -19,7 +19,7 @@ from scipy.stats import binom
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_kind, require_like
 from probewise._words import unit_of_name
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.nested import NestedResult, Weighted
 from probewise.report.plots import canvas
 from probewise.report.words import value_and_interval_texts, value_with_error, words_without_unit
@@ -54,7 +54,7 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     shares: dict[str, Any] = {"width_ratios": (4.0, 1.0), "height_ratios": (1.2 if n <= _FEW else 1.6, *[1.0] * n)}
     axes = canvas.grid_of_axes(n + 1, 2, size_in=(8.6, 1.9 + height * n), **shares)
     depth, mass = -result.log_volume, _mass_per_nat(result)
-    shown = _thinned_rows(result.n_dead)
+    shown = np.unique(np.linspace(0, result.n_dead - 1, min(result.n_dead, _MOST_POINTS)).astype(np.int64))
     shown = shown[np.argsort(mass[shown], kind="stable")]
     top, key = axes[0]
     _draw_mass(top, depth, mass, linewidth=1.2)
@@ -239,13 +239,11 @@ def _evidence_text(result: Posterior) -> str:
 
 def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
     require_like("result", result, ("names", "theta"), f"{_A_RUN}, or weighted samples")
-    if not result.names:
-        raise ParameterError("names", result.names, "one parameter or more; without any there is nothing to draw")
+    require(result.names, "names", result.names, "one parameter or more; without any there is nothing to draw")
     if parameters is None:
         return list(range(len(result.names)))
     unknown = [name for name in parameters if name not in result.names]
-    if unknown or not parameters:
-        raise ParameterError("parameters", tuple(parameters), f"one or more of {result.names}")
+    require(not unknown and parameters, "parameters", tuple(parameters), f"one or more of {result.names}")
     return [result.names.index(name) for name in parameters]
 
 
@@ -265,10 +263,6 @@ def _parameter_label(name: str) -> str:
 def _mass_per_nat(result: NestedResult) -> FloatArray:
     """Return the posterior mass per nat of log volume, (n_dead,): a death among n live points takes 1 / n nats."""
     return result.weight * result.n_at_death
-
-
-def _thinned_rows(n: int) -> IntArray:
-    return np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).astype(np.int64))
 
 
 def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:

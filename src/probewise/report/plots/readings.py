@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.recordings import HalfPlane, Plan, Quadrant, Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots import canvas
@@ -121,8 +121,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
     require_recording(recording)
     plan = recording.plan
     lines = [(k, track) for k, track in enumerate(tracks_and_single_rows(plan)[0]) if track.from_edge]
-    if not lines:
-        raise ParameterError("recording", recording.source or "as given", "one with a scan over a half_plane")
+    require(lines, "recording", recording.source or "as given", "one with a scan over a half_plane")
     turns = {track.label: (k, float(plan.orientation_rad[track.rows[0]])) for k, track in lines}
     n = len(turns)
     ax = canvas.axes_or_new(ax, size_in=(1.55 * n, 2.9))
@@ -161,8 +160,7 @@ def quadrant_patterns(recording: Recording) -> canvas.AxesGrid:
         for name, rows in plan.rows_by_pattern()
         if isinstance(pattern := plan.patterns.get(name), Quadrant)
     ]
-    if not quadrants:
-        raise ParameterError("recording", recording.source or "as given", "one with readings over a quadrant")
+    require(quadrants, "recording", recording.source or "as given", "one with readings over a quadrant")
     n_rows = -(-len(quadrants) // 2)
     axes = canvas.grid_of_axes(n_rows, 2, size_in=(4.6, 2.35 * n_rows + 0.1))
     for ax in axes.flat:

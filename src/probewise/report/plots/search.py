@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
-from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
@@ -100,20 +99,14 @@ def playing_field(
     left, right, low, high = image.get_extent()
     ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     if lego_scale:
-        lego = ax.secondary_xaxis("top", functions=(_to_lego, _from_lego))
+        lego = ax.secondary_xaxis(
+            "top", functions=(lambda mm: np.divide(mm, _LEGO_UNIT_MM), lambda units: np.multiply(units, _LEGO_UNIT_MM))
+        )
         lego.set_xlabel("LEGO distance units (8 mm)", fontsize=canvas.SMALL_PT)
         lego.tick_params(labelsize=canvas.SMALL_PT)
     if title:
         ax.set_title(title, fontsize="medium", loc="left")
     return ax
-
-
-def _to_lego(mm: ArrayLike) -> FloatArray:
-    return np.asarray(mm, dtype=np.float64) / _LEGO_UNIT_MM
-
-
-def _from_lego(units: ArrayLike) -> FloatArray:
-    return np.asarray(units, dtype=np.float64) * _LEGO_UNIT_MM
 
 
 def draw_field_legend(axes: Axes | canvas.AxesGrid) -> None:

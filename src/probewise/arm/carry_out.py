@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm.instrument import Instrument, Pose, ReachablePlaces, Reading, require_within_reach
+from probewise.arm.instrument import Instrument, Pose, Reading, require_within_reach
 from probewise.arm.lego import LegoArm
 from probewise.arm.own import Measures, OwnInstrument, as_instrument
 from probewise.arm.simulated import SimulatedArm
@@ -86,7 +86,7 @@ def carry_out(
     """
     arm = as_instrument(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    require_within_reach(reachable_places_of(arm), places, "row of the plan", way_out="; move the plan's origin")
+    require_within_reach(arm.reach, places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
     if isinstance(arm, LegoArm):
         arm.turned_rad = 0.0
@@ -94,7 +94,10 @@ def carry_out(
     turns = _turns_by_hand_rad(arm, plan, places)
     if (turns[:first] > _SAME_TURN_RAD).any():
         arm.mounted_rad = math.nan  # by hand, in an earlier session
-    does_not_matter = math.isnan(arm.mounted_rad) and (arm.turns or not _orientation_matters(plan, turns))
+    # A sensor that nobody has to turn reads the same over uniform sheets however it stands on its mount.
+    uniform = all(isinstance(plan.patterns.get(name), Uniform) for name, _ in plan.rows_by_pattern())
+    unturned = arm.turns or (uniform and not (turns > _SAME_TURN_RAD).any())
+    does_not_matter = math.isnan(arm.mounted_rad) and unturned
     lying = -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
@@ -112,7 +115,9 @@ def carry_out(
             ask(RequestToPerson(text, turned_rad=turned))
             arm.mounted_rad = turned
         reading = _measure_row(arm, places[row], turned, plan, row)
-        there = _place_in_plan_frame_mm(reading, plan, row, origin_mm)
+        there, (x_mm, y_mm) = (float(plan.x_mm[row]), float(plan.y_mm[row])), origin_mm
+        if (reading.pose.x_mm, reading.pose.y_mm) != (there[0] + x_mm, there[1] + y_mm):  # taken elsewhere: to a micron
+            there = round(reading.pose.x_mm - x_mm, 3), round(reading.pose.y_mm - y_mm, 3)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 
 
@@ -130,16 +135,6 @@ def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], f
     turned_rad = np.abs(np.angle(np.exp(1j * np.diff(turns))))  # 0 for a whole turn
     by_hand = 1 + np.count_nonzero(np.diff(lying)) + np.count_nonzero(turned_rad > _SAME_TURN_RAD)
     return seconds + BY_HAND_S * float(by_hand)
-
-
-def _place_in_plan_frame_mm(
-    reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]
-) -> tuple[float, float]:
-    """Return x and y of a reading in the plan's frame: the planned ones if it was taken there, else to a micron."""
-    x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
-    if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
-        return x_mm, y_mm
-    return round(reading.pose.x_mm - origin_mm[0], 3), round(reading.pose.y_mm - origin_mm[1], 3)
 
 
 def _turns_by_hand_rad(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan, places_mm: FloatArray) -> FloatArray:
@@ -167,12 +162,6 @@ def _measure_row(
     height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if arm.lifts else math.nan
     up_mm = None if math.isnan(height_mm) else float(height_mm)
     return arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
-
-
-def _orientation_matters(plan: Plan, turns_rad: FloatArray) -> bool:
-    """Return whether a sensor that is turned on its mount may read otherwise, or has to be turned for some row."""
-    patterns = [plan.patterns.get(name) for name, _ in plan.rows_by_pattern()]
-    return not all(isinstance(each, Uniform) for each in patterns) or bool((turns_rad > _SAME_TURN_RAD).any())
 
 
 def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
@@ -208,20 +197,6 @@ def readings_of_recording(recording: Recording) -> list[Reading]:
         )
         for k, value in enumerate(recording.readings)
     ]
-
-
-def reachable_places_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> ReachablePlaces:
-    """Return the object whose `contains` says which places an arm can reach.
-
-    It is the LEGO arm's geometry, the simulated arm's `reach`, or a user's instrument itself.
-    """
-    match arm:
-        case LegoArm():
-            return arm.geometry
-        case SimulatedArm():
-            return arm.reach
-        case _:
-            return arm
 
 
 def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:

@@ -27,7 +27,7 @@ from probewise.arm.geometry import (
     place_jacobian,
     places_at_parameters,
 )
-from probewise.errors import ParameterError, ProbewiseError, ReachError
+from probewise.errors import ParameterError, ProbewiseError, ReachError, require
 from probewise.recordings.table import csv_text, number_text, read_table
 
 LEAST_MARKS = 5
@@ -149,8 +149,7 @@ def fit_geometry(
         Sd of a mark's place and height, from positioning by eye and from the motors.
     """
     turned, marks = floats(turned_rad, "turned_rad"), floats(marks_mm, "marks_mm")
-    if len(marks) < LEAST_MARKS:
-        raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
+    require(len(marks) >= LEAST_MARKS, "marks", len(marks), f"{LEAST_MARKS} or more")
     values, p_value, jacobian = _least_squares_fit(geometry, turned, marks, touch_mm)
     residuals = marks - places_at_parameters(geometry, values, turned)
     if p_value < LEAST_P:
@@ -206,8 +205,7 @@ def _disagreement_message(
 def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
     """Return sds of place, height and scale over the field, from the covariance, (9, 9), of the fitted parameters."""
     places = geometry.reachable_grid_mm
-    if not len(places):
-        raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
+    require(len(places), "marks", n_marks, "marks that leave the field within reach; touch them again")
     slopes = place_jacobian(geometry, places)
     variances = np.einsum("nik,kl,nil->ni", slopes, covariance, slopes)
     # Scale error of the whole field: the mean radial displacement from its centre.

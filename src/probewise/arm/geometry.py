@@ -8,14 +8,14 @@ nadir); about the vertical, the sensor turns with the base alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Side
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 
 JOINTS = ("base", "shoulder", "elbow")
 """The joints in the order of the columns of all arrays of angles."""
@@ -37,8 +37,7 @@ class Joint:
     stop_rad: float | None = None  # angle of a mechanical stop, at or beyond a limit, used to find home
 
     def __post_init__(self) -> None:
-        if self.port not in (0, 1, 2):
-            raise ParameterError("port", self.port, "0 to 2, for A to C")
+        require(self.port in (0, 1, 2), "port", self.port, "0 to 2, for A to C")
         if not (math.isfinite(self.gear_ratio) and abs(self.gear_ratio) >= 0.1):
             raise ParameterError("gear_ratio", self.gear_ratio, "a finite number, 0.1 or more in magnitude")
         if not -2 * math.pi <= self.low_rad < self.high_rad <= 2 * math.pi:
@@ -110,11 +109,9 @@ class Accuracy:
     covariance: tuple[tuple[float, ...], ...]  # of the errors of the parameters `FITTED`, nine rows; radians, mm
 
     def __post_init__(self) -> None:
-        if self.marks < 1:
-            raise ParameterError("marks", self.marks, "1 or more")
+        require(self.marks >= 1, "marks", self.marks, "1 or more")
         for name in ("place_sd_mm", "height_sd_mm", "scale_sd"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ParameterError(name, getattr(self, name), "0 or more")
+            require(0 <= getattr(self, name) < math.inf, name, getattr(self, name), "0 or more")
         shape = [len(row) for row in self.covariance]
         if shape != [N_FITTED] * N_FITTED:
             raise ParameterError("covariance", f"rows of {shape}", f"{N_FITTED} rows of {N_FITTED} numbers")
@@ -150,11 +147,9 @@ class Geometry:
 
     def __post_init__(self) -> None:
         finite = (*self.field_mm, *self.axis_mm, *self.shoulder_mm, *self.links_mm, *self.sensor_mm, self.mounting_rad)
-        if not all(math.isfinite(number) for number in finite):
-            raise ParameterError("geometry", finite, "finite numbers")
+        require(all(math.isfinite(number) for number in finite), "geometry", finite, "finite numbers")
         for name, value in (("field_mm", min(self.field_mm)), ("links_mm", min(self.links_mm))):
-            if not value > 0:
-                raise ParameterError(name, value, "greater than 0")
+            require(value > 0, name, value, "greater than 0")
         if not 0 < self.lowest_mm < self.read_height_mm < self.travel_height_mm < math.inf:
             raise ParameterError(
                 "lowest_mm, read_height_mm, travel_height_mm",
@@ -163,8 +158,7 @@ class Geometry:
             )
         if self.light_per_mm is not None and not 0 <= self.light_per_mm < 1:
             raise ParameterError("light_per_mm", self.light_per_mm, "0 or more, less than 1")
-        if self.sensor_port not in range(4):
-            raise ParameterError("sensor port", self.sensor_port, "0 to 3, for 1 to 4")
+        require(self.sensor_port in range(4), "sensor port", self.sensor_port, "0 to 3, for 1 to 4")
         if len({joint.port for joint in self.joints}) < len(self.joints):
             raise ParameterError("ports", tuple("ABC"[j.port] for j in self.joints), "a port of its own for each joint")
         if any(joint.stop_rad is not None for joint in (self.shoulder, self.elbow)):
@@ -211,14 +205,7 @@ class Geometry:
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Compute x, y and height of the sensor's face, (n, 3), lab frame, from joint angles, (n, 3)."""
-        return forward_kinematics_mm(
-            angles_rad,
-            self.links_mm,
-            self.axis_mm,
-            self.shoulder_mm,
-            self.sensor_mm,
-            elbow_is_relative=self.elbow_is_relative,
-        )
+        return _position_mm(self, angles_rad, self.links_mm, self.axis_mm, self.shoulder_mm)
 
     def height_slopes_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
         """Return the derivative of the sensor's height by each joint angle, (n, 3), at joint angles, (n, 3)."""
@@ -298,20 +285,12 @@ class Geometry:
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
 
 
-def forward_kinematics_mm(
-    angles_rad: FloatArray,
-    links_mm: Sequence[float] | FloatArray,
-    axis_mm: Sequence[float] | FloatArray,
-    shoulder_mm: Sequence[float] | FloatArray,
-    sensor_mm: Sequence[float] | FloatArray,
-    *,
-    elbow_is_relative: bool,
-) -> FloatArray:
-    """Compute x, y and height of the sensor's face, (n, 3), from joint angles, (n, 3), and lengths as in `Geometry`."""
+def _position_mm(arm: Geometry, angles_rad: FloatArray, links_mm: Any, axis_mm: Any, shoulder_mm: Any) -> FloatArray:
+    """Compute x, y and height of the sensor's face, (n, 3), from joint angles, (n, 3), and pairs of other lengths."""
     base, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)
-    lower = shoulder + elbow if elbow_is_relative else elbow
-    away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + sensor_mm[0]
-    height = shoulder_mm[1] + links_mm[0] * np.sin(shoulder) + links_mm[1] * np.sin(lower) - sensor_mm[1]
+    lower = shoulder + elbow if arm.elbow_is_relative else elbow
+    away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + arm.sensor_mm[0]
+    height = shoulder_mm[1] + links_mm[0] * np.sin(shoulder) + links_mm[1] * np.sin(lower) - arm.sensor_mm[1]
     return np.stack([axis_mm[0] + away * np.cos(base), axis_mm[1] + away * np.sin(base), height], axis=-1)
 
 
@@ -350,14 +329,7 @@ def fitted_parameter_values(geometry: Geometry) -> FloatArray:
 
 def places_at_parameters(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
     """Return x, y, height of the sensor, (n, 3), for values of `FITTED`, (9,), and joint angles from home, (n, 3)."""
-    return forward_kinematics_mm(
-        values[:3] + turned_rad,
-        values[3:5],
-        values[5:7],
-        values[7:9],
-        geometry.sensor_mm,
-        elbow_is_relative=geometry.elbow_is_relative,
-    )
+    return _position_mm(geometry, values[:3] + turned_rad, values[3:5], values[5:7], values[7:9])
 
 
 def place_jacobian(geometry: Geometry, places_mm: FloatArray) -> FloatArray:

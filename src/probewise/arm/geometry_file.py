@@ -16,7 +16,6 @@ from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.io import read_text
 
 FORMAT = "arm/1"
-ELBOWS = ("absolute", "relative")
 _HEADER = re.compile(r"\s*\[\s*([\w.]+)\s*\]")
 _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)([-+\w.]+)(.*)")
 LARGEST = 1e6
@@ -43,19 +42,12 @@ def read_geometry(path: str | Path) -> Geometry:
     except ValueError as error:  # not TOML, or a number of thousands of digits
         raise FileError(path, f"not TOML ({error})", "an arm's geometry, TOML") from error
     top = _TomlTable(path, "", content)
-    if top.take_entry("format") != FORMAT:
-        raise top.error_at("format", f'"{FORMAT}"')
+    top.value("format", f'"{FORMAT}"', lambda v: v == FORMAT)
     field, base, links, sensor = (top.table(name) for name in ("field", "base", "links", "sensor"))
     joints = top.table("joints")
-    elbow = links.take_entry("elbow")
-    if elbow not in ELBOWS:
-        raise links.error_at("elbow", " or ".join(f'"{name}"' for name in ELBOWS))
-    port = sensor.take_entry("port")
-    if port not in (1, 2, 3, 4) or isinstance(port, bool | float):
-        raise sensor.error_at("port", "1, 2, 3 or 4")
-    whole = sensor.take_entry("whole_percent")
-    if not isinstance(whole, bool):
-        raise sensor.error_at("whole_percent", "true or false")
+    elbow = links.value("elbow", '"absolute" or "relative"', lambda v: v in ("absolute", "relative"))
+    port = sensor.value("port", "1, 2, 3 or 4", lambda v: v in (1, 2, 3, 4) and not isinstance(v, bool | float))
+    whole = sensor.value("whole_percent", "true or false", lambda v: isinstance(v, bool))
     tables = {name: joints.table(name) for name in JOINTS}
     known = top.table("accuracy") if "accuracy" in content else None
     parts: dict[str, Any] = {name: _parse_joint(table) for name, table in tables.items()}
@@ -151,33 +143,25 @@ class _TomlTable:
         self.path, self.where, self.content = path, where, content
         self._left = set(content)
 
-    def error_at(self, name: str, allowed: str) -> FileError:
-        return FileError(self.path, f"{self.where}{name} is {shown(self.content[name])}", allowed)
-
-    def take_entry(self, name: str) -> Any:
+    def value(self, name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
         if name not in self.content:
             raise FileError(self.path, f"{self.where}{name} is missing", "every entry of the shipped lego_arm.toml")
         self._left.discard(name)
+        if not fits(self.content[name]):
+            raise FileError(self.path, f"{self.where}{name} is {shown(self.content[name])}", allowed)
         return self.content[name]
 
     def table(self, name: str) -> _TomlTable:
-        content = self.take_entry(name)
-        if not isinstance(content, dict):
-            raise self.error_at(name, f"a table [{self.where}{name}]")
+        content = self.value(name, f"a table [{self.where}{name}]", lambda v: isinstance(v, dict))
         return _TomlTable(self.path, f"{self.where}{name}.", content)
 
     def number(self, name: str) -> float:
-        value = self.take_entry(name)
-        if not _is_number(value):
-            raise self.error_at(name, f"a number of magnitude up to {LARGEST:g}")
-        return float(value)
+        return float(self.value(name, f"a number of magnitude up to {LARGEST:g}", _is_number))
 
     def rows_of_numbers(self, name: str) -> tuple[tuple[float, ...], ...]:
-        rows = self.take_entry(name)
-        if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-            raise self.error_at(name, "rows of numbers, [[...], [...], ...]")
-        if not all(_is_number(number) for row in rows for number in row):
-            raise self.error_at(name, f"rows of numbers of magnitude up to {LARGEST:g}")
+        allowed, of_numbers = "rows of numbers, [[...], [...], ...]", f"rows of numbers of magnitude up to {LARGEST:g}"
+        rows = self.value(name, allowed, lambda v: isinstance(v, list) and all(isinstance(row, list) for row in v))
+        self.value(name, of_numbers, lambda v: all(_is_number(number) for row in v for number in row))
         return tuple(tuple(map(float, row)) for row in rows)
 
     def require_all_taken(self) -> None:
@@ -196,9 +180,7 @@ def _built(table: _TomlTable, kind: Callable[..., T], *values: Any) -> T:
 
 
 def _parse_joint(table: _TomlTable) -> Joint:
-    port = table.take_entry("port")
-    if port not in ("A", "B", "C"):
-        raise table.error_at("port", '"A", "B" or "C"')
+    port = table.value("port", '"A", "B" or "C"', lambda v: v in ("A", "B", "C"))
     ratio = table.number("gear_ratio")
     angles = [math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play")]
     stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
@@ -206,9 +188,8 @@ def _parse_joint(table: _TomlTable) -> Joint:
 
 
 def _parse_accuracy(table: _TomlTable) -> Accuracy:
-    marks = table.take_entry("marks")
-    if not isinstance(marks, int) or isinstance(marks, bool):
-        raise table.error_at("marks", "a whole number, 1 or more")
+    whole = "a whole number, 1 or more"
+    marks = table.value("marks", whole, lambda v: isinstance(v, int) and not isinstance(v, bool))
     sds = [table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd")]
     if "covariance" not in table.content:
         again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"

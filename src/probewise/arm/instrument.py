@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_number, require_kind, warn_of_likely_degrees
-from probewise.errors import ParameterError, ReachError
+from probewise.errors import ParameterError, ReachError, require
 
 Side: TypeAlias = Literal[-1, 1]
 """Direction of arrival: -1 with the count decreasing, 1 increasing."""
@@ -116,10 +116,8 @@ class ReadingScale:
     step: float | None = 1.0
 
     def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise ParameterError("low", self.low, f"less than high, {self.high:g}")
-        if self.step is not None and not self.step > 0:
-            raise ParameterError("step", self.step, "greater than 0, or None")
+        require(self.low < self.high, "low", self.low, f"less than high, {self.high:g}")
+        require(self.step is None or self.step > 0, "step", self.step, "greater than 0, or None")
 
     def clip_and_round(self, value: float) -> float:
         """Clip a value to the scale and round it to a step, within the scale; NaN, a missing reading, stays NaN."""
@@ -205,11 +203,9 @@ class Reach:
     def __post_init__(self) -> None:
         width, height = self.field_mm
         for name, value in (("field_mm", width), ("field_mm", height), ("farthest_mm", self.farthest_mm)):
-            if not (math.isfinite(value) and value > 0):
-                raise ParameterError(name, value, "a finite length greater than 0")
+            require(math.isfinite(value) and value > 0, name, value, "a finite length greater than 0")
         for name, value in (("axis_beyond_mm", self.axis_beyond_mm), ("nearest_mm", self.nearest_mm)):
-            if not (math.isfinite(value) and value >= 0):
-                raise ParameterError(name, value, "a finite length of 0 or more")
+            require(math.isfinite(value) and value >= 0, name, value, "a finite length of 0 or more")
         if self.nearest_mm >= self.farthest_mm:
             raise ParameterError("nearest_mm", self.nearest_mm, f"less than farthest_mm, {self.farthest_mm:g}")
         corner = math.hypot(width / 2, height + self.axis_beyond_mm)
@@ -220,13 +216,6 @@ class Reach:
                 f"a field that comes within {self.nearest_mm:g} to {self.farthest_mm:g} mm of the axis, which stands "
                 f"{self.axis_beyond_mm:g} mm beyond its upper side; move the arm or choose another field",
             )
-
-    @classmethod
-    def over_whole_field(cls, field_mm: tuple[float, float] = FIELD_MM) -> Self:
-        """Return the reach of an arm long enough for the whole field, its axis 60 mm beyond the upper side."""
-        width, height = field_mm
-        beyond = 60.0
-        return cls(field_mm, beyond, 0.0, math.hypot(width / 2, height + beyond) + 1.0)
 
     @property
     def axis_mm(self) -> tuple[float, float]:

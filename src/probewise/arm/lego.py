@@ -66,6 +66,7 @@ class LegoArm:
 
     def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
         self._machine, self.geometry, self._clock = machine, geometry, clock
+        self.reach, self.read_height_mm = geometry, geometry.read_height_mm
         self._zero_s = clock.monotonic() - start_s
         self._is_down = False
         self._arrived: list[int] = [0, 0, 0]  # the direction from which each joint reached its position
@@ -103,11 +104,6 @@ class LegoArm:
     def position_mm(self) -> FloatArray:
         """Place and height (x, y, height) of the sensor's face by the motors' counters, lab frame, shape (3,)."""
         return np.asarray(self.geometry.position_mm(self.angles_rad[None, :])[0])
-
-    @property
-    def read_height_mm(self) -> float:
-        """Height of the sensor above the surface when it reads, in mm."""
-        return self.geometry.read_height_mm
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at places, (n_places, 2), its turn by hand included: shape (n_places,)."""

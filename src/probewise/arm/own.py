@@ -23,7 +23,7 @@ from probewise._signals import defer_signals
 from probewise.arm.instrument import Clock, Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
-from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of
+from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of, require
 from probewise.recordings.columns import KNOWN, SESSION
 from probewise.recordings.io import run_python_file
 
@@ -69,7 +69,7 @@ class OwnInstrument:
         self._connect, self.source, self._start_s, self._clock = connect, source, start_s, clock
         self._own: Any = None
         self._entered: Any = None  # what is left or closed at the end
-        self.mounted_rad = 0.0
+        self.mounted_rad, self.reach = 0.0, self  # it says itself which places it reaches
         self._zero_s = clock.monotonic() - start_s
         self._speed = Speed()
 
@@ -198,8 +198,7 @@ class OwnInstrument:
 
     def _as_reading(self, found: object, pose: Pose) -> Reading:
         if isinstance(found, Reading):
-            if math.isinf(found.value):
-                raise ParameterError(f"value{_RETURNED}", found.value, _OR_NAN)
+            require(not math.isinf(found.value), f"value{_RETURNED}", found.value, _OR_NAN)
             own = {"time_s": found.time_s} | {name: getattr(found.pose, name) for name in _OF_THE_POSE}
             known = {name: _checked_covariate(name, number) for name, number in found.covariates.items()}
             reading = dataclasses.replace(found, covariates=known) if known else found
@@ -208,8 +207,7 @@ class OwnInstrument:
             own |= {name: getattr(pose, name) for name in _OF_THE_POSE}
             if not isinstance(found, Mapping):
                 return Reading(_checked_value("what measure returned", found), pose, own["time_s"])
-            if "value" not in found:
-                raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
+            require("value" in found, "what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
             known = {
                 name: _checked_covariate(name, number) for name, number in found.items() if name not in (*own, "value")
             }

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number, require_callable, require_like
 from probewise.arm.instrument import Pose, Reach, Reading, ReadingScale, Workspace, require_pose, require_within_reach
-from probewise.errors import ParameterError, ReachError, ShapeError
+from probewise.errors import ReachError, ShapeError, require
 
 LEGO = ReadingScale()
 
@@ -28,14 +28,12 @@ class Speed:
     read_s: float = 1.2
 
     def __post_init__(self) -> None:
-        if not self.move_mm_s > 0:
-            raise ParameterError("move_mm_s", self.move_mm_s, "greater than 0")
-        if not (math.isfinite(self.read_s) and self.read_s >= 0):
-            raise ParameterError("read_s", self.read_s, "0 or more")
+        require(self.move_mm_s > 0, "move_mm_s", self.move_mm_s, "greater than 0")
+        require(math.isfinite(self.read_s) and self.read_s >= 0, "read_s", self.read_s, "0 or more")
 
 
 class SimulatedArm:
-    """An Instrument that simulates moving, lowering, reading and raising, with a simulated clock.
+    """An Instrument that simulates moving, lowering, reading and raising; `time_s` is its clock, `pose` where it is.
 
     Parameters
     ----------
@@ -65,8 +63,7 @@ class SimulatedArm:
         last: Reading | None = None,
     ) -> None:
         require_callable("light", light, "a function light(pose, time_s, height_mm) that returns the reading there")
-        if not checked_number("height_mm", height_mm) > 0:
-            raise ParameterError("height_mm", height_mm, "greater than 0")
+        require(checked_number("height_mm", height_mm) > 0, "height_mm", height_mm, "greater than 0")
         if reach is not None:
             require_like(
                 "reach", reach, ("rest_mm", "contains", "orientation_rad"), "a Reach, or the Geometry of an arm"
@@ -76,24 +73,14 @@ class SimulatedArm:
         self.speed = Speed() if speed is None else speed
         self.mounted_rad = 0.0
         self._home = Pose(*self.reach.rest_mm)
-        self._pose, self._time_s = (self._home, 0.0) if last is None else (last.pose, last.time_s)
+        self.pose, self.time_s = (self._home, 0.0) if last is None else (last.pose, last.time_s)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         """Return the arm to its rest position."""
-        self._pose = self._home
-
-    @property
-    def pose(self) -> Pose:
-        """Current pose of the sensor."""
-        return self._pose
-
-    @property
-    def time_s(self) -> float:
-        """Time of the simulated clock."""
-        return self._time_s
+        self.pose = self._home
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         return self.reach.contains(_checked_places(places_mm))
@@ -119,11 +106,11 @@ class SimulatedArm:
         height_mm = self._height_mm if pose.height_mm is None else pose.height_mm
         if not 0 < height_mm < math.inf:
             raise ReachError("height_mm", height_mm, "above the surface: finite, greater than 0")
-        self._time_s += float(self.travel_s(self._pose, place)[0])
-        self._pose = pose
-        value = checked_number("what light returned", self._light(pose, self._time_s, height_mm))
+        self.time_s += float(self.travel_s(self.pose, place)[0])
+        self.pose = pose
+        value = checked_number("what light returned", self._light(pose, self.time_s, height_mm))
         value = value if self._scale is None else self._scale.clip_and_round(value)
-        return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": height_mm})
+        return Reading(value=value, pose=pose, time_s=self.time_s, covariates={"height_mm": height_mm})
 
 
 def _checked_places(places_mm: FloatArray) -> FloatArray:

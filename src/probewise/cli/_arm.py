@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import add, parse_numbers, parse_path
+from probewise.cli._common import add, parse_finite_numbers, parse_path
 from probewise.errors import ParameterError, did_you_mean
 from probewise.progress import Progress, silent
 
@@ -105,7 +104,5 @@ def parse_arm(text: str) -> ArmName:
 
 def parse_place(name: str, text: str) -> tuple[float, float]:
     """Parse "X,Y" in mm; raise ParameterError, with the option's name, for anything else."""
-    numbers = parse_numbers(text)
-    if len(numbers) != 2 or not all(map(math.isfinite, numbers)):
-        raise ParameterError(name, text, "X,Y in mm, such as 524,260")
-    return numbers[0], numbers[1]
+    x_mm, y_mm = parse_finite_numbers(name, text, 2, "X,Y in mm, such as 524,260")
+    return x_mm, y_mm

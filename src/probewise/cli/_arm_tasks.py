@@ -22,14 +22,20 @@ from probewise.arm import (
     percent_to_lego_units,
     require_within_reach,
 )
-from probewise.arm.carry_out import reachable_places_of
 from probewise.arm.fitting import spread_mark_places
 from probewise.arm.geometry import JOINTS
 from probewise.arm.height_check import HeightReading, check_heights
 from probewise.cli import _bench
 from probewise.cli._arm import SCENE, parse_arm, parse_place
-from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_result, print_warning
-from probewise.errors import LinkError, ParameterError
+from probewise.cli._common import (
+    DEFAULT_SEED,
+    CommandError,
+    parse_finite_numbers,
+    print_result,
+    print_warning,
+    refuse_options,
+)
+from probewise.errors import LinkError, ParameterError, require
 from probewise.recordings import write_bytes_atomically
 
 _UNITS = "LEGO units (1 dark to 100 bright)"
@@ -61,8 +67,7 @@ def open_instrument(
     if chosen is None or chosen.kind == "nxt":
         refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
         return open_lego_arm(arguments, geometry, start_s=start_s), None
-    if arguments.dry_run:
-        raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
+    require(not arguments.dry_run, "--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
     if chosen.kind == "file":
         refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
     default: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
@@ -79,18 +84,10 @@ def confirm_lowering(arguments: argparse.Namespace, instrument: Instrument, geom
         _bench.warn_and_confirm_lowering(parse_arm(arguments.arm), instrument, geometry)
 
 
-def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
-    """Raise ParameterError if one of these options is given: there are none with `what`."""
-    for name in names:
-        if (value := getattr(arguments, name, None)) is not None:
-            raise ParameterError(f"--{name}", str(value), f"none with {what}")
-
-
 def nxt_port(name: str) -> str:
     """Return the port of "nxt:PORT"; raise ParameterError for any other arm."""
     chosen = parse_arm(name)
-    if chosen.kind == "file":
-        raise ParameterError("--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
+    require(chosen.kind != "file", "--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
     if chosen.kind != "nxt":
         allowed = "nxt:PORT, also that of `probewise emulate-nxt`, a brick in software; --dry-run prints the moves"
         raise ParameterError("--arm", name, allowed)
@@ -118,8 +115,7 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
     reached = geometry.contains(places)
-    if not reached.any():
-        raise ParameterError("reach", "nowhere on the field", "links, heights and limits that reach the field")
+    require(reached.any(), "reach", "nowhere on the field", "links, heights and limits that reach the field")
     say(f"reach        {geometry.sentence()}")
     say(f"field        {reached.mean():.1%} of it within reach")
     _, farthest_mm = geometry.radii_in_reach_mm()
@@ -171,11 +167,9 @@ def jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> No
                 if arguments.down:
                     prompter_unless_dry_run(arguments, arm)("check the sensor's position; it will be raised again")
         case [joint, text] if joint in JOINTS:
-            degrees = parse_numbers(text)
-            if len(degrees) != 1 or not math.isfinite(degrees[0]):
-                raise ParameterError("WHERE", text, "a number of degrees")
+            (degrees,) = parse_finite_numbers("WHERE", text, 1, "a number of degrees")
             with open_lego_arm(arguments, geometry) as arm:
-                arm.turn_joint(JOINTS.index(joint), math.radians(degrees[0]))
+                arm.turn_joint(JOINTS.index(joint), math.radians(degrees))
                 _print_position(arm, quiet=arguments.quiet)
         case _:
             raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")
@@ -220,7 +214,7 @@ def scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     instrument, _ = open_instrument(arguments, geometry)
     confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
-        require_within_reach(reachable_places_of(arm), places, "reading of the scan")
+        require_within_reach(arm.reach, places, "reading of the scan")
         names = ["battery_mv"] if isinstance(arm, LegoArm) else None  # an own instrument's are those of its readings
         if names is not None:
             print_result(",".join((_COLUMNS, *names)))
@@ -244,8 +238,7 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
     width, height = geometry.field_mm
     places = [parse_place("X,Y", text) for text in arguments.places]
     places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]
-    if len(places) < 2:
-        raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
+    require(len(places) >= 2, "X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_within_reach(geometry, np.array(places), "place")
     instrument, bench = open_instrument(arguments, geometry, scene=_WHITE)
     assert isinstance(instrument, LegoArm)

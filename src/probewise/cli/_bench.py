@@ -32,8 +32,8 @@ from probewise.arm import (
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._arm import SCENE, ArmName
-from probewise.cli._common import DEFAULT_SEED, CommandError, parse_numbers, print_warning, write_to_terminal
-from probewise.errors import ParameterError
+from probewise.cli._common import DEFAULT_SEED, CommandError, parse_finite_numbers, print_warning, write_to_terminal
+from probewise.errors import ParameterError, require
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World
@@ -219,32 +219,22 @@ class SimulatedBench:
 
 def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> Surface:
     """Return a pattern shifted by `by_mm`; raise ParameterError for a ramp, which cannot be shifted."""
+    allowed = "0,0 with a ramp, which is given in field coordinates"
+    require(not isinstance(pattern, recordings.Ramp) or by_mm == (0.0, 0.0), "--origin-mm", by_mm, allowed)
 
     def moved(place_mm: tuple[float, float]) -> tuple[float, float]:
         return place_mm[0] + by_mm[0], place_mm[1] + by_mm[1]
 
-    def along_mm(normal_rad: float) -> float:
-        return by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad)
-
-    match pattern:
-        case recordings.Uniform():
-            return pattern
-        case recordings.HalfPlane():
-            return dataclasses.replace(pattern, offset_mm=pattern.offset_mm + along_mm(pattern.normal_rad))
-        case recordings.Quadrant():
-            return dataclasses.replace(pattern, corner_mm=moved(pattern.corner_mm))
-        case recordings.Disc():
-            return dataclasses.replace(pattern, center_mm=moved(pattern.center_mm))
-        case recordings.Polygon():
-            return dataclasses.replace(pattern, vertices_mm=tuple(map(moved, pattern.vertices_mm)))
-        case recordings.Stripes():
-            return dataclasses.replace(pattern, phase_mm=pattern.phase_mm + along_mm(pattern.normal_rad))
-        case recordings.Image():
-            return dataclasses.replace(pattern, origin_mm=moved(pattern.origin_mm))
-        case recordings.Ramp():
-            if by_mm != (0.0, 0.0):
-                raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, which is given in field coordinates")
-            return pattern
+    shifted: dict[str, Any] = {}
+    for name, value in vars(pattern).items():
+        if name in ("corner_mm", "center_mm", "origin_mm"):
+            shifted[name] = moved(value)
+        elif name == "vertices_mm":
+            shifted[name] = tuple(map(moved, value))
+        elif name in ("offset_mm", "phase_mm"):  # along the normal
+            normal_rad = vars(pattern)["normal_rad"]
+            shifted[name] = value + (by_mm[0] * math.cos(normal_rad) + by_mm[1] * math.sin(normal_rad))
+    return dataclasses.replace(pattern, **shifted)
 
 
 # Adapting a plan to an arm: unit, range and step of its readings, and the columns that can be commanded
@@ -261,17 +251,10 @@ def plan_for_own_instrument(
     if unit is not None:  # the values declared in the plan have another unit
         declared = {"unit": unit, "min": None, "max": None, "step": None, "sensor": ""}
     if range_ is not None:
-        declared["min"], declared["max"] = _parse_declared("--range", range_, 2, "LOW,HIGH such as 0,1023")
+        declared["min"], declared["max"] = parse_finite_numbers("--range", range_, 2, "LOW,HIGH such as 0,1023")
     if step is not None:
-        (declared["step"],) = _parse_declared("--step", step, 1, "a number such as 1")
+        (declared["step"],) = parse_finite_numbers("--step", step, 1, "a number such as 1")
     return without_measured_covariates(plan, dataclasses.replace(plan.instrumentation, **declared))  # type: ignore[arg-type]
-
-
-def _parse_declared(option: str, text: str, n: int, allowed: str) -> tuple[float, ...]:
-    numbers = parse_numbers(text)
-    if len(numbers) != n or not all(map(math.isfinite, numbers)):
-        raise ParameterError(option, text, allowed)
-    return numbers
 
 
 def plan_for_lego_arm(plan: recordings.Plan, geometry: Geometry) -> recordings.Plan:

@@ -13,7 +13,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
-from probewise.errors import FileError, ParameterError, ProbewiseError, did_you_mean, printable, shortened, shown
+from probewise.errors import (
+    FileError,
+    ParameterError,
+    ProbewiseError,
+    did_you_mean,
+    printable,
+    require,
+    shortened,
+    shown,
+)
 
 if TYPE_CHECKING:
     from probewise._writing import Drawings
@@ -104,6 +113,13 @@ def add_nested_stop(parser: argparse.ArgumentParser) -> None:
     add(parser, "--nested-stop", about, choices=("change", "remaining"))
 
 
+def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
+    """Raise ParameterError if one of these options is given: there are none with `what`."""
+    for name in names:
+        if (value := getattr(arguments, name, None)) is not None:
+            raise ParameterError(f"--{name.replace('_', '-')}", str(value), f"none with {what}")
+
+
 def refuse_nested_stop(arguments: argparse.Namespace) -> None:
     """Raise ParameterError if --nested-stop is given without --method paper."""
     if arguments.nested_stop is not None and arguments.method != "paper":
@@ -159,6 +175,13 @@ def positive_number_parser(unit: str) -> Callable[[str], float]:
         return numbers[0]
 
     return parse
+
+
+def parse_finite_numbers(option: str, text: str, n: int, allowed: str) -> tuple[float, ...]:
+    """Parse "A,B,..." of `n` finite numbers; raise ParameterError, with the option's name, for anything else."""
+    numbers = parse_numbers(text)
+    require(len(numbers) == n and all(map(math.isfinite, numbers)), option, text, allowed)
+    return numbers
 
 
 def parse_numbers(text: str) -> tuple[float, ...]:

@@ -20,7 +20,7 @@ from probewise._version import __version__
 from probewise._writing import Drawings, StagedFiles, checked_output_directory, staged_output
 from probewise.cli._common import error_in_one_line, finish, message_to_resume
 from probewise.cli._executor import open_executor
-from probewise.errors import ParameterError, ProbewiseError
+from probewise.errors import ProbewiseError, require
 from probewise.recordings.table import csv_text
 from probewise.report import each as report
 
@@ -94,8 +94,7 @@ def _device_names(files: Sequence[Path]) -> list[str]:
         for file, name in zip(files, names, strict=True)
     ]
     twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise ParameterError("recordings", twice, "files of different names, which name their folders")
+    require(twice is None, "recordings", twice, "files of different names, which name their folders")
     return names
 
 

@@ -10,7 +10,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -56,10 +55,17 @@ def run_and_report(
     If it is interrupted, the message says what the file holds. The last line printed begins with `said`.
     """
     from probewise._progress import progress_shown
+    from probewise.proof.campaign import read_campaign
 
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
-    kept = partial(_message_to_resume_campaign, out / file, campaign.noun.removesuffix("s"), arguments)
+
+    def kept() -> str:
+        if not (out / file).exists():
+            return "nothing was written"
+        n_done = len(read_campaign(out / file).results)
+        return message_to_resume(out / file, n_done, campaign.noun.removesuffix("s"), arguments)
+
     with (
         reporting_what_is_kept(kept),
         progress_shown(quiet=arguments.quiet) as progress,
@@ -73,15 +79,6 @@ def run_and_report(
             lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw), progress=progress
         )
     return finish(drawings, page.sentence, f"{said}written to {out}", quiet=arguments.quiet)
-
-
-def _message_to_resume_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
-    """Return a message: how many finished tasks a campaign's file holds, and the command that resumes it."""
-    from probewise.proof.campaign import read_campaign
-
-    if not path.exists():
-        return "nothing was written"
-    return message_to_resume(path, len(read_campaign(path).results), noun, arguments)
 
 
 @contextlib.contextmanager

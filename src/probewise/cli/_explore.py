@@ -25,7 +25,7 @@ from probewise.cli import _bench
 from probewise.cli import _common as common
 from probewise.cli._arm import ArmName, parse_arm, read_or_shipped_geometry
 from probewise.effects import spoken_name
-from probewise.errors import FileError, ParameterError, did_you_mean
+from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.experiment import Exploration, HiddenShape, read_journal
 from probewise.recordings import read_recording, shipped, write_bytes_atomically
 from probewise.report import exploration as report
@@ -118,8 +118,7 @@ def _shipped_sensor(arguments: argparse.Namespace, chosen: ArmName) -> FittedSen
 
     Raises ParameterError for a real arm.
     """
-    if chosen.is_real:
-        raise ParameterError("--sensor", "none", "the sensor model of this arm, as `probewise calibrate` writes it")
+    require(not chosen.is_real, "--sensor", "none", "the sensor model of this arm, as `probewise calibrate` writes it")
     if arguments.resume and (arguments.out / _SHIPPED).exists():
         return read_sensor(arguments.out / _SHIPPED)
     common.print_result("no --sensor: that of the recording that ships is calibrated", quiet=arguments.quiet)
@@ -152,8 +151,7 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
     if text is None:
         return of_arm or Field()
     numbers = common.parse_numbers(text)
-    if len(numbers) != 2:
-        raise ParameterError("--field", text, "WIDTH,HEIGHT in mm, such as 1048,520")
+    require(len(numbers) == 2, "--field", text, "WIDTH,HEIGHT in mm, such as 1048,520")
     field = Field(*numbers)
     if of_arm not in (None, field):
         raise ParameterError("--field", text, f"{of_arm.width_mm:g},{of_arm.height_mm:g}, the geometry's; or none")
@@ -195,8 +193,7 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
         raise ParameterError("--truth", text, allowed)
     shape, theta = SHAPES[name](field), np.array(common.parse_numbers(listed))
     wanted = shape.prior.names
-    if len(theta) != len(wanted):
-        raise ParameterError("--truth", text, f"{len(wanted)} numbers, {','.join(wanted)}")
+    require(len(theta) == len(wanted), "--truth", text, f"{len(wanted)} numbers, {','.join(wanted)}")
     return HiddenShape.from_parameters(name, shape, theta, called=f"--truth {text}")
 
 
@@ -239,8 +236,7 @@ def _open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tu
     """
     chosen, geometry, start_s = inputs.arm, inputs.geometry, taken[-1].time_s if taken else 0.0
     if chosen.is_real:
-        if arguments.truth is not None:
-            raise ParameterError("--truth", arguments.truth, "none with a real arm, whose target is unknown")
+        require(arguments.truth is None, "--truth", arguments.truth, "none with a real arm, whose target is unknown")
         return ArmAndTruth(_bench.open_real_arm(chosen, geometry, start_s=start_s))
     hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)
     world, noise = experiments.world_like(inputs.sensor), inputs.streams.noise

@@ -19,7 +19,7 @@ from probewise.cli._arm import parse_arm
 from probewise.cli._arm_tasks import open_instrument
 from probewise.cli._bench import prompter, prompter_for_answer
 from probewise.cli._common import CommandError, message_to_resume, print_result
-from probewise.errors import FileError, ParameterError, ReachError
+from probewise.errors import FileError, ParameterError, ReachError, require
 from probewise.recordings import write_text_atomically
 
 STEP_MM = 5.0
@@ -35,8 +35,7 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
     """Bring the sensor to marks, unless there is no --arm; fit the geometry to them, and write it."""
     source = arguments.geometry or shipped_geometry_path()
     out = checked_output_file(arguments.out, arguments.geometry)
-    if arguments.dry_run:
-        raise ParameterError("--dry-run", True, "none with fit-geometry: a person directs its moves")
+    require(not arguments.dry_run, "--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit existing marks, --marks MARKS.csv"

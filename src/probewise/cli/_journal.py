@@ -62,17 +62,13 @@ def find_journal_sensor_file(path: Path) -> Path:
         raise FileError(path, "it does not name its sensor's file", give)
     places = (path.parent / named, path.parent / Path(named).name)
     standing = [place for place in places if place.exists()]
-    standing += [renamed for place in places for renamed in _renamed_inputs(place)]
+    for place in places:  # where a result took its place, it has another name: see `staged_output`
+        standing += sorted(place.parent.glob(f"{glob.escape(place.stem)}_kept*{place.suffix}"))
     for place in standing:
         if sensor_entry(read_sensor(place))["sensor_sha256"] == wanted:
             return place
     found = "is another by now" if standing else "is not there any more"
     raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)
-
-
-def _renamed_inputs(path: Path) -> list[Path]:
-    """List the files to which an input was renamed where a result took its place (see `staged_output`)."""
-    return sorted(path.parent.glob(f"{glob.escape(path.stem)}_kept*{path.suffix}"))
 
 
 def _instrumentation_declared_by_run(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:

@@ -29,7 +29,7 @@ from probewise.arm import (
     readings_of_recording,
     recording_of_readings,
 )
-from probewise.arm.carry_out import BY_HAND_S, duration_s, reachable_places_of
+from probewise.arm.carry_out import BY_HAND_S, duration_s
 from probewise.arm.geometry import wrapped_to_pi
 from probewise.cli import _bench
 from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
@@ -38,9 +38,8 @@ from probewise.cli._arm_tasks import (
     nxt_port,
     open_instrument,
     prompter_unless_dry_run,
-    refuse_options,
 )
-from probewise.cli._common import message_to_resume, print_result, print_warning
+from probewise.cli._common import message_to_resume, print_result, print_warning, refuse_options
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
@@ -232,8 +231,8 @@ def person_at_bench(
 
     def complaint_about_sheet(name: str) -> str | None:
         """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
-        bounds, origin = reachable_places_of(arm), np.array(origin_mm)
-        chosen = sheet_check.white_and_black_places(name, lambda places: bounds.contains(places + origin))
+        origin = np.array(origin_mm)
+        chosen = sheet_check.white_and_black_places(name, lambda places: arm.reach.contains(places + origin))
         values = {}
         for is_white, place in chosen.items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
@@ -320,14 +319,8 @@ class SheetCheck:
     ) -> dict[bool, tuple[float, float]]:
         """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
 
-        Return (x, y) in mm in the plan's frame, by these keys; a key is missing if there is no such place.
-
-        Parameters
-        ----------
-        name
-            The pattern.
-        allowed
-            Function that returns the mask, (n,), of reachable places, (n, 2), in the plan's frame.
+        Return (x, y) in mm in the plan's frame, by these keys; a key is missing if there is no such place. `allowed`
+        returns the mask, (n,), of reachable places, (n, 2), in that frame.
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)

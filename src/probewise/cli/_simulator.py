@@ -46,12 +46,6 @@ def open_simulator(path: Path, n_workers: int) -> Iterator[Simulator]:
         yield replace(simulator, simulate=SpreadCalls(simulator.simulate, path, pool, n_workers))
 
 
-def refuse_sensor(sensor: Path | None) -> None:
-    """Raise ParameterError if --sensor is given beside --simulator."""
-    if sensor is not None:
-        raise ParameterError("--sensor", str(sensor), "none with --simulator, which replaces it")
-
-
 def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
     """Read tables of one system; return them joined, and notes on their columns.
 

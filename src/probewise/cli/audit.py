@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING
 
 from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._arm import SHIPPED, read_or_shipped_plan
-from probewise.cli._common import add, add_quiet, finish, inputs_and_filled_in_plan, parse_path, print_result
+from probewise.cli._common import (
+    add,
+    add_quiet,
+    finish,
+    inputs_and_filled_in_plan,
+    parse_path,
+    print_result,
+    refuse_options,
+)
 from probewise.cli._journal import refuse_journal
-from probewise.cli._simulator import add_simulator, add_workers, open_simulator, refuse_sensor
+from probewise.cli._simulator import add_simulator, add_workers, open_simulator
 
 if TYPE_CHECKING:
     from probewise._writing import StagedFiles
@@ -45,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     drawings = None if arguments.out is None else Drawings(checked_output_directory(arguments.out, main="audit.json"))
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
-            refuse_sensor(arguments.sensor)
+            refuse_options(arguments, "--simulator, which replaces it", "sensor")
             with open_simulator(arguments.simulator, arguments.workers) as simulator:
                 table = read_table_for(simulator, arguments.plan)
                 progress("building the effects")

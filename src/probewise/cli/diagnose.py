@@ -11,7 +11,7 @@ from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.cli import _common as common
 from probewise.cli._executor import add_executor
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._simulator import add_simulator, open_simulator, read_joined_table, refuse_sensor
+from probewise.cli._simulator import add_simulator, open_simulator, read_joined_table
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _diagnose_simulator(arguments: argparse.Namespace) -> int:
     from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
     from probewise.report import diagnosis as report
 
-    refuse_sensor(arguments.sensor)
+    common.refuse_options(arguments, "--simulator, which replaces it", "sensor")
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
     source = ", ".join(path.name for path in arguments.recordings)

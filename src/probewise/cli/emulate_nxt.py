@@ -137,14 +137,9 @@ def _is_foreground() -> bool:
 
 @contextlib.contextmanager
 def _telegram_log(path: Path | None) -> Iterator[Trace]:
-    """Yield a function that writes a line per telegram or fault to the file; without a file it writes nothing."""
-    from probewise.emulator.radio import ignore_trace
-
-    if path is None:
-        yield ignore_trace
-        return
+    """Yield a function that writes a line per telegram or fault to the file, or nowhere without one."""
     began_s = time.monotonic()
-    with path.open("w", encoding="utf-8", buffering=1) as file:
+    with open(path or os.devnull, "w", encoding="utf-8", buffering=1) as file:
 
         def write_line(now_s: float, event: str, text: str) -> None:
             file.write(f"{now_s - began_s:10.3f} {event} {text}\n")

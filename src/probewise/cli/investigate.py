@@ -85,10 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.truth is not None and chosen.kind != "simulated":
         raise ParameterError("--truth", arguments.truth, f"none with {arguments.arm}: it is for the simulated arm")
     idle = {"simulated": ("origin_mm", "geometry"), "file": ("geometry",)}.get(chosen.kind, ())
-    for name in idle:
-        if getattr(arguments, name) is not None:
-            allowed = f"none with {arguments.arm}, which has no use for it"
-            raise ParameterError(f"--{name.replace('_', '-')}", str(getattr(arguments, name)), allowed)
+    common.refuse_options(arguments, f"{arguments.arm}, which has no use for it", *idle)
     plan = _first_plan(arguments, chosen)
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
     truth_seed, noise_seed, rounds_seed, files_seed = np.random.SeedSequence(arguments.seed).spawn(4)

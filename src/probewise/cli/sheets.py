@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING
 
 from probewise._writing import checked_output_file
 from probewise.cli._arm import add_geometry, read_or_shipped_geometry, read_or_shipped_plan
-from probewise.cli._common import CommandError, add, add_quiet, note_if_replaced, parse_path, print_result
-from probewise.errors import ParameterError
+from probewise.cli._common import (
+    CommandError,
+    add,
+    add_quiet,
+    note_if_replaced,
+    parse_path,
+    print_result,
+    refuse_options,
+)
+from probewise.errors import ParameterError, require
 
 if TYPE_CHECKING:
     from probewise._arrays import FloatArray
@@ -41,8 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report.plots.sheets import sheets_pdf
     from probewise.report.sheets import PAPERS_MM, tiles_of
 
-    if arguments.paper not in PAPERS_MM:
-        raise ParameterError("--paper", arguments.paper, " or ".join(PAPERS_MM))
+    require(arguments.paper in PAPERS_MM, "--paper", arguments.paper, " or ".join(PAPERS_MM))
     named = Path(arguments.what)
     out = checked_output_file(arguments.out, *([named] if named.is_file() else []))
     sheets = _sheets_to_draw(arguments)
@@ -65,8 +72,8 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, pattern_sheets, target_sheet
 
     what = arguments.what
-    if what not in (FIELD, TARGET) and arguments.target is not None:
-        raise ParameterError("--target", arguments.target, f"none with {what}: it is for {FIELD} and {TARGET}")
+    if what not in (FIELD, TARGET):
+        refuse_options(arguments, f"{what}: it is for {FIELD} and {TARGET}", "target")
     if what == MARKS:
         return (marks_sheet(read_or_shipped_geometry(arguments)),)
     if what == JIG:
@@ -80,10 +87,7 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
             return (field_sheet(field_mm, outline),)
         assert outline is not None
         return (target_sheet(arguments.target, outline),)
-    if arguments.geometry is not None:
-        raise ParameterError(
-            "--geometry", str(arguments.geometry), f"none with a plan: it is for {FIELD}, {MARKS} and {JIG}"
-        )
+    refuse_options(arguments, f"a plan: it is for {FIELD}, {MARKS} and {JIG}", "geometry")
     path = Path(what)
     if path.suffix.lower() == ".json":
         beside = path.with_suffix(".csv")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from probewise._writing import checked_output_directory
 from probewise.cli._common import MOST_BATCH, add, add_out, add_quiet, count_up_to, parse_count, parse_seed
 from probewise.cli._executor import add_executor, run_and_report
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 
 if TYPE_CHECKING:
     from probewise.proof.configurations import SearchConfiguration
@@ -85,8 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     rows = _configuration_rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
-    if max(numbers.values()) < 2:
-        raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
+    require(max(numbers.values()) >= 2, "--circles", arguments.circles, "2 or more: one circle gives no standard error")
     plain = study(numbers, max_readings=arguments.max_readings)
     return run_and_report(plain, partial(pages.study_page, command=command), arguments, "trials.jsonl")
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from probewise.arm.instrument import Clock
 from probewise.arm.nxt.link import Link
 from probewise.arm.nxt.telegram import GetInputValues, InputValues, SensorMode, SensorType, SetInputMode, TelegramError
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError, require
 
 AD_MAX = 1023
 N_INVALID = 3  # least number of attempts, since one may use up the allowed time on a slow connection
@@ -28,8 +28,7 @@ def normalized_from_counts(raw_counts: int) -> int:
 
     Raises ParameterError if the counts are outside the converter's 0 to 1023.
     """
-    if not 0 <= raw_counts <= AD_MAX:
-        raise ParameterError("raw_counts", raw_counts, f"0 to {AD_MAX}")
+    require(0 <= raw_counts <= AD_MAX, "raw_counts", raw_counts, f"0 to {AD_MAX}")
     dark = max(raw_counts - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT
     return AD_MAX - min(dark, AD_MAX)
 

@@ -93,16 +93,11 @@ class Link:
     """
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
-        self._stream, self._clock, self._timing = stream, clock, timing
+        self._stream, self._clock, self._timing, self.name = stream, clock, timing, stream.name
         self.n_asked = self.n_told = 0
         self._owed = {UNKNOWN}
         self._free_at = clock.monotonic()
         self._awake_until = clock.monotonic()
-
-    @property
-    def name(self) -> str:
-        """Name of the connection."""
-        return self._stream.name
 
     def ask(self, request: Request[A], *, check: Callable[[A], None] | None = None) -> A:
         """Send a command and return the answer.
@@ -201,7 +196,10 @@ class Link:
 
     def _await_reply(self, request: Request[A], deadline: float) -> Reply:
         while True:
-            telegram = self._read_frame(request, deadline)
+            length = int.from_bytes(self._read_exactly(2, request, deadline), "little")
+            if not 2 <= length <= LONGEST:
+                raise TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {LONGEST}")
+            telegram = self._read_exactly(length, request, deadline)
             try:
                 reply = decode(telegram)
             except TelegramError:
@@ -210,12 +208,6 @@ class Link:
                 return reply
             if reply.opcode not in self._owed:
                 raise TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")
-
-    def _read_frame(self, request: Request[A], deadline: float) -> bytes:
-        length = int.from_bytes(self._read_exactly(2, request, deadline), "little")
-        if not 2 <= length <= LONGEST:
-            raise TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {LONGEST}")
-        return self._read_exactly(length, request, deadline)
 
     def _read_exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
         """Read exactly `size` bytes, in any number of pieces; NoAnswerError at the deadline."""
@@ -238,7 +230,7 @@ class SerialPort:
     """A serial port in raw mode: /dev/rfcomm0, COM5, /dev/tty.NXT-DevB, a pseudo-terminal."""
 
     def __init__(self, port: serial.Serial) -> None:
-        self._port = port
+        self._port, self.name = port, str(port.name)
 
     @classmethod
     def open(cls, path: str) -> Self:
@@ -258,11 +250,6 @@ class SerialPort:
                 f"{path} cannot be opened ({_system_message(error)}); is the brick on, paired and bound to that port, "
                 "and does no other program use it?"
             ) from error
-
-    @property
-    def name(self) -> str:
-        """The port's path."""
-        return str(self._port.name)
 
     def read(self, size: int, timeout_s: float) -> bytes:
         """Return up to `size` bytes, fewer if no more arrive within `timeout_s`; LinkError if the line is cut."""

@@ -226,23 +226,6 @@ def test_a_scale_parameter_changes_linearly_first_and_by_a_factor_of_the_same_sl
         assert np.isfinite(variant.prior.log_prob(np.array([[3e-4, which]])))[0]
 
 
-@pytest.mark.single_case
-@pytest.mark.slow
-def test_a_rate_that_doubles_every_ten_degrees_is_named_with_its_slope_at_the_mean():
-    """By a factor of 64 over the table: linearly, it would fall below zero at the cold end."""
-    rng = np.random.default_rng(2)
-    rate = 0.02 * 2 ** ((_TEMP - _TEMP.mean()) / 10)
-    y = 10.0 * np.exp(-rate * _HOURS) + 0.05 * rng.standard_normal(_HOURS.size)
-    found = diagnose_system(SIMULATOR, _table(y), rng=np.random.default_rng(0))
-    assert found.verdict == "named"
-    assert found.combination == (NAME,)
-    (effect,) = [e for e in found.effects if e.name == NAME]
-    (slope,) = effect.parameters
-    assert slope.name == "a"
-    assert slope.mean == pytest.approx(0.02 * np.log(2) / 10, rel=0.05)
-    assert "exponentially" in effect.sentence
-
-
 def test_a_stored_model_of_an_earlier_version_depends_linearly():
     """Its file holds `a` alone: predictions are those of the same file with the new parameter at 0."""
     about = _about(1.0)

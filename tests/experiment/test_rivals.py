@@ -48,7 +48,7 @@ from probewise.experiment.rivals import rivals_of
 from probewise.experiment.stopping import trend_of_residuals
 from probewise.inference import Rounded
 from probewise.inquiry import Readout
-from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world, run_concealed_trial
+from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
 from probewise.proof.configurations import REFERENCE
 from probewise.proof.trial import Trial, arm_of, experiment_of, timed_steps
 from probewise.recordings import Plan, Recording, Uniform
@@ -421,19 +421,6 @@ def test_an_effect_found_in_a_run_counts_from_0_beside_one_from_far_away(sensor,
     plan = Plan.from_arrays(x_mm=[0.0, 300.0, 0.0], y_mm=[0.0, 0.0, 200.0], patterns=Uniform(0.0), unit="LEGO")
     expected = black + np.array([0.0, 300 * per_mm_x, 200 * per_mm_y])
     np.testing.assert_allclose(predict(mended, plan).mean, expected, rtol=1e-9)
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-def test_a_robot_that_doubts_finds_the_circle_and_what_is_wrong_with_its_sensor():
-    """Without doubt it ends sure and wrong on this circle or does not end.
-
-    A saturation is found in tests/cli/test_agreement.py.
-    """
-    found = run_concealed_trial(ConcealedTrial("ambient_gradient", 1, 0, 0.9, 40))
-    assert found["known"]
-    assert found["error_mm"] < 12.0
-    assert "ambient_gradient" in found["credible"]
 
 
 @pytest.mark.slow

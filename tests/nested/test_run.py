@@ -194,7 +194,7 @@ class Slab:
 @pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 @pytest.mark.parametrize(
     ("share", "max_calls"),
-    [*itertools.product((0.5, 0.1, 0.03), (100, 230, 1000, 3000)), (0.003, 3000), (0.001, 21_000)],
+    [(0.5, 100), (0.5, 3000), (0.1, 230), (0.03, 100), (0.03, 1000), (0.003, 3000), (0.001, 21_000)],
 )
 def test_the_call_limit_holds_where_a_part_of_the_prior_is_impossible(share: float, max_calls: int) -> None:
     problem = Slab(share)
@@ -300,9 +300,9 @@ def test_the_papers_rule_ends_a_run_on_a_plateau_before_its_points_are_copies():
 
 
 def test_first_live_points_forget_the_few_possible_draws_at_which_they_began() -> None:
-    """One of 5,040 draws is possible. Means of 50 points scatter between 20 seeds as those of independent points.
+    """One of 5,040 draws is possible. Means of 50 points scatter between ten seeds as those of independent points.
 
-    A ratio of variances above 3 has a probability of 1e-5 (chi-square of 19 degrees of freedom); of points that stayed
+    A ratio of variances above 4.4 has a probability of 1e-5 (chi-square of 9 degrees of freedom); of points that stayed
     with the three or four draws it would be above ten.
     """
 
@@ -311,9 +311,9 @@ def test_first_live_points_forget_the_few_possible_draws_at_which_they_began() -
 
     known = problems.Known(problems.box(7, 0, 1), function, 0.0)
     middle = []
-    for seed in range(20):
+    for seed in range(10):
         run = run_once(known, rng=np.random.default_rng([7, seed]), n_live=50, stop=lambda _: "at once")
         first = run.theta[run.log_birth == -np.inf]
         middle.append(first[:, 3].mean())
     # The fourth of seven ordered uniforms is Beta(4, 4), of variance 1/36.
-    assert np.var(middle, ddof=1) * 36 * 50 < 3.0
+    assert np.var(middle, ddof=1) * 36 * 50 < 4.4

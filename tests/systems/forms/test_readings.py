@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
+from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.templates import EffectTemplates
 from probewise.systems import Law, RunTable, Simulator
 from probewise.systems.forms.readings import delayed_readings, lagged_readings
@@ -106,16 +106,3 @@ def test_the_smooth_variant_has_a_twentieth_of_the_prior_of_the_first():
     variants = prepare_system(*_cups(0.8, 0.6)).effects["lag"].variants()
     templates = EffectTemplates((), (), variants, np.array([0, 0, 1]))
     np.testing.assert_allclose(templates.variant_probabilities(np.log([3.0, 1.0, 4.0])), [20 / 21, 1 / 21])
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-@pytest.mark.parametrize(("tau", "delay"), [(0.6, 0.0), (0.0, 0.5)])
-def test_a_thermometer_that_is_read_once_in_its_time_constant_is_told_from_one_that_comes_late(tau, delay):
-    found = diagnose_system(*_cups(0.8, tau, delay), rng=np.random.default_rng(0))
-    name = "lag" if tau else "delay"
-    assert found.combination == (name,)
-    (stated,) = next(effect.parameters for effect in found.effects if effect.name == name)
-    low, high = stated.interval95
-    assert low < tau + delay < high
-    assert high - low < 0.2

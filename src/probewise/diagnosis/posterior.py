@@ -222,6 +222,12 @@ _RETURNS, _PROXIMAL_STEPS = 2, 3  # Gauss-Newton steps to the ridge, of a walker
 _ROUNDING = 1e-13
 
 
+def _scale_and_unit(precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Split precisions, definite but for rounding, into the roots of their diagonals and definite matrices."""
+    scale = np.sqrt(np.einsum("kpp->kp", precision))
+    return scale, precision / scale[:, :, None] / scale[:, None] + _ROUNDING * np.eye(precision.shape[1])
+
+
 @dataclass(frozen=True, eq=False)
 class _Kernels:
     """A mixture of Student-t kernels: means (k, n_params), precisions (k, n_params, n_params), shares (k,), tails."""
@@ -234,8 +240,7 @@ class _Kernels:
     @cached_property
     def lower(self) -> FloatArray:
         """Cholesky factors of the precisions, definite but for rounding."""
-        scale = np.sqrt(np.einsum("kpp->kp", self.precision))
-        unit = self.precision / scale[:, :, None] / scale[:, None] + _ROUNDING * np.eye(self.mean.shape[1])
+        scale, unit = _scale_and_unit(self.precision)
         return np.asarray(np.linalg.cholesky(unit) * scale[:, :, None])
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -332,7 +337,8 @@ class _Ridge:
             left = self.law((self.problem.recording.readings[usable] - predicted).T).T
             left = (left / self._variance(self.best) ** 0.5).reshape(*points.shape[:2], -1)
             slopes, residuals = (left[:, :1] - left[:, 1:]) / steps[:, :, None], left[:, 0]
-        possible = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1)
+            # A prediction that ran away has squares beyond all numbers.
+            possible = np.isfinite(np.sum(slopes**2, axis=(1, 2)) + np.sum(residuals**2, axis=1))
         slopes, residuals = np.where(possible[:, None, None], slopes, 0.0), np.where(possible[:, None], residuals, 0.0)
         return slopes, residuals, slopes @ slopes.transpose(0, 2, 1) + self.eye, possible
 
@@ -343,7 +349,9 @@ class _Ridge:
             slopes, residuals, precision, _ = self._linearise(z)
             downhill = np.einsum("kpn,kn->kp", slopes, residuals) - z
             downhill += ((anchors - z)[:, None] @ firmness)[:, 0]
-            z = np.clip(z + np.linalg.solve(precision + firmness, downhill[:, :, None])[:, :, 0], -FARTHEST, FARTHEST)
+            scale, unit = _scale_and_unit(precision + firmness)
+            step = np.linalg.solve(unit, (downhill / scale)[:, :, None])[:, :, 0] / scale
+            z = np.clip(z + step, -FARTHEST, FARTHEST)
         return z
 
     def kernels_at_modes(self, fits: Sequence[Fit]) -> _Kernels:
@@ -382,7 +390,7 @@ class _Ridge:
         _, _, precision, _ = self._linearise(z)
         for _ in range(_STRIDES):
             lengths, axes = np.linalg.eigh(precision)
-            stride = np.einsum("kij,kj,klj,kl->ki", axes, lengths**-0.5, axes, way)
+            stride = np.einsum("kij,kj,klj,kl->ki", axes, np.maximum(lengths, 1.0) ** -0.5, axes, way)
             firmness = _FIRM / np.maximum(np.sum(stride**2, axis=1), LEAST_SCALE)[:, None, None] * self.eye
             z = self._drawn_to_ridge(np.clip(z + stride, -FARTHEST, FARTHEST), firmness, _RETURNS)
             _, residuals, precision, possible = self._linearise(z)

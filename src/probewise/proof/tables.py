@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.special import ndtr
@@ -305,7 +305,7 @@ def oracle_covariate_rate(hidden: Hidden) -> float:
     """Return the probability that the effect ranks before its most similar rival without any of its covariates."""
     shown = set(hidden["shows_in"])
     named = [name for name in hidden["cosines"] if name in VOCABULARY]
-    covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in named}
+    covariates = {name: VOCABULARY[name].covariates for name in named}
     covariates["ssf_order"] = ("edge_distance",)
     return _rate_against_closest_rival(hidden, {name for name, own in covariates.items() if shown & set(own)})
 

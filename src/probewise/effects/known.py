@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.priors import Marginal, Prior, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, Stage
@@ -49,8 +49,8 @@ class Known(WrappedEffect[V]):
     values: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if len(self.values) != len(self.effect.prior.names):
-            raise ParameterError("values", self.values, f"one number for each of {self.effect.prior.names}")
+        names = self.effect.prior.names
+        require(len(self.values) == len(names), "values", self.values, f"one number for each of {names}")
 
     @property
     def prior(self) -> Product:
@@ -85,8 +85,8 @@ class Estimated(Known[V]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.marginals) != len(self.values):
-            raise ParameterError("marginals", self.marginals, "as many as values, one for each")
+        as_many = len(self.marginals) == len(self.values)
+        require(as_many, "marginals", self.marginals, "as many as values, one for each")
 
     @property
     def informed(self) -> Informed[V]:

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.recordings.plan import Plan, Recording
 
 _FAR = 10.0  # of a recording's own lengths from 0
@@ -31,8 +31,8 @@ class Origin:
     y_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        if not np.isfinite([self.time_s, self.x_mm, self.y_mm]).all():
-            raise ParameterError("Origin", (self.time_s, self.x_mm, self.y_mm), "finite numbers")
+        given = (self.time_s, self.x_mm, self.y_mm)
+        require(np.isfinite(given).all(), "Origin", given, "finite numbers")
 
     @classmethod
     def of(cls, plan: Plan) -> Self:
@@ -88,8 +88,7 @@ class Extent:
     counted_from: Origin | None = None
 
     def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise ParameterError("Extent(low, high)", (self.low, self.high), "low < high")
+        require(self.low < self.high, "Extent(low, high)", (self.low, self.high), "low < high")
 
     @classmethod
     def usual(cls, origin: Origin) -> Self:
@@ -103,8 +102,7 @@ class Extent:
         Raises ParameterError if there is no usable reading.
         """
         readings = recording.readings[recording.usable]
-        if readings.size == 0:
-            raise ParameterError("usable readings", 0, "at least one; the recording holds none")
+        require(readings.size > 0, "usable readings", 0, "at least one; the recording holds none")
         low, high = float(readings.min()), float(readings.max())
         tiny = (max(abs(low), abs(high)) or 1.0) * 1e-6  # relative: the unit of a reading may be large
         return cls(low, max(high, low + tiny), recording.plan)

@@ -23,7 +23,7 @@ from probewise._posterior_samples import (
 )
 from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
-from probewise.errors import FileError, ParameterError, message_of, printable
+from probewise.errors import FileError, ParameterError, message_of, printable, require
 from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.io import read_text
 from probewise.recordings.table import csv_text, number_text
@@ -122,8 +122,8 @@ class FittedSystem(NamedSamples):
         ParameterError
             If the model is that of a diagnosis, which keeps samples only.
         """
-        if not self.best:
-            raise ParameterError("mode", None, "a model of `probewise fit` or fit_simulator(...).fitted; take median()")
+        allowed = "a model of `probewise fit` or fit_simulator(...).fitted; take median()"
+        require(self.best, "mode", None, allowed)
         return dict(zip(self.names, self.best, strict=True))
 
     def parameter_table(self) -> str:

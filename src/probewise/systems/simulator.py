@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path, checked_text, checked_texts, require_callable, require_kind, require_mapping
 from probewise.effects import EFFECTS, RARE_EFFECTS
-from probewise.errors import FileError, ParameterError, message_of, printable, shown
+from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
 from probewise.recordings.io import raising_exceptions, read_text, run_python_text
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable, read_run_table
 
-_A_RANGE = "(low, high) with low < high; None for an open end"
 _OF_SYSTEM = ("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise")
 _OF_LAW = ("states", "hold", "max_step_s")
 _NAMES = (*_OF_SYSTEM, "simulate", *_OF_LAW, "rates", "observe", "vectorized", "extra")  # in a file
@@ -77,15 +76,14 @@ class Noise:
         return cls(**given)
 
     def __post_init__(self) -> None:
-        if not (self.sd is None or isinstance(self.sd, str) or _is_positive_number(self.sd)):
-            raise ParameterError('noise["sd"]', self.sd, "a number greater than 0, the name of a column, or None")
-        if not (self.step is None or _is_positive_number(self.step)):
-            raise ParameterError('noise["step"]', self.step, "a number greater than 0, or None")
-        if not _is_finite_number(self.zero):
-            raise ParameterError('noise["zero"]', self.zero, "a finite number, the reading at zero signal")
+        is_sd = self.sd is None or isinstance(self.sd, str) or _is_positive_number(self.sd)
+        require(is_sd, 'noise["sd"]', self.sd, "a number greater than 0, the name of a column, or None")
+        is_step = self.step is None or _is_positive_number(self.step)
+        require(is_step, 'noise["step"]', self.step, "a number greater than 0, or None")
+        require(_is_finite_number(self.zero), 'noise["zero"]', self.zero, "a finite number, the reading at zero signal")
         is_pair = isinstance(self.range, Sequence) and not isinstance(self.range, str) and len(self.range) == 2
-        if not is_pair or not (_is_number(self.ends[0]) and _is_number(self.ends[1]) and self.ends[0] < self.ends[1]):
-            raise ParameterError('noise["range"]', self.range, _A_RANGE)
+        rises = is_pair and all(_is_number(end) for end in self.ends) and self.ends[0] < self.ends[1]
+        require(rises, 'noise["range"]', self.range, "(low, high) with low < high; None for an open end")
         object.__setattr__(self, "range", tuple(self.range))
 
     @property
@@ -118,12 +116,10 @@ class Law:
         require_callable("rates", self.rates, "a function rates(states, parameters, columns)")
         if self.observe is not None:
             require_callable("observe", self.observe, "a function observe(states, parameters, columns), or None")
-        if not self.states:
-            raise ParameterError("states", dict(self.states), "one state or more, each with where it starts")
-        if self.hold not in ("previous", "linear"):
-            raise ParameterError("hold", self.hold, "'previous' or 'linear'")
-        if self.max_step_s is not None and not 0 < self.max_step_s < np.inf:
-            raise ParameterError("max_step_s", self.max_step_s, "greater than 0")
+        require(self.states, "states", dict(self.states), "one state or more, each with where it starts")
+        require(self.hold in ("previous", "linear"), "hold", self.hold, "'previous' or 'linear'")
+        is_step = self.max_step_s is None or 0 < self.max_step_s < np.inf
+        require(is_step, "max_step_s", self.max_step_s, "greater than 0")
 
 
 @dataclass(frozen=True)
@@ -200,37 +196,32 @@ class Simulator:
         else:
             require_kind("law", self.law, Law, "a law of motion: Law(states, rates)")
         require_mapping("parameters", self.parameters, "the prior of each by name: {'tau_s': ('log', 1, 1000)}")
-        if not self.parameters:
-            raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
+        require(self.parameters, "parameters", {}, "one parameter or more, each with its prior")
         priors = {name: parse_prior(f"parameters[{name!r}]", prior) for name, prior in self.parameters.items()}
         object.__setattr__(self, "parameters", priors)
         object.__setattr__(self, "per_run", checked_texts("per_run", self.per_run, "names of parameters"))
         object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
         object.__setattr__(self, "noise", Noise.of(self.noise))
         require_mapping("extra", self.extra, "effects by name: {'drag': Extra(prior, null, says)}")
+        names = ", ".join(self.parameters)
         for name in self.per_run:
-            if name not in self.parameters:
-                raise ParameterError("per_run", name, f"a parameter: {', '.join(self.parameters)}")
-        if self.per_run and self.run is None:
-            allowed = 'nothing, or run = "..." with the column that names the runs'
-            raise ParameterError("per_run", list(self.per_run), allowed)
+            require(name in self.parameters, "per_run", name, f"a parameter: {names}")
+        allowed = 'nothing, or run = "..." with the column that names the runs'
+        require(not self.per_run or self.run is not None, "per_run", list(self.per_run), allowed)
         if self.law is not None:
-            if self.time is None:
-                raise ParameterError("time", None, "the column of time, which rates are integrated over")
+            require(self.time is not None, "time", None, "the column of time, which rates are integrated over")
             for state, start in self.law.states.items():
-                if not (start in self.parameters if isinstance(start, str) else _is_finite_number(start)):
-                    allowed = f"a number or a parameter: {', '.join(self.parameters)}"
-                    raise ParameterError(f"states[{state!r}]", start, allowed)
+                is_start = start in self.parameters if isinstance(start, str) else _is_finite_number(start)
+                require(is_start, f"states[{state!r}]", start, f"a number or a parameter: {names}")
         own = {}
         for name, effect in self.extra.items():
             require_kind(f"extra[{name!r}]", effect, Extra, "an Extra(prior, null, says), of probewise.systems")
             own[name] = replace(effect, prior=parse_prior(f"extra[{name!r}].prior", effect.prior))
-            if not _is_finite_number(effect.null):
-                raise ParameterError(f"extra[{name!r}].null", effect.null, "a finite number, at which it is absent")
-            if name in self.parameters:
-                raise ParameterError("extra", name, "names that no parameter has")
-            if name in _TAKEN:
-                raise ParameterError("extra", name, f"names that no effect of this program has: {', '.join(_TAKEN)}")
+            is_null = _is_finite_number(effect.null)
+            require(is_null, f"extra[{name!r}].null", effect.null, "a finite number, at which it is absent")
+            require(name not in self.parameters, "extra", name, "names that no parameter has")
+            allowed = f"names that no effect of this program has: {', '.join(_TAKEN)}"
+            require(name not in _TAKEN, "extra", name, allowed)
         object.__setattr__(self, "extra", own)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise._kinds import checked_path
-from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.cells import first_cell_without_number, parsed_numbers
 from probewise.recordings.columns import text_of_name
@@ -75,8 +75,7 @@ class RunTable:
         columns: dict[str, NDArray[Any]] = {}
         for name, given in self.columns.items():
             values: Any = given
-            if name in columns:  # a data frame may have two of one name
-                raise ParameterError("columns", f"{name} twice", "each column once")
+            require(name not in columns, "columns", f"{name} twice", "each column once")  # as a data frame may have two
             if name == self.time and name != self.run:
                 values, note = times_to_numbers(name, values, self.time_unit)
                 if note:
@@ -85,18 +84,15 @@ class RunTable:
             if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
                 note = f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
                 object.__setattr__(self, "notes", (*self.notes, note))
-        if not columns:
-            raise ParameterError("columns", (), "one or more")
+        require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
         for name, values in columns.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"column {name!r} has shape {values.shape}; allowed: ({n_points},), as the others")
-        if n_points == 0:
-            raise ParameterError("table", "without a row", "one row or more")
+        require(n_points > 0, "table", "without a row", "one row or more")
         object.__setattr__(self, "columns", columns)
         for what, column in (("time", self.time), ("run", self.run)):
-            if column is not None and column not in columns:
-                raise ParameterError(what, column, f"a column of the table: {', '.join(columns)}")
+            require(column is None or column in columns, what, column, f"a column of the table: {', '.join(columns)}")
         if self.time is not None:
             values = columns[self.time]
             if values.dtype != np.float64 or not np.isfinite(values).all():
@@ -210,8 +206,7 @@ class RunRecording(Recording):
     """Least noise as a share of the span of the readings: set by arithmetic, since real noise may be a millionth."""
 
     def _require_plan(self) -> None:
-        if not isinstance(self.plan, RunTable):
-            raise ParameterError("plan", self.plan, "a RunTable")
+        require(isinstance(self.plan, RunTable), "plan", self.plan, "a RunTable")
 
     @property
     def relative_sd(self) -> FloatArray:
@@ -356,11 +351,10 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
     ParameterError
         If there is no table, two are the same, or a column of numbers in the first has texts in another.
     """
-    if not tables:
-        raise ParameterError("tables", (), "one or more")
+    require(tables, "tables", (), "one or more")
     for (one, first), (another, second) in itertools.combinations(zip(sources, tables, strict=True), 2):
-        if _same_tables(first, second):
-            raise ParameterError("tables", f"{one} and {another}", "tables that differ; these hold the same rows")
+        allowed = "tables that differ; these hold the same rows"
+        require(not _same_tables(first, second), "tables", f"{one} and {another}", allowed)
     if len(tables) == 1:
         return tables[0], ()
     first, notes = tables[0], list[str]()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ShapeError, require
 from probewise.sensor import Footprint, SSFField, footprint_of, mean_ssf_field
 
 _SIGMAS = 5.0
@@ -106,8 +106,7 @@ def posterior_mean_ssf_field(
         The mean of the fields, not the field of the mean parameters. It extends five sds beyond all centres except the
         outermost thousandth of the mass.
     """
-    if not (pixel_mm > 0 and math.isfinite(pixel_mm)):
-        raise ParameterError("pixel_mm", pixel_mm, "greater than 0")
+    require(pixel_mm > 0 and math.isfinite(pixel_mm), "pixel_mm", pixel_mm, "greater than 0")
     weight = np.full(len(theta), 1 / len(theta)) if weight is None else weight / weight.sum()
     if weight.shape != (len(theta),):
         raise ShapeError(f"weight has shape {weight.shape}; allowed: ({len(theta)},), one per sample")

@@ -27,7 +27,7 @@ from probewise.calibration.priors import SSFPrior, blind_axis_rad, default_prior
 from probewise.calibration.quick import fit_orders_quickly
 from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
-from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.errors import DoubtfulResultWarning, ParameterError, require
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.nested import NestedResult, StopRule, Weighted, least_live
 from probewise.recordings import Recording, fingerprint
@@ -174,8 +174,7 @@ def calibrate(
     if executor is not None:
         require_like("executor", executor, ("submit",), "an Executor of concurrent.futures, or None")
     require_flag("quick", quick)
-    if quick and not refined:
-        raise ParameterError("refined", refined, "True with quick=True, or leave quick out")
+    require(not quick or refined, "refined", refined, "True with quick=True, or leave quick out")
     problems = ProblemsByOrder(recording, prior, data_sets)
     search = partial(search_prior_of_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
@@ -208,8 +207,7 @@ def _checked_orders(orders: object) -> tuple[int, ...]:
     if isinstance(orders, str) or not isinstance(orders, Iterable):
         raise ParameterError("orders", orders, allowed)
     asked = tuple(orders)
-    if not asked or not all(isinstance(n, Integral) and int(n) >= 1 for n in asked):
-        raise ParameterError("orders", asked, allowed)
+    require(asked and all(isinstance(n, Integral) and int(n) >= 1 for n in asked), "orders", asked, allowed)
     return tuple(dict.fromkeys(int(n) for n in asked))
 
 

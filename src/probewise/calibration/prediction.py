@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray, floats, own_arithmetic
 from probewise.calibration.sensor_file import FittedSensor, require_fitted_sensor
 from probewise.effects import EFFECTS, Origin
 from probewise.effects.noise_distribution import PredictiveMixture
-from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
+from probewise.errors import DoubtfulResultWarning, ShapeError, require
 from probewise.progress import Progress, silent
 from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_patterns_described, require_plan
@@ -67,8 +67,7 @@ def predict(
     """
     require_fitted_sensor(sensor, "in the order predict(sensor, plan)")
     if isinstance(plan, Recording):
-        if readings is not None:
-            raise ParameterError("readings", readings, "none together with a recording, which has its own")
+        require(readings is None, "readings", readings, "none together with a recording, which has its own")
         readings, plan = plan.readings, plan.plan
     require_plan(plan)
     require_patterns_described(plan)

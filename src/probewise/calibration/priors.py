@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, rounding_error
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
 from probewise.recordings import Uniform as UniformPattern
@@ -118,8 +118,7 @@ class SSFPrior:
     def __post_init__(self) -> None:
         if self.n_gaussians < 1:
             raise ParameterError("n_gaussians", self.n_gaussians, "1 or more")
-        if not 0 < self.max_correlation < 1:
-            raise ParameterError("max_correlation", self.max_correlation, "above 0, below 1")
+        require(0 < self.max_correlation < 1, "max_correlation", self.max_correlation, "above 0, below 1")
         if self.unit_mass_mm2 is not None and not self.unit_mass_mm2 > 0:
             raise ParameterError("unit_mass_mm2", self.unit_mass_mm2, "greater than 0, or None")
 
@@ -330,8 +329,7 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     usable = recording.usable
     readings = recording.readings[usable]
     named = recording.source or "recording"
-    if readings.size == 0:
-        raise ParameterError(named, f"{len(recording)} rows, none usable", "readings present and within min..max")
+    require(readings.size != 0, named, f"{len(recording)} rows, none usable", "readings present and within min..max")
     low, high = float(readings.min()), float(readings.max())
     if not low < high:
         raise ParameterError(

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import IntArray
 from probewise.calibration.priors import SSFPrior
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ShapeError, require
 from probewise.inference import SensorProblem, student_t_of
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 from probewise.nested.importance import MOST_K
@@ -59,8 +59,7 @@ class ProblemsByOrder:
     def prior_of(self, n_gaussians: int) -> SSFPrior:
         """Return the prior of an order; ParameterError if it is no `SSFPrior`."""
         found = self.prior(self.recording, n_gaussians)
-        if not isinstance(found, SSFPrior):
-            raise ParameterError("prior", found, "an SSFPrior")
+        require(isinstance(found, SSFPrior), "prior", found, "an SSFPrior")
         return found
 
     def problem(self, n_gaussians: int) -> SensorProblem:

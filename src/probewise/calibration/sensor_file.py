@@ -29,7 +29,7 @@ from probewise.calibration.priors import PriorRow
 from probewise.effects import EFFECTS, OTHER_FORMS, Extent, Origin
 from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
 from probewise.effects.reference import ZERO
-from probewise.errors import FileError, ParameterError, ProbewiseError, printable, shown
+from probewise.errors import FileError, ParameterError, ProbewiseError, printable, require, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
@@ -483,6 +483,5 @@ def _read(path: object, value: Any, form: Any, place: str = "") -> Any:
 
 def _mask_of_rows(rows: FloatArray, n: int) -> BoolArray:
     """Convert the numbers of rows to a mask, (n,)."""
-    if not np.isin(rows, np.arange(n)).all():
-        raise ParameterError("absent", rows.tolist(), f"whole numbers from 0 to {n - 1}")
+    require(np.isin(rows, np.arange(n)).all(), "absent", rows.tolist(), f"whole numbers from 0 to {n - 1}")
     return np.isin(np.arange(n), rows)

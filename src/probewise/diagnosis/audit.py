@@ -48,7 +48,7 @@ from probewise.diagnosis.templates import templates_of_effect
 from probewise.diagnosis.words import substitute_reading_unit
 from probewise.effects import NUISANCES, VOCABULARY, Effect, Extent, LightEffect, name_of_first_copy
 from probewise.effects.noise import noise_of_runs, noise_per_run
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
 from probewise.sensor import Stage, is_free_form
@@ -341,8 +341,7 @@ def audit_plan(
     require_plan(plan)
     if sensor is not None:
         require_sensor_prior(sensor)
-    if len(plan) == 0:
-        raise ParameterError("plan", "no row", "at least one")
+    require(len(plan) != 0, "plan", "no row", "at least one")
     require_patterns_described(plan)
     if sensor is not None:
         require_same_unit(sensor, plan)
@@ -437,8 +436,7 @@ def _expected_sensor(
         null, z = default_sensor(Extent(low, high, plan), 2), _TYPICAL.copy()
         said = f"a typical sensor of {low:g} to {high:g}"
     sd = _NOISE * (high - low) if noise_sd is None else noise_sd
-    if not sd > 0:
-        raise ParameterError("noise_sd", sd, "greater than 0")
+    require(sd > 0, "noise_sd", sd, "greater than 0")
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
     return Expected(null, z, sd, partial(_effects_under, effects, (low, high)), said)
 

@@ -23,7 +23,7 @@ from probewise.diagnosis.posterior import NUMBERS, HypothesisProblem, draw_by_im
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node
 from probewise.diagnosis.simulator_fit import log_evidence_of, modes_of
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
-from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require
 from probewise.nested import Weighted
 from probewise.nested.repartition import repartitioned
 from probewise.progress import Progress, silent
@@ -200,8 +200,7 @@ def fit_simulator(
     recording, about = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).about
     system = about.system
     usable = recording.usable
-    if prepared.has_only_equal_readings:
-        raise ParameterError("readings", "all equal", "readings of which some differ")
+    require(not prepared.has_only_equal_readings, "readings", "all equal", "readings of which some differ")
     progress("looking for the modes")
     law = white_noise_of_recording(recording)
     first = cast(FloatArray, cast(System, prepared.null).first)

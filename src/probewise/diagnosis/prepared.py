@@ -27,7 +27,7 @@ from probewise.diagnosis.sensors import (
 )
 from probewise.effects import Effect, Extent, NoiseEffect
 from probewise.effects.noise import LARGEST_SIZE
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.recordings.patterns import Pattern, have_same_albedo
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_recording
 from probewise.sensor import COMMANDED, Stage, with_declared_height_commanded
@@ -45,8 +45,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
     """
     if isinstance(recordings, str) or not isinstance(recordings, Sequence):
         require_recording(recordings)
-    if not recordings:
-        raise ParameterError("recordings", (), "one or more")
+    require(recordings, "recordings", (), "one or more")
     for recording in recordings:
         require_recording(recording)
     first = recordings[0]

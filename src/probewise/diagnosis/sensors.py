@@ -26,7 +26,7 @@ from probewise._kinds import require_like
 from probewise.calibration import FittedSensor, mixture_moments
 from probewise.diagnosis.fit import FARTHEST, Model, Null
 from probewise.effects import Effect, Extent
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.priors import Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene import AnyOf, KnownScene, Region, Scene, Shape
@@ -316,8 +316,7 @@ class SensorAndShape(CalibratedSensor):
 
         Of a set of shapes (`AnyOf`), only the best-fitting one is kept. Raises ParameterError if no reading is usable.
         """
-        if not recording.usable.any():
-            raise ParameterError("usable readings", 0, "at least one; the recording holds none")
+        require(recording.usable.any(), "usable readings", 0, "at least one; the recording holds none")
         known = sensor_from_samples(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
         found = [_search_for_shapes(cls.over(known, member, np.empty((0, 0))), recording, rng) for member in members]

@@ -19,7 +19,7 @@ from probewise._kinds import require_kind, require_mapping
 from probewise._words import unit_after_number, value_with_sd
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import ZERO, Extent, Origin
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.priors import HeavyTailedPrior, Marginal, Prior, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -472,8 +472,7 @@ def require_effect_kinds(effects: object) -> None:
         require_kind(
             f"effects[{name!r}]", kind, LightEffect, "a function decorated with probewise.effects.light_effect"
         )
-        if kind.name != name:
-            raise ParameterError("effects", name, f"{kind.name!r}, the name of that effect")
+        require(kind.name == name, "effects", name, f"{kind.name!r}, the name of that effect")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

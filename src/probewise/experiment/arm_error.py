@@ -19,7 +19,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.geometry import FITTED, Accuracy, Geometry, place_jacobian
 from probewise.arm.instrument import Reading
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.experiment.kinds import HypothesisKind, Posterior
 from probewise.experiment.setup import Experiment
 from probewise.inference.problem import checked_log_prob
@@ -100,8 +100,7 @@ def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accura
     """
     root = _covariance_factor(np.array(accuracy.covariance))
     place = place_jacobian(geometry, places_mm) @ root
-    if not np.isfinite(place).all():
-        raise ParameterError("readings", "a place out of the arm's reach", "readings of this arm")
+    require(np.isfinite(place).all(), "readings", "a place out of the arm's reach", "readings of this arm")
     turned = np.broadcast_to(root[FITTED.index("base home")], place[:, :1].shape)
     return np.concatenate([place, turned], axis=1)
 

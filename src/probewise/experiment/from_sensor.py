@@ -14,7 +14,7 @@ from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
 from probewise.effects import Estimated, Known
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.experiment.method import NestedSampling
 from probewise.experiment.paper import least_sd, student_t_likelihood
 from probewise.experiment.rivals import OF_MOTION, DescribedEffect, FromRest
@@ -156,8 +156,7 @@ def experiment_for(
         ("heights_mm", heights_mm, bool(heights_mm) and sensor.instrumentation.height_mm is None, _NO_HEIGHT),
     )
     for name, value, wrong, allowed in refused:
-        if wrong:
-            raise ParameterError(name, value, allowed)
+        require(not wrong, name, value, allowed)
     sensor = sensor.with_leading_effects()  # a mean over several hypotheses describes none of them
     noise_sd = float(sensor.noise_sd.mean())
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)

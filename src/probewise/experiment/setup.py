@@ -16,7 +16,7 @@ from probewise._version import __version__
 from probewise.arm.geometry import Geometry, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.experiment.journal import recording_of, value_digest
 from probewise.experiment.kinds import HypothesisKind, KindProblem, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
@@ -239,8 +239,7 @@ class Experiment:
             ("model.names", self.model.names, self.model.names == self.prior.names, of_shape),
             ("shape", self.names, has_lengths, "a shape with a parameter in mm, which the run can stop on"),
         ):
-            if not fits:
-                raise ParameterError(name, value, allowed)
+            require(fits, name, value, allowed)
         if self.trust < 1:
             _ = self._rivals
         _ = self.readout, self.designs  # their constructors check the values

@@ -17,7 +17,7 @@ from probewise._kinds import checked_finite_number, require_rng
 from probewise.arm import Geometry, Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
-from probewise.errors import ParameterError, did_you_mean, printable
+from probewise.errors import ParameterError, did_you_mean, printable, require
 from probewise.experiment.journal import value_digest
 from probewise.recordings import Disc, Instrumentation, Polygon
 from probewise.scene import (
@@ -230,8 +230,7 @@ class HiddenShape:
                 return Disc((center[0], center[1]), axes[0])
             return Oval((center[0], center[1]), (axes[0], axes[1]), float(region.angle_rad[0]))
         (outline,) = outlines(region, n_vertices=_PAINTED_VERTICES)
-        if np.isnan(outline).any():
-            raise ParameterError("shape", self.name, "one whose outline is one closed line")
+        require(not np.isnan(outline).any(), "shape", self.name, "one whose outline is one closed line")
         return Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
 
     @property
@@ -260,6 +259,5 @@ def _theta_in_prior_order(names: Sequence[str], values: object) -> FloatArray:
     """
     if not isinstance(values, Mapping):
         return floats(values, "truth")  # type: ignore[arg-type]
-    if set(values) != set(names):
-        raise ParameterError("truth", values, f"one number for each of {', '.join(names)}")
+    require(set(values) == set(names), "truth", values, f"one number for each of {', '.join(names)}")
     return np.array([checked_finite_number(f"truth[{name!r}]", values[name]) for name in names])

@@ -20,7 +20,7 @@ from scipy.special import gammainc, gammaincc, gammaln
 
 from probewise._arrays import FloatArray, IntArray, floats, frozen_int, read_only_floats
 from probewise._kinds import checked_number
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -55,8 +55,7 @@ class Naive:
         for name in ("mu_black", "sd_black", "mu_white", "sd_white"):
             checked_number(name, getattr(self, name))
         for name in ("sd_black", "sd_white"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ParameterError(name, getattr(self, name), "greater than 0, finite")
+            require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "greater than 0, finite")
         if not (math.isfinite(self.mu_black) and math.isfinite(self.mu_white)) or self.mu_black == self.mu_white:
             raise ParameterError("(mu_black, mu_white)", (self.mu_black, self.mu_white), "finite and different")
 

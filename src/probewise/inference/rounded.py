@@ -13,7 +13,7 @@ from scipy.special import log_ndtr
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number
 from probewise.effects.noise_distribution import log_gaussian_mass_between
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.inference.likelihoods import residuals
 
 _FAR = 200.0  # sds from the prediction that the table covers
@@ -99,10 +99,8 @@ class Rounded:
         for name in ("sd", "step", "low", "high"):
             checked_number(name, getattr(self, name))
         for name in ("sd", "step"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ParameterError(name, getattr(self, name), "greater than 0, finite")
-        if not self.low < self.high:
-            raise ParameterError("(low, high)", (self.low, self.high), "low < high")
+            require(0 < getattr(self, name) < math.inf, name, getattr(self, name), "greater than 0, finite")
+        require(self.low < self.high, "(low, high)", (self.low, self.high), "low < high")
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the log probability of readings, (n_points,), by predictions (n_samples, n_points): (n_samples,)."""

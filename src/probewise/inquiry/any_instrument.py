@@ -21,7 +21,7 @@ from scipy.special import chdtrc, logsumexp, ndtri
 from probewise._arrays import FloatArray, IntArray, floats, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_callable, require_rng
-from probewise.errors import ParameterError, ShapeError, did_you_mean
+from probewise.errors import ParameterError, ShapeError, did_you_mean, require
 from probewise.inquiry.entropy import choose
 from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
 from probewise.inquiry.smc import STEADY, nested_sampling_from_scratch, particles_from_run, prior_particles, update
@@ -133,8 +133,7 @@ class Settings:
 def _checked_column(name: str, values: Any) -> Column:
     """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
     array = np.asarray(values)
-    if array.ndim != 1 or not array.size or array.dtype.kind not in "biufU":
-        raise ParameterError(name, values, _ALLOWED)
+    require(array.ndim == 1 and array.size and array.dtype.kind in "biufU", name, values, _ALLOWED)
     _require_texts_given(name, values, array)
     if array.dtype.kind != "U":
         array = array.astype(np.float64)
@@ -404,8 +403,7 @@ class Inquiry(ShowsItself):
 
         Raises ParameterError if the inquiry has no goal.
         """
-        if not self._goal:
-            raise ParameterError("goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
+        require(self._goal, "goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
         return self._largest_sd_over_goal <= 1.0
 
     @property
@@ -575,13 +573,11 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
     """Return the target sds by parameter, empty if no goal is given; ParameterError for anything else."""
     if goal is None:
         return {}
-    if not isinstance(goal, Mapping) or not goal:
-        raise ParameterError("goal", goal, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
+    require(isinstance(goal, Mapping) and goal, "goal", goal, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
     for name, sd in goal.items():
         if name not in names:
             raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
-        if not checked_finite_number(f"goal[{name!r}]", sd) > 0:
-            raise ParameterError(f"goal[{name!r}]", sd, "greater than 0")
+        require(checked_finite_number(f"goal[{name!r}]", sd) > 0, f"goal[{name!r}]", sd, "greater than 0")
     return dict(goal)
 
 

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, read_only_floats
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 from probewise.recordings.plan import Plan
 
 _MOST_REPEATS = 1000
@@ -26,8 +26,7 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ParameterError(name, getattr(self, name), "finite, greater than 0")
+            require(0 < getattr(self, name) < np.inf, name, getattr(self, name), "finite, greater than 0")
         for name in ("n_x", "n_y"):
             if getattr(self, name) < 2:
                 raise ParameterError(name, getattr(self, name), "2 or more")
@@ -120,8 +119,7 @@ class Designs:
         if not self.repeats or min(self.repeats) < 1 or max(self.repeats) > _MOST_REPEATS:
             raise ParameterError("repeats", self.repeats, f"one number or more, each from 1 to {_MOST_REPEATS}")
         for name, values in self.settings:
-            if not values or not np.isfinite(values).all():
-                raise ParameterError(f"settings {name}", values, "one finite value or more")
+            require(values and np.isfinite(values).all(), f"settings {name}", values, "one finite value or more")
 
     def __len__(self) -> int:
         return self.grid.n_places * len(self.setting_combinations)

@@ -16,7 +16,7 @@ from scipy.special import gammaln, ndtr, stdtr
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_number
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 from probewise.inquiry.utilities import WeightsGivenReading
 from probewise.priors import Marginal
 
@@ -63,15 +63,13 @@ class ReadingNoise:
     between: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.sd, type | str | bytes):
-            raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
+        require(not isinstance(self.sd, type | str | bytes), "noise sd", self.sd, _ALLOWED_SD)
         is_number = not (self.is_sd_inferred or callable(self.sd))
         if is_number and not 0 < checked_number("noise sd", self.sd, _ALLOWED_SD) < math.inf:
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
         if self.is_sd_inferred and not np.min(self.sd.from_unit(np.array([1e-9, 0.5]))) > 0:  # type: ignore[union-attr]
             raise ParameterError("noise sd", self.sd, "a prior of numbers greater than 0, such as LogUniform(0.1, 10)")
-        if not checked_number("dof", self.dof) > 0:
-            raise ParameterError("dof", self.dof, "greater than 0; infinity is the Gaussian")
+        require(checked_number("dof", self.dof) > 0, "dof", self.dof, "greater than 0; infinity is the Gaussian")
         if not 0 <= checked_number("outliers", self.outliers) < 1:
             raise ParameterError(
                 "outliers", self.outliers, "0 or more, below 1: the share of readings that are outliers"

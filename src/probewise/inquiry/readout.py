@@ -10,7 +10,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.priors import Prior
 
 _REACH = 5.0  # noise sds beyond the levels that the cells cover
@@ -58,12 +58,9 @@ class Readout:
     high: float = math.inf
 
     def __post_init__(self) -> None:
-        if not 0 < self.noise_sd < math.inf:
-            raise ParameterError("noise_sd", self.noise_sd, "finite, greater than 0")
-        if self.step is not None and not 0 < self.step < math.inf:
-            raise ParameterError("step", self.step, "finite, greater than 0, or None")
-        if not self.low < self.high:
-            raise ParameterError("(low, high)", (self.low, self.high), "low < high")
+        require(0 < self.noise_sd < math.inf, "noise_sd", self.noise_sd, "finite, greater than 0")
+        require(self.step is None or 0 < self.step < math.inf, "step", self.step, "finite, greater than 0, or None")
+        require(self.low < self.high, "(low, high)", (self.low, self.high), "low < high")
 
     def require_in_range(self, value: float) -> None:
         """Raise ParameterError for a reading out of range; NaN, a missing reading, passes."""
@@ -192,8 +189,7 @@ def fewest_readings(
     is the probability, above 0 and below 1, that the best first place lies on the shape: a search reading answers yes
     or no, with at most this probability of yes as long as no better place arises. ParameterError for other numbers.
     """
-    if not 0 < most_covered < 1:
-        raise ParameterError("most_covered", most_covered, "greater than 0, less than 1")
+    require(0 < most_covered < 1, "most_covered", most_covered, "greater than 0, less than 1")
     if not prior_bits >= met_bits >= target_bits:
         raise ParameterError(
             "(prior_bits, met_bits, target_bits)", (prior_bits, met_bits, target_bits), "in descending order"
@@ -214,8 +210,7 @@ def capacity_bits(low: float, high: float, readout: Readout) -> float:
     The capacity-achieving distribution of levels is found by the Blahut-Arimoto iteration (1972), until the bounds are
     within 1e-4 bits. ParameterError unless `low` is below `high`.
     """
-    if not low < high:
-        raise ParameterError("(low, high)", (low, high), "low < high")
+    require(low < high, "(low, high)", (low, high), "low < high")
     levels = evenly_spaced_levels(low, high, readout.noise_sd / _PER_SD)
     chance = readout.cell_probability(levels)
     given = -entropy_bits(chance)

@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, require_finite
-from probewise.errors import ParameterError, did_you_mean
+from probewise.errors import ParameterError, did_you_mean, require
 from probewise.inquiry.entropy import UtilityMap, choose, label_entropy, map_of_rows
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
@@ -248,8 +248,7 @@ class ReadingEntropy:
     label: ClassVar[str] = "entropy (bits)"
 
     def __post_init__(self) -> None:
-        if not (0 < self.bin_width < np.inf):
-            raise ParameterError("bin_width", self.bin_width, "finite, greater than 0")
+        require(0 < self.bin_width < np.inf, "bin_width", self.bin_width, "finite, greater than 0")
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Return the entropy in bits at every available design, (n,)."""
@@ -338,8 +337,7 @@ class Finishing:
     least: float = 0.25
 
     def __post_init__(self) -> None:
-        if not 0 < self.least <= 1:
-            raise ParameterError("least", self.least, "greater than 0, 1 or less")
+        require(0 < self.least <= 1, "least", self.least, "greater than 0, 1 or less")
 
     @property
     def label(self) -> str:
@@ -418,8 +416,7 @@ class ParameterValue:
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """Return the bin of each hypothesis's parameter: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
-        if self.name not in names:
-            raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
+        require(self.name in names, "parameter", self.name, f"one of {', '.join(names)}")
         order = np.argsort(theta[:, names.index(self.name)], kind="stable")
         before = np.cumsum(weight[order]) - 0.5 * weight[order]
         out = np.empty(len(theta), dtype=np.int64)
@@ -436,8 +433,7 @@ class WhichShape:
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """Return the number of each hypothesis's shape in the set, (n_samples,)."""
-        if "shape" not in names:
-            raise ParameterError("names", names, "shape among them: the hypotheses of two shapes or more")
+        require("shape" in names, "names", names, "shape among them: the hypotheses of two shapes or more")
         return np.floor(theta[:, names.index("shape")]).astype(np.int64)
 
 

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise._kinds import require_rng
-from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.errors import DoubtfulResultWarning, ParameterError, require
 from probewise.nested.check import DISAGREE
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate, n_independent
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
@@ -166,11 +166,9 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
     names, seeds = parts[0].names, list[object]()
-    if not names:
-        raise ParameterError("results", "runs without parameters", "runs with some; the evidence is exact without")
+    require(names, "results", "runs without parameters", "runs with some; the evidence is exact without")
     for number, result in enumerate(parts, start=1):
-        if result.names != names:
-            raise ParameterError(f"names of run {number}", result.names, f"those of the first run, {names}")
+        require(result.names == names, f"names of run {number}", result.names, f"those of the first run, {names}")
         if not np.array_equal(n_alive_at_death(*(getattr(result, name) for name in _LEVELS)), result.n_at_death):
             allowed = "complete runs of nested sampling, in the order of log likelihood and label"
             raise ParameterError(f"n_at_death of run {number}", "not what births and deaths give", allowed)

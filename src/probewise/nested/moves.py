@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.nested.clusters import Clusters
 from probewise.nested.problem import Bound, Evaluator, Points
 from probewise.nested.slice import AXIS, DIFFERENCE, FRAME, HOP, SliceChains
@@ -122,8 +122,7 @@ class SliceMove:
     fewest_steps: int = _FEWEST_STEPS
 
     def __post_init__(self) -> None:
-        if not self.steps_per_param > 0:
-            raise ParameterError("steps_per_param", self.steps_per_param, "greater than 0")
+        require(self.steps_per_param > 0, "steps_per_param", self.steps_per_param, "greater than 0")
         if not (self.axes >= 0 and self.differences >= 0 and self.axes + self.differences <= 1):
             raise ParameterError("(axes, differences)", (self.axes, self.differences), "0 or more, together at most 1")
         if self.hops < 0:
@@ -277,12 +276,9 @@ class KernelMove:
     otherwise: SliceMove = field(default_factory=SliceMove)
 
     def __post_init__(self) -> None:
-        if not self.moves > 0:
-            raise ParameterError("moves", self.moves, "greater than 0")
-        if not self.n_proposals >= 1:
-            raise ParameterError("n_proposals", self.n_proposals, "1 or more")
-        if not self.patience >= 1:
-            raise ParameterError("patience", self.patience, "1 or more")
+        require(self.moves > 0, "moves", self.moves, "greater than 0")
+        require(self.n_proposals >= 1, "n_proposals", self.n_proposals, "1 or more")
+        require(self.patience >= 1, "patience", self.patience, "1 or more")
 
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator

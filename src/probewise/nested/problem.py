@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._kinds import require_callable, require_like
-from probewise.errors import NotConvergedError, ParameterError, message_of
+from probewise.errors import NotConvergedError, ParameterError, message_of, require
 from probewise.priors import Coordinates, Marginal, Prior, Product, Uniform, require_prior
 
 AnyPrior: TypeAlias = "Prior | Mapping[str, Any] | Sequence[Any] | Callable[[FloatArray], Any]"
@@ -112,11 +112,9 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
     ParameterError if `periodic` names parameters that the prior does not have, or the prior has coordinates.
     """
     if hasattr(prior, "coordinates"):
-        if periodic:
-            raise ParameterError("periodic", tuple(periodic), "none: the prior has coordinates of its own")
+        require(not periodic, "periodic", tuple(periodic), "none: the prior has coordinates of its own")
         return Space(prior, prior.coordinates)
-    if not set(periodic) <= set(prior.names):
-        raise ParameterError("periodic", tuple(periodic), f"names among {prior.names}")
+    require(set(periodic) <= set(prior.names), "periodic", tuple(periodic), f"names among {prior.names}")
     return Space(prior, None, tuple(prior.names.index(name) for name in periodic))
 
 
@@ -489,22 +487,18 @@ class _ScipyMarginal:
 
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
     """Convert a prior in any form that `make_problem` takes to one with names; ParameterError for anything else."""
-    if isinstance(names, str):
-        raise ParameterError("names", names, "a list of names: names=['x', 'y']")
+    require(not isinstance(names, str), "names", names, "a list of names: names=['x', 'y']")
     given = None if names is None else tuple(str(name) for name in names)
     made: Prior
-    if isinstance(prior, type):
-        raise ParameterError("prior", prior, _ALLOWED_PRIOR)
+    require(not isinstance(prior, type), "prior", prior, _ALLOWED_PRIOR)
     if isinstance(prior, Mapping):
         made = Product({str(name): _as_marginal(f"prior[{name!r}]", one) for name, one in prior.items()})
     elif hasattr(prior, "names") and hasattr(prior, "from_unit_cube"):
         made = cast(Prior, prior)
     elif isinstance(prior, Sequence) and not isinstance(prior, str | bytes):
         chosen = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
-        if len(chosen) != len(prior):
-            raise ParameterError("names", names, f"{len(prior)} names, one for each distribution")
-        if len(set(chosen)) != len(chosen):
-            raise ParameterError("names", names, "each name once")
+        require(len(chosen) == len(prior), "names", names, f"{len(prior)} names, one for each distribution")
+        require(len(set(chosen)) == len(chosen), "names", names, "each name once")
         made = Product(
             {n: _as_marginal(f"prior[{i}]", one) for i, (n, one) in enumerate(zip(chosen, prior, strict=True))}
         )
@@ -512,15 +506,12 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
         if given is None:
             allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"
             raise ParameterError("names", None, allowed)
-        if len(set(given)) != len(given):
-            raise ParameterError("names", names, "each name once")
+        require(len(set(given)) == len(given), "names", names, "each name once")
         made = cast(Prior, _TransformPrior(given, prior, vectorized))
     else:
         raise ParameterError("prior", prior, _ALLOWED_PRIOR)
-    if len(set(made.names)) != len(made.names):
-        raise ParameterError("names of the prior", made.names, "each name once")
-    if given is not None and given != made.names:
-        raise ParameterError("names", names, f"those of the prior, {made.names}, or none")
+    require(len(set(made.names)) == len(made.names), "names of the prior", made.names, "each name once")
+    require(given is None or given == made.names, "names", names, f"those of the prior, {made.names}, or none")
     return made
 
 

@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole, require_callable, require_rng
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
@@ -85,8 +85,7 @@ def refine(
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)
     evaluate, space = _evaluator_and_space(problem, result, "result")
-    if not result.names:
-        raise ParameterError("result", "a run without parameters", "one with some; the evidence is exact without")
+    require(result.names, "result", "a run without parameters", "one with some; the evidence is exact without")
     n_lineages = effective_lineages(result)
     fitted, held = _split_off_held_out(result, n_lineages, space, rng)
     known = [fitted]
@@ -186,8 +185,7 @@ def update(
 def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tuple[Evaluator, Space]:
     """Return a problem's evaluator and unbounded coordinates; ParameterError if `found` has other parameters."""
     evaluate = Evaluator(problem)
-    if found.names != evaluate.names:
-        raise ParameterError(f"{name}.names", found.names, f"the problem's names {evaluate.names}")
+    require(found.names == evaluate.names, f"{name}.names", found.names, f"the problem's names {evaluate.names}")
     return evaluate, unbounded_space_of(problem.prior)
 
 

@@ -23,7 +23,7 @@ from probewise._display import ShowsItself
 from probewise._kinds import checked_number, checked_path, checked_whole, require_rng
 from probewise._version import __version__
 from probewise._writing import write_bytes_atomically
-from probewise.errors import FileError, ParameterError, ShapeError, message_of, shown
+from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
 from probewise.nested.evidence import birth_rows, log_volumes
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
@@ -284,8 +284,7 @@ class NestedResult(Samples):
         likelihood `log_l`, the level `log_l_birth` above which it was drawn, and its `row` in the result. Attributes
         are those of the run. ImportError if arviz is not installed; ParameterError if there are no parameters.
         """
-        if not self.names:
-            raise ParameterError("names", self.names, "one parameter or more; without any there are no samples")
+        require(self.names, "names", self.names, "one parameter or more; without any there are no samples")
         arviz = _import_optional("arviz")
         told = ("log_z", "log_z_error", "n_eff", "n_calls", "n_live", "stop_reason")
         attributes = {

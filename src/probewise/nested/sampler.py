@@ -33,7 +33,7 @@ from probewise._kinds import (
     require_like,
     require_rng,
 )
-from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
+from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require
 from probewise.nested.check import check_and_repeat
 from probewise.nested.evidence import (
     DOUBTFUL_P_VALUE,
@@ -99,8 +99,7 @@ class RemainingEvidence:
     dlogz: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0 < self.dlogz < math.inf:
-            raise ParameterError("dlogz", self.dlogz, "greater than 0, finite")
+        require(0 < self.dlogz < math.inf, "dlogz", self.dlogz, "greater than 0, finite")
 
     def __call__(self, state: RoundSummary) -> str | None:
         """Return the reason to stop, or None."""
@@ -120,8 +119,7 @@ class EvidenceChange:
     tolerance: float = 1e-8
 
     def __post_init__(self) -> None:
-        if not 0 < self.tolerance < math.inf:
-            raise ParameterError("tolerance", self.tolerance, "greater than 0, finite")
+        require(0 < self.tolerance < math.inf, "tolerance", self.tolerance, "greater than 0, finite")
 
     def __call__(self, state: RoundSummary) -> str | None:
         """Return the reason to stop, or None."""
@@ -222,8 +220,7 @@ def run(
     """
     require_rng(rng)
     posed = as_problem(problem, prior, names, vectorized, pass_dict, periodic)
-    if not checked_number("max_cost", max_cost) >= 1:
-        raise ParameterError("max_cost", max_cost, "1 (no check) or more")
+    require(checked_number("max_cost", max_cost) >= 1, "max_cost", max_cost, "1 (no check) or more")
     moving: Move = SliceMove() if move is None else move
     once = partial(
         run_once, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
@@ -407,8 +404,7 @@ def _checked_n_live_and_n_replaced(
         allowed = f"up to {most:,} for {n_params} parameters, whose arrays take {_MOST_BYTES >> 20} MB; {way_out}"
         raise ParameterError("n_live", n_live, allowed)
     n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
-    if not 1 <= n_replaced <= n_live // 2:
-        raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
+    require(1 <= n_replaced <= n_live // 2, "n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
     if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
         raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
     return n_live, n_replaced

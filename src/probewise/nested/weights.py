@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import ParameterError
+from probewise.errors import require
 
 
 def n_effective(log_weight: FloatArray) -> float:
@@ -60,8 +60,7 @@ def weighted_quantiles(
     ParameterError if a level is not between 0 and 1.
     """
     levels = np.asarray(q, dtype=np.float64)
-    if levels.ndim != 1 or not ((levels >= 0) & (levels <= 1)).all():
-        raise ParameterError("q", q, "a list of numbers from 0 to 1")
+    require(levels.ndim == 1 and ((levels >= 0) & (levels <= 1)).all(), "q", q, "a list of numbers from 0 to 1")
     out = np.empty((levels.size, values.shape[1]))
     for i in range(values.shape[1]):
         order = np.argsort(values[:, i])

@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.experiment import MethodName
 from probewise.inquiry import utility_named
 from probewise.nested import NESTED_STOP, NestedStop
@@ -79,12 +79,10 @@ class SearchConfiguration:
             "nested_stop": NESTED_STOP,
         }
         for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise ParameterError(name, getattr(self, name), " or ".join(allowed))
+            require(getattr(self, name) in allowed, name, getattr(self, name), " or ".join(allowed))
         utility_named(self.utility)
         for name in ("noise_sd", "width"):
-            if not 1e-3 <= getattr(self, name) <= 1e3:
-                raise ParameterError(name, getattr(self, name), "from 0.001 to 1000")
+            require(1e-3 <= getattr(self, name) <= 1e3, name, getattr(self, name), "from 0.001 to 1000")
         if self.model == "naive":
             for name, plain in (("width", 1.0), ("learn_sensor", False)):
                 if getattr(self, name) != plain:

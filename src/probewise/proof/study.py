@@ -12,7 +12,7 @@ from scipy.stats import poisson
 
 from probewise._kinds import checked_whole
 from probewise._version import __version__
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.proof.campaign import Campaign, Result
 from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
 from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
@@ -58,8 +58,7 @@ def summarise(trials: Sequence[Result], *, max_readings: int) -> Summary:
 
     Raises ParameterError if there are fewer than two runs, which have no standard error.
     """
-    if len(trials) < 2:
-        raise ParameterError("number of trials", len(trials), "2 or more, so that there is a standard error")
+    require(len(trials) >= 2, "number of trials", len(trials), "2 or more, so that there is a standard error")
     sure = [t for t in trials if t["reached"]]
     needed = np.array([t["readings"] if t["reached"] else max_readings for t in trials], dtype=np.float64)
     after = [t["readings"] - t["first_white"] for t in sure if t["first_white"] is not None]

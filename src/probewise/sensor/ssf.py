@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_whole
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 from probewise.sensor.stages import Footprint
 
 _REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
@@ -153,10 +153,8 @@ class SSFField(ShowsItself):
         if values.ndim != 2 or values.size == 0:
             raise ShapeError(f"SSF field has shape {values.shape}; allowed: (n_y, n_x), not empty")
         require_finite("SSF field", values)
-        if not 0 < self.pixel_mm < math.inf:
-            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
-        if not values.sum() > 0:
-            raise ParameterError("sum of the SSF field", float(values.sum()), "greater than 0")
+        require(0 < self.pixel_mm < math.inf, "pixel_mm", self.pixel_mm, "greater than 0")
+        require(values.sum() > 0, "sum of the SSF field", float(values.sum()), "greater than 0")
         object.__setattr__(self, "values", read_only_floats(values / values.sum()))
 
     @property

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.recordings.files import write_recording
 from probewise.recordings.io import SHIPPED
 from probewise.recordings.plan import Recording
@@ -78,8 +78,7 @@ def regenerate_recording(name: str) -> Recording:
 
 def _random_streams(name: str) -> list[np.random.Generator]:
     """Return three independent generators: for the concealed effect, the times and the noise."""
-    if name not in SHIPPED:
-        raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
+    require(name in SHIPPED, "name", name, " or ".join(repr(known) for known in SHIPPED))
     return np.random.default_rng(SEEDS[name]).spawn(3)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from probewise._arrays import FloatArray, read_only_floats, require_finite
-from probewise.errors import ParameterError, ShapeError
+from probewise.errors import ParameterError, ShapeError, require
 
 Density = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -35,8 +35,7 @@ class Spot:
         require_finite("weights", weights)
         if weights.min() < 0 or weights.sum() <= 0:
             raise ParameterError("weights", float(weights.min()), "0 or more, not all of them 0")
-        if not self.pixel_mm > 0:
-            raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
+        require(self.pixel_mm > 0, "pixel_mm", self.pixel_mm, "greater than 0")
         object.__setattr__(self, "weights", read_only_floats(weights / weights.sum()))
 
     def edges_mm(self) -> tuple[FloatArray, FloatArray]:
@@ -149,8 +148,7 @@ def tailed_spot(
     `core_mm` are the decay lengths along u and v; `skew`, 0 to below 1 (else ParameterError), lengthens the tail
     towards +u and shortens that towards -u.
     """
-    if not 0 <= skew < 1:
-        raise ParameterError("skew", skew, "0 to below 1")
+    require(0 <= skew < 1, "skew", skew, "0 to below 1")
 
     def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
         p, q = (u - center_mm[0]) / core_mm[0], (v - center_mm[1]) / core_mm[1]
@@ -173,8 +171,7 @@ def ring_spot(
 
     A Gaussian of sd `width_mm` about a circle; `off_axis`, 0 to 1 (else ParameterError), brightens the side towards +v.
     """
-    if not 0 <= off_axis <= 1:
-        raise ParameterError("off_axis", off_axis, "0 to 1")
+    require(0 <= off_axis <= 1, "off_axis", off_axis, "0 to 1")
 
     def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
         p, q = u - center_mm[0], v - center_mm[1]

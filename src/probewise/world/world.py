@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_rng
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.rays import seen_white_fraction
 from probewise.world.spots import Spot
@@ -64,15 +64,11 @@ class World:
     height_mm: float = 14.0
 
     def __post_init__(self) -> None:
-        if not self.noise_sd >= 0:
-            raise ParameterError("noise_sd", self.noise_sd, "0 or more")
-        if self.step is not None and not self.step > 0:
-            raise ParameterError("step", self.step, "greater than 0, or None")
-        if not self.height_mm > 0:
-            raise ParameterError("height_mm", self.height_mm, "greater than 0")
+        require(self.noise_sd >= 0, "noise_sd", self.noise_sd, "0 or more")
+        require(self.step is None or self.step > 0, "step", self.step, "greater than 0, or None")
+        require(self.height_mm > 0, "height_mm", self.height_mm, "greater than 0")
         for effect in self.concealed:
-            if effect.stage not in STAGES:
-                raise ParameterError(f"{effect.name}.stage", effect.stage, f"one of {', '.join(STAGES)}")
+            require(effect.stage in STAGES, f"{effect.name}.stage", effect.stage, f"one of {', '.join(STAGES)}")
 
     def read(
         self,
@@ -221,8 +217,7 @@ class World:
         known: dict[str, Surface] = {**plan.patterns, **(surfaces or {})}
         rows_by_pattern = plan.rows_by_pattern()
         for name, _ in rows_by_pattern:
-            if name not in known:
-                raise ParameterError("pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
+            require(name in known, "pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
         return [(known[name], rows) for name, rows in rows_by_pattern]
 
 

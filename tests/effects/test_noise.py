@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from probewise.effects import Extent
 from probewise.effects.noise import (
@@ -15,11 +14,10 @@ from probewise.effects.noise import (
     lattice_step,
     outliers,
     quantisation,
-    random_walk,
     sd_of_estimated_lattice_step,
     signal_dependent_noise,
 )
-from probewise.effects.noise_distribution import PredictiveMixture, log_density
+from probewise.effects.noise_distribution import log_density
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters
@@ -117,15 +115,3 @@ def test_the_bank_of_lost_readings_lies_within_their_prior_in_any_unit(unit):
 def test_a_declared_lattice_is_no_effect():
     declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))
     assert quantisation.for_extent(Extent(10.0, 60.0, declared)) is None
-
-
-def test_a_random_walk_is_scored_at_the_rows_that_have_a_reading():
-    walk = random_walk().apply(
-        NoiseParameters(np.full((4, 1), SD), np.zeros((1, 1))), np.full((4, 1), 0.5), PLAN.take(slice(3))
-    )
-    predicted, readings = np.zeros((4, 3)), np.array([0.1, np.nan, -0.2])
-    mixture = PredictiveMixture(readings, np.isfinite(readings))
-    mixture.add(predicted, walk)
-    _, sd, scores = mixture.mean_sd_and_log_density()
-    np.testing.assert_allclose(sd, SD * np.sqrt(1 + 0.25 * np.array([1, 2, 3])))
-    np.testing.assert_allclose(scores, norm.logpdf(readings, 0.0, sd))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,6 +43,17 @@ def test_a_reading_far_beyond_every_prediction_keeps_a_finite_density() -> None:
     out = log_rounding_cell_density(np.array([1e6, -1e6]), np.zeros(2), np.full(2, 1e-3), 1.0)
     assert np.isfinite(out).all()
     assert out[0] == pytest.approx(out[1])
+
+
+def test_an_uncertain_offset_is_scored_at_the_rows_that_have_a_reading():
+    """Beside a tail it is no wider: a mixture of two normal distributions, each of the sum of two variances."""
+    offset, readings = np.array([[0.5, 1.0, 2.0]]), np.array([0.1, np.nan, -0.2])
+    mixture = PredictiveMixture(readings, np.isfinite(readings))
+    mixture.add(np.zeros((1, 3)), replace(OUTLIERS, offset_sd=offset))
+    _, sd, scores = mixture.mean_sd_and_log_density()
+    np.testing.assert_allclose(sd**2, offset[0] ** 2 + SD**2 * (0.8 + 0.2 * 4.0**2))
+    own, wide = (norm(0.0, np.hypot(offset[0], size)).pdf(readings) for size in (SD, 4 * SD))
+    np.testing.assert_allclose(scores, np.log(0.8 * own + 0.2 * wide))
 
 
 LOW, HIGH, SD = 0.0, 10.0, 2.0

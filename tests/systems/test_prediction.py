@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from heater import ABOUT, SIMULATOR, fitted, runs
+from scipy.stats import norm
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.systems import (
@@ -327,6 +328,69 @@ def test_later_rows_of_a_recorded_run_go_on_from_its_recorded_state(rows):
     found = predicted(model, part.with_columns({"humidity": np.ones(len(part))}))
     np.testing.assert_allclose(found.mean, part.columns["x"] + part.time_s, atol=1e-5)
     assert (len(found.table), found.notes) == (len(part), ())
+
+
+_RECORDED_ROWS = np.array([0, 1, 2, 3, 5, 6, 8, 9])  # two readings of the run are missing, and no row
+_SIGMA, _RHO, _STEP = 0.4, -0.6, 0.7
+
+
+def _flat(effects, **parameters):
+    """A constant level of 3 and noise with a memory, known exactly; ten rows of run a, each a second, two missing."""
+    simulator = Simulator("y", "K", {"level": (0, 10)}, lambda p, data: p["level"] + 0 * data["t"], time="t", run="run")
+    t, readings = np.arange(10.0), np.full(10, np.nan)
+    readings[_RECORDED_ROWS] = 3 + np.random.default_rng(RNG).normal(0, 1, len(_RECORDED_ROWS))
+    recorded = RunTable({"t": t, "y": readings, "run": np.full(10, "a")}, "t", "run")
+    stored = StoredFit(recorded, np.full(10, 3.0), _SIGMA)
+    samples = np.tile([3.0, *parameters.values()], (500, 1))
+    model = FittedSystem(
+        simulator, ("level", *parameters), samples, np.full(500, _SIGMA), effects=tuple(effects), known=stored
+    )
+    return model, readings[_RECORDED_ROWS] - 3
+
+
+def _correlated(rows):
+    return _SIGMA**2 * _RHO ** np.abs(np.subtract.outer(rows, rows))
+
+
+def _walking(rows):
+    return _SIGMA**2 * (np.eye(len(rows)) + _STEP**2 * (np.minimum.outer(rows, rows) + 1))
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "value", "covariance"),
+    [("correlated_noise", "rho", _RHO, _correlated), ("random_walk", "sd_per_row", _STEP, _walking)],
+)
+@pytest.mark.parametrize("first", [10, 13], ids=["next", "after three seconds without a row"])
+def test_noise_with_a_memory_is_predicted_given_the_recorded_residuals(effect, parameter, value, covariance, first):
+    """The exact conditional distribution of jointly normal readings; of a run without recorded rows, the marginal."""
+    model, residuals = _flat([effect], **{f"{effect}.{parameter}": value})
+    rows = np.arange(first, first + 6)
+    after = predicted(model, {"t": rows.astype(float), "run": ["a"] * 6})
+    both = covariance(np.append(_RECORDED_ROWS, rows))
+    gain = np.linalg.solve(both[:8, :8], both[:8, 8:]).T
+    np.testing.assert_allclose(after.mean, 3 + gain @ residuals, rtol=1e-9)
+    np.testing.assert_allclose(after.sd, np.sqrt(np.diag(both[8:, 8:] - gain @ both[:8, 8:])), rtol=1e-9)
+    new = predicted(model, {"t": rows.astype(float), "run": ["b"] * 6})
+    np.testing.assert_allclose(new.mean, 3.0)
+    np.testing.assert_allclose(new.sd, np.sqrt(np.diag(covariance(np.arange(10, 16)))))
+
+
+def test_a_recorded_reading_that_may_be_wide_tells_less_of_a_walk():
+    """One reading, narrow or wide: the walk after it has the moments of a mixture of two normal distributions."""
+    share, times = 0.3, 8.0
+    of = {"outliers.share": share, "outliers.size": times, "random_walk.sd_per_row": _STEP}
+    model, residuals = _flat(["outliers", "random_walk"], **of)
+    one = model.known.table.with_columns({"y": np.append(model.known.table.columns["y"][0], np.full(9, np.nan))})
+    model = dataclasses.replace(model, known=dataclasses.replace(model.known, table=one))
+    found = predicted(model, {"t": [10.0, 11.0], "run": ["a", "a"]})
+    walk, own = (_SIGMA * _STEP) ** 2, _SIGMA**2 * np.array([1.0, times**2])
+    weight = np.array([1 - share, share]) * norm(0, np.sqrt(walk + own)).pdf(residuals[0])
+    weight, mean = weight / weight.sum(), walk / (walk + own) * residuals[0]
+    at = weight @ mean
+    variance = weight @ (walk * own / (walk + own) + (mean - at) ** 2)
+    np.testing.assert_allclose(found.mean, 3 + at)
+    of_own = _SIGMA**2 * (1 + share * (times**2 - 1))
+    np.testing.assert_allclose(found.sd**2, variance + walk * np.array([10, 11]) + of_own)
 
 
 def test_later_rows_are_said_to_start_again_where_the_model_has_no_recorded_rows():

@@ -105,22 +105,15 @@ def drifting_noise(kind: LightEffect, of: Extent) -> Effect:
 
 @light_effect("random_walk", Stage.NOISE, "a random walk of the zero", ("time", "row", "run"))
 def random_walk(kind: LightEffect, of: Extent) -> Effect:
-    """A random walk of the offset of a table's readings: a normal step from each row to the next, across runs too.
-
-    Of another table than the recorded one, the rows before its first one count.
-    """
+    """A random walk of the offset of a table's readings: a normal step from each row to the next, across runs too."""
     return _on_noise(
         kind,
         of,
         {"sd_per_row": (LogUniform(5e-3, 3.0), "noise sd")},
-        lambda noise, theta, table: replace(noise, walk=theta[:, :1], walked=_rows_walked(table)),
+        lambda noise, theta, _: replace(noise, walk=theta[:, :1]),
         in_words("the offset is a random walk with steps of sd {0} noise sds from row to row"),
         (16,),
     )
-
-
-def _rows_walked(table: Any) -> FloatArray:
-    return getattr(table, "first_row", 0) + 1.0 + np.arange(float(len(table)))
 
 
 @light_effect("noise_per_run", Stage.NOISE, "noise that differs from run to run", ("run",))

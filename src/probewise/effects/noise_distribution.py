@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr, ndtr, softmax
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.recordings.plan import masks_of_readings_at_ends
@@ -67,7 +67,6 @@ def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatAr
 
     `readings`: measured readings, (n_points,); `predicted`: noise-free readings, (n_samples, n_points).
     """
-    noise = noise_with_walk_variance(noise)
     return _log_of_mixture(
         noise,
         lambda sd: _log_density_rounded(readings, predicted, sd, noise.step),
@@ -79,10 +78,10 @@ def _log_of_mixture(
     noise: NoiseParameters, of_sd: Callable[[FloatArray], FloatArray], of_lost: Callable[[], FloatArray]
 ) -> FloatArray:
     """Return the log of the sum over narrow, wide and lost readings, each with its share; `of_sd` is log density."""
-    out = of_sd(noise.sd)
+    out = of_sd(np.hypot(noise.sd, noise.offset_sd))
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
         if np.any(noise.wide_share):
-            wide = of_sd(noise.sd * noise.wide_times)
+            wide = of_sd(np.hypot(noise.sd * noise.wide_times, noise.offset_sd))
             out = np.logaddexp(np.log1p(-noise.wide_share) + out, np.log(noise.wide_share) + wide)
         if np.any(noise.lost_share):
             out = np.logaddexp(np.log1p(-noise.lost_share) + out, np.log(noise.lost_share) + of_lost())
@@ -91,16 +90,78 @@ def _log_of_mixture(
 
 def reading_variance(noise: NoiseParameters) -> FloatArray:
     """Return the variance of a reading that is not lost, with outliers, random walk and rounding; arrays broadcast."""
-    noise = noise_with_walk_variance(noise)
     wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
-    return np.asarray(noise.sd**2 * wide + noise.step**2 / 12)
+    return np.asarray(noise.sd**2 * wide + noise.offset_sd**2 + noise.step**2 / 12)
 
 
-def noise_with_walk_variance(noise: NoiseParameters) -> NoiseParameters:
-    """Return the noise with the random walk's marginal variance at each row included in its sd."""
-    if not np.any(noise.walk):
-        return noise
-    return replace(noise, sd=noise.sd * np.sqrt(1 + noise.walk**2 * noise.walked), walk=np.zeros((1, 1)))
+@dataclass(frozen=True, eq=False)
+class RecordedBefore:
+    """What was recorded before some rows that are to be predicted, by which noise with a memory is known in part.
+
+    `rows`: number of each recorded row, in order, (n_recorded,); `usable`: mask of those with a reading, (n_recorded,);
+    `later`: number of each row to be predicted, (n_later,); `last`: place in `rows` of the last usable one of its run,
+    -1 if there is none, (n_later,); `n_since`: rows of the run since then, (n_later,).
+    """
+
+    rows: IntArray
+    usable: BoolArray
+    later: IntArray
+    last: IntArray
+    n_since: IntArray
+
+    def condition(
+        self, noise: NoiseParameters, sigma: FloatArray, residuals: FloatArray
+    ) -> tuple[FloatArray, NoiseParameters]:
+        """Return the expected noise of each later row, (n_samples, n_later), and the noise about it.
+
+        `noise` is that of all rows, the recorded ones first; `sigma` (n_samples, 1) is the sd in which the steps of a
+        walk are told; `residuals` are those of the recorded rows, (n_samples, n_recorded). AR(1) noise of correlation
+        rho is expected to be rho^k of the last one after k rows, with 1 - rho^(2 k) of its variance. A walk is filtered
+        (Kalman); from its state at the last recorded row its variance grows by a step a row. A row without recorded
+        ones in its run has the marginal distribution, a walk that of one that begins at the first row.
+        """
+        n, follows = len(self.rows), self.last >= 0
+        sd = np.broadcast_to(noise.sd, (len(residuals), n + len(self.later)))
+        expected, own, offset = np.zeros((len(sd), len(self.later))), sd[:, n:], np.zeros((1, 1))
+        if np.any(noise.rho) and follows.any():
+            kept = np.where(follows, noise.rho**self.n_since, 0.0)
+            expected = kept * own * (residuals / sd[:, :n])[:, self.last]
+            own = own * np.sqrt(1 - kept**2)
+        if np.any(noise.walk):
+            step = (noise.walk * sigma) ** 2
+            variance = step * (self.later + 1)
+            if follows.any():
+                known = np.flatnonzero(self.usable)
+                state, unsure = _filtered_walk(noise, step, sd[:, known], residuals[:, known], self.rows[known])
+                n_steps = np.maximum(self.later - self.rows[known[-1]], self.n_since)
+                expected = expected + np.where(follows, state, 0.0)
+                variance = np.where(follows, unsure + step * n_steps, variance)
+            offset = np.sqrt(variance)
+        return expected, replace(noise, sd=own, offset_sd=offset)
+
+
+def _filtered_walk(
+    noise: NoiseParameters, step: FloatArray, sd: FloatArray, residuals: FloatArray, rows: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance, (n_samples, 1) both, of a random walk at the last of some rows, given their residuals.
+
+    `step` (n_samples, 1) is the variance of its steps; `sd` and `residuals` are (n_samples, n_rows). A reading may be
+    wide: two normal distributions, which are merged after each row.
+    """
+    times = np.concatenate(np.broadcast_arrays(1.0, noise.wide_times), axis=1)
+    with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
+        log_share = np.log(np.concatenate([1 - noise.wide_share, noise.wide_share], axis=1))
+    mean, variance = np.zeros((len(sd), 1)), np.zeros((len(sd), 1))
+    for k, n_steps in enumerate(np.diff(rows, prepend=-1)):
+        variance = variance + step * n_steps
+        total = variance + (sd[:, k, None] * times) ** 2
+        missed = residuals[:, k, None] - mean
+        weight = softmax(log_share - 0.5 * np.log(total) - 0.5 * missed**2 / total, axis=1)
+        moved = variance / total * missed
+        change = np.sum(weight * moved, axis=1, keepdims=True)
+        mean = mean + change
+        variance = np.sum(weight * (variance * (1 - variance / total) + (moved - change) ** 2), axis=1, keepdims=True)
+    return mean, variance
 
 
 def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
@@ -120,7 +181,6 @@ def log_probability_at_end(
     `readings`: readings at an end of the range, (n_points,); `predicted`: noise-free readings of an unlimited
     instrument, (n_samples, n_points); `is_high`: whether that is the high end.
     """
-    noise = noise_with_walk_variance(noise)
     sign = 1.0 if is_high else -1.0
     beyond = sign * (predicted - readings) + 0.5 * noise.step
     lost_beyond = sign * (noise.lost_value - readings) + 0.5 * noise.step
@@ -134,9 +194,9 @@ def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high
 
     `predicted` are noise-free readings of an unlimited instrument, of that shape.
     """
-    noise = noise_with_walk_variance(noise)
+    beside = np.hypot(noise.offset_sd, noise.step / np.sqrt(12))
     own, wide = (
-        _mean_of_limited_normal(predicted, np.hypot(sd, noise.step / np.sqrt(12)), low, high)
+        _mean_of_limited_normal(predicted, np.hypot(sd, beside), low, high)
         for sd in (noise.sd, noise.sd * noise.wide_times)
     )
     return np.asarray((1 - noise.wide_share) * own + noise.wide_share * wide)
@@ -171,20 +231,19 @@ class PredictiveMixture:
         `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
         apart than the noise; mean and sd are unaffected.
         """
-        noise = noise_with_walk_variance(noise)
         limited = limited_mean(noise, mean, *self.ends) if np.isfinite(self.ends).any() else mean
         variance = mean.var(axis=0) + np.broadcast_to(reading_variance(noise), mean.shape).mean(axis=0)
         if self.step is not None:  # not in the variance: the pooled sd includes a declared rounding
             noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:
-            noise = replace(noise, sd=np.hypot(np.broadcast_to(noise.sd, mean.shape), between))
+            noise = replace(noise, offset_sd=np.hypot(np.broadcast_to(noise.offset_sd, mean.shape), between))
         log_sum = np.logaddexp.reduce(self._log_density_of_scored(noise, mean), axis=0)
         self._blocks.append((len(mean), mean.mean(axis=0), variance, limited.mean(axis=0), log_sum))
 
     def _log_density_of_scored(self, noise: NoiseParameters, mean: FloatArray) -> FloatArray:
         """Return the log density of each scored reading, or log probability at an end, (n_samples, n_scored)."""
-        sd = noise.sd if noise.sd.shape[-1] == 1 else noise.sd[:, self.scored]
-        given = replace(noise, sd=sd), self.readings[self.scored], mean[:, self.scored]
+        sd, offset_sd = (each if each.shape[-1] == 1 else each[:, self.scored] for each in (noise.sd, noise.offset_sd))
+        given = replace(noise, sd=sd, offset_sd=offset_sd), self.readings[self.scored], mean[:, self.scored]
         out = log_density(*given)
         for at_end, is_high in zip(self._at_ends, (False, True), strict=True):
             if at_end[self.scored].any():

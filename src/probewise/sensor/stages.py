@@ -107,10 +107,11 @@ class View:
 class NoiseParameters:
     """Noise of the readings: `sd` broadcasts to (n_samples, n_points); unless stated, the rest are (n_samples, 1).
 
-    `rho` is the AR(1) correlation within a scan. A random walk of the offset has steps of `walk` sds from row to row
-    and has taken `walked` (n_points,) steps by each row. With probability `wide_share` a reading's noise is
-    `wide_times` as wide; with probability `lost_share` a reading is lost and reads `lost_value`. Readings are rounded
-    to `step`, 0 for none. `seen` (n_samples, n_points) is the white fraction, for noise that depends on the signal.
+    `rho` is the AR(1) correlation within a scan. A random walk of the offset has steps of `walk` sds from row to row;
+    where it has come to by each reading is uncertain by the sd `offset_sd`, which broadcasts as `sd`. With probability
+    `wide_share` a reading's own noise is `wide_times` as wide; with probability `lost_share` a reading is lost and
+    reads `lost_value`. Readings are rounded to `step`, 0 for none. `seen` (n_samples, n_points) is the white fraction,
+    for noise that depends on the signal.
     """
 
     sd: FloatArray
@@ -122,7 +123,7 @@ class NoiseParameters:
     lost_value: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     step: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     walk: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
-    walked: FloatArray = field(default_factory=lambda: np.zeros(1))
+    offset_sd: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
 
 
 V = TypeVar("V")

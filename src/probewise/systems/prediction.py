@@ -11,13 +11,13 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, own_arithmetic
+from probewise._arrays import BoolArray, FloatArray, IntArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
 from probewise.effects import EFFECTS, Effect
-from probewise.effects.noise import noise_of_runs, noise_per_run, random_walk
-from probewise.effects.noise_distribution import PredictiveMixture
+from probewise.effects.noise import dropouts, noise_of_runs, noise_per_run, random_walk
+from probewise.effects.noise_distribution import PredictiveMixture, RecordedBefore
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
@@ -124,8 +124,9 @@ def predict_system(
     that look back to it, such as a lag, take the number interpolated within the run. The effect of a column that counts
     from its mean is 0 where the column is missing, as in the fit.
 
-    Later rows of a recorded run follow its recorded rows, if the model has them, so that its state goes on from there;
-    otherwise the run is started again at its first row, which a note says.
+    Later rows of a recorded run follow its recorded rows, if the model has them, so that its state goes on from there,
+    and so does noise with a memory: each sample's is conditional on its residuals there. A gap in time counts as the
+    rows that it would have held. Otherwise the run is started again at its first row, which a note says.
 
     `table` is a RunTable, a dict of arrays, or a DataFrame of n_points rows, with the columns that the simulator and
     the effects use; `rng` is for runs outside the recording.
@@ -149,8 +150,8 @@ def predict_system(
     require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
-    whole = _with_recorded_rows_before(fitted, own)
-    before = len(whole) - len(own)
+    recorded = _recorded_rows_before(fitted, own)
+    whole, before = _with_recorded_rows_before(fitted, own, recorded), len(recorded)
     system = replace(
         System.of(fitted.simulator, whole.with_columns(_interpolated_inputs(fitted.simulator, whole))),
         max_step=fitted.max_step,
@@ -161,7 +162,8 @@ def predict_system(
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(whole)))
     given, lost = _filled_table_and_unpredictable_mask(chain, theta, whole)
-    lost = lost[before:]
+    known, earlier = _recorded_before(fitted, own, recorded, ~lost[:before])
+    ignored, lost = np.append(~known.usable, lost[before:]), lost[before:]
     chain = _chain_with_converged_step(chain, theta, given, float(np.median(fitted.noise_sd)))
     mixture = PredictiveMixture(
         recording.readings, recording.usable & ~lost, own.instrumentation.step, fitted.simulator.noise.ends
@@ -171,13 +173,15 @@ def predict_system(
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
-        mean = np.where(lost, 0.0, chain.predict(block, given)[:, before:])
+        mean = np.where(ignored, 0.0, chain.predict(block, given))
         there = np.isfinite(mean).all(axis=1)
-        never &= ~np.isfinite(mean).any(axis=0)
+        never &= ~np.isfinite(mean[:, before:]).any(axis=0)
         n_failed += int((~there).sum())
         if there.any():
-            sd = fitted.noise_sd[first : first + per_block][there, None]
-            mixture.add(mean[there], _noise_parameters(fitted, chain, block[there], mean[there], sd, own), between)
+            mean, sd = mean[there], fitted.noise_sd[first : first + per_block][there, None]
+            noise = _noise_parameters(fitted, chain, block[there], mean, sd, whole)
+            expected, noise = known.condition(noise, sd, earlier - mean[:, :before])
+            mixture.add(mean[:, before:] + expected, noise, between)
     if n_failed == n_samples:
         at = f"in {int(never.sum())} of {len(own)} rows, first in row {int(np.argmax(never)) + own.first_line}"
         found = f"no finite reading {at}" if never.any() else "no finite reading"
@@ -198,27 +202,60 @@ def predict_system(
     return SystemPrediction(own, recording.readings, mean=mean, sd=sd, log_density=scores, notes=notes, **counts)
 
 
-def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> RunTable:
-    """Return a table with the recorded rows of its runs before their first rows in it, by time, put first.
+def _recorded_rows_before(fitted: FittedSystem, table: RunTable) -> IntArray:
+    """Return the numbers of the recorded rows of a table's runs before their first rows in it, by time, in order."""
+    if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
+        return np.zeros(0, dtype=np.int64)
+    recorded = fitted.known.table
+    first = _first_times(table)
+    begins = np.array([first.get(name, -np.inf) for name in recorded.scan_names])
+    return np.flatnonzero(recorded.time_s < begins[recorded.scan])
+
+
+def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable, rows: IntArray) -> RunTable:
+    """Return a table with these recorded rows put first.
 
     So a state, or an effect that looks back, goes on from where the recording left it. A column that the recording
     lacks is missing in these rows.
     """
-    if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
+    if fitted.known is None or not rows.size:
         return table
-    recorded = fitted.known.table
-    first = _first_times(table)
-    begins = np.array([first.get(name, -np.inf) for name in recorded.scan_names])
-    rows = np.flatnonzero(recorded.time_s < begins[recorded.scan])
-    if not rows.size:
-        return table
-    columns = {}
+    recorded, columns = fitted.known.table, {}
     for name, values in table.columns.items():
         earlier = recorded.columns.get(name)
         if earlier is None or earlier.dtype.kind != values.dtype.kind:
             earlier = np.full(len(recorded), np.nan if values.dtype == np.float64 else "")
         columns[name] = np.concatenate([earlier[rows], values])
     return replace(table, columns=columns, first_line=table.first_line - len(rows), notes=())
+
+
+def _recorded_before(
+    fitted: FittedSystem, table: RunTable, rows: IntArray, predicted: BoolArray
+) -> tuple[RecordedBefore, FloatArray]:
+    """Return what was recorded before the rows of a table: these recorded rows, and their readings, (n_recorded,).
+
+    `predicted` is the mask of those that the model predicts. A lost reading, or one at an end of the range, tells
+    nothing of the noise.
+    """
+    later, last = np.arange(len(table)) + table.first_row, np.full(len(table), -1)
+    n_since, usable, readings = np.zeros(len(table), dtype=np.int64), predicted, np.zeros(0)
+    if fitted.known is not None and rows.size:
+        recording = as_recording(fitted.simulator, fitted.known.table)
+        recorded, readings = fitted.known.table, recording.readings[rows]
+        lost = [fitted.samples[:, k] for k, name in enumerate(fitted.names) if name == f"{dropouts.name}.value"]
+        usable = predicted & (recording.usable & ~recording.censored)[rows] & ~np.isin(readings, lost)
+        run = np.array(recorded.scan_names)[recorded.scan[rows]]
+        between = np.concatenate([np.diff(recorded.time_s[own]) for own in recorded.rows_by_scan()])
+        for name, own in zip(table.scan_names, table.rows_by_scan(), strict=True):
+            before = np.flatnonzero(run == name)
+            if not usable[before].any():
+                continue
+            last[own] = before[usable[before]][-1]
+            order = np.argsort(np.argsort(table.time_s[own], kind="stable")) + 1
+            elapsed = table.time_s[own] - recorded.time_s[rows[last[own]]]
+            in_rows = np.round(elapsed / np.median(between[between > 0])).astype(np.int64)
+            n_since[own] = np.maximum(order + np.count_nonzero(before > last[own[0]]), in_rows)
+    return RecordedBefore(rows, usable, later, last, n_since), readings
 
 
 def _first_times(table: RunTable) -> dict[str, float]:

@@ -185,3 +185,25 @@ def test_a_noise_that_is_not_as_it_was_declared_is_told(declared, told):
     table = {"pull_n": x, "strain_ue": SLOPE * x + rng.normal(0, SD, len(x))}
     notes = fit_simulator(simulator, table, rng=rng).recording.notes
     assert sum("the noise sd of a reading is " in note and "was declared" in note for note in notes) == told
+
+
+_DECAY = ({"a": (0, 10), "k": (-50, 50)}, lambda p, u: p["a"] * np.exp(p["k"] * u["t"]))
+_TWO_DECAYS = (
+    {**_DECAY[0], "b": (-10, 10), "c": (-40, 40)},
+    lambda p, u: p["a"] * np.exp(p["k"] * u["t"]) + p["b"] * np.exp(p["c"] * u["t"]),
+)
+_SAME = ({"a": (-10, 10), "k": (-10, 10)}, lambda p, u: (p["a"] + p["k"]) * u["t"])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("noise", [0.1, 1e-12, 0.0])
+@pytest.mark.parametrize("model", [_DECAY, _TWO_DECAYS, _SAME], ids=["decay", "two decays", "the same twice"])
+def test_a_model_that_runs_away_or_fits_exactly_or_says_the_same_twice_is_fitted(model, noise):
+    """Predictions reach e^500, or the residuals rounding, or only a sum is known: precisions that rounding spoils."""
+    (parameters, simulate), t = model, np.linspace(0.5, 10, 8)
+    y = simulate({"a": 2.0, "k": -0.3, "b": 0.0, "c": 0.0}, {"t": t})
+    y = y + noise * np.random.default_rng(3).standard_normal(len(t))
+    simulator = Simulator("y", "V", parameters, simulate=simulate, time="t")
+    fit = fit_simulator(simulator, {"t": t, "y": y}, rng=np.random.default_rng(1))
+    assert np.isfinite(fit.fitted.samples).all()
+    np.testing.assert_allclose(simulate(fit.fitted.mode(), {"t": t}), y, atol=5 * noise + 1e-6)

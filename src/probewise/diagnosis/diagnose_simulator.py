@@ -17,7 +17,7 @@ from probewise._arrays import BoolArray, FloatArray, own_arithmetic
 from probewise._kinds import require_progress, require_rng
 from probewise._words import count_with_noun
 from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared
-from probewise.diagnosis.fit import Fit
+from probewise.diagnosis.fit import Fit, with_prior
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import find_lost_readings
@@ -181,7 +181,7 @@ def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterat
     Phi(-|z|) / phi(z) away, measured in z.
     """
     slopes = law(found.slopes[:, : system.n_params]) / found.sd
-    z, curvature = found.z[: system.n_params], slopes.T @ slopes + np.eye(system.n_params)
+    z, curvature = found.z[: system.n_params], with_prior(slopes.T @ slopes)
     downhill = slopes.T @ law(found.residuals[:, None])[:, 0] / found.sd - z
     covariance = np.linalg.inv(curvature)
     variance = np.diag(covariance)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.fit import Fit, log_multiplicity, residual_degrees_of_freedom
+from probewise.diagnosis.fit import Fit, log_multiplicity, residual_degrees_of_freedom, with_prior
 from probewise.diagnosis.noise import NoiseLaw, NoiseModel, NoiseNodes, stacked_density
 from probewise.effects import NoiseEffect
 from probewise.sensor.stages import effects_with_columns
@@ -29,7 +29,6 @@ LEAST_VISIBLE = 4.0
 _INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
 
 
-_ROUNDING = 1e-12
 _MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noise models
 
 
@@ -116,8 +115,7 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
 
     Arguments: whitened slopes (n_points, n_params), and the variance of a whitened reading.
     """
-    curvature = slopes.T @ slopes / variance + np.eye(slopes.shape[1])
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(curvature)).T)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(with_prior(slopes.T @ slopes / variance))).T)
 
 
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
@@ -134,7 +132,7 @@ def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
 
     for _ in range(3):
         variance = np.maximum(sums_of_squares() / n_points, least)
-        curvature = jj / variance[:, None, None] + np.eye(p)
+        curvature = with_prior(jj / variance[:, None, None])
         steps = _newton_steps(curvature, jr / variance[:, None] - found.z)
     fit_and_prior = _laplace_terms(found.z + steps, curvature, n_points) - [law.half_log_det() for law in laws]
     rss = sums_of_squares()
@@ -155,7 +153,7 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
         left = residual - slopes @ steps
         sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
         variance = sigma**2 / tail.fisher_information
-        curvature = gram / variance[:, None, None] + np.eye(p)
+        curvature = with_prior(gram / variance[:, None, None])
         downhill = slopes.T @ tail.normal_pseudo_residuals(left, sigma) / variance - found.z[:, None] - steps
         steps += _newton_steps(curvature, downhill.T).T
     left = residual - slopes @ steps
@@ -167,12 +165,7 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
 
 def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
     """Return the Newton steps to the modes, (n_laws, n_params); `downhill` are minus the gradients."""
-    try:
-        return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
-    except np.linalg.LinAlgError:  # readings fitted exactly: the prior is lost in rounding
-        size = np.trace(curvature, axis1=1, axis2=2)[:, None, None] / curvature.shape[1]
-        ridge = _ROUNDING * size * np.eye(curvature.shape[1])
-        return np.asarray(np.linalg.solve(curvature + ridge, downhill[:, :, None])[:, :, 0])
+    return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
 
 
 def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
@@ -242,7 +235,7 @@ class Linearised:
         sigma = np.array([self.sd * math.sqrt(self.law.fisher_information)])
         normal = self.law.normal_pseudo_residuals(self.law(found.residuals - change)[:, None], sigma)[:, 0]
         shift = slopes.T @ (normal / self.sd) - found.z
-        return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
+        return np.asarray(np.linalg.solve(with_prior(slopes.T @ slopes), shift))
 
     def draw_null_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw projected residuals under the null, in noise sds, (n_rows, n_draws)."""
@@ -483,5 +476,5 @@ def linearised_sizes(found: Fit, law: NoiseLaw, usable: IntArray, names: Sequenc
     for name in names:
         rest = np.delete(slopes, found.model.coordinate_slice(name), axis=1)
         change = law(found.change_by_effect(name, usable)[:, None])[:, 0] / sd
-        taken = np.linalg.solve(rest.T @ rest + np.eye(rest.shape[1]), rest.T @ change)
+        taken = np.linalg.solve(with_prior(rest.T @ rest), rest.T @ change)
         yield float(np.linalg.norm(np.append(change - rest @ taken, taken)))

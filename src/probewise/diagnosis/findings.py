@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.best_repair import BestRepair
 from probewise.diagnosis.evidence import Linearised, linearised_sizes
-from probewise.diagnosis.fit import fit, fit_each_start
+from probewise.diagnosis.fit import fit, fit_each_start, with_prior
 from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import ALARM, significant_places
 from probewise.diagnosis.noise import n_rows_since_previous_usable, noise_statistics, previous_usable
@@ -140,7 +140,7 @@ def _samples_of_insignificant(
         return effect, values, 0.0
     projected = problem.project(templates.columns[middle])
     # A ridge of one prior scale keeps undetectable amplitudes finite.
-    precision = projected.T @ projected + np.eye(projected.shape[1])
+    precision = with_prior(projected.T @ projected)
     amount = np.linalg.solve(precision, projected.T @ problem.residual)
     spread = np.linalg.cholesky(np.linalg.inv(precision))
     draws = amount + rng.standard_normal((N_SAMPLES, len(amount))) @ spread.T

@@ -359,7 +359,6 @@ def _fit_coroutine(
         return _prediction_and_slopes((yield points)[:, usable], steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
-    eye = np.eye(len(z))
     if dear:
         yield z[None, :]
     predicted, slopes = yield from request_slopes(z)
@@ -371,9 +370,10 @@ def _fit_coroutine(
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
         sigma = law.likeliest_sigma(whitened)
         variance = float(sigma[0]) ** 2 / law.fisher_information
-        curvature = turned.T @ turned / variance + eye
-        downhill = turned.T @ law.normal_pseudo_residuals(whitened, sigma)[:, 0] / variance - z
-        tries = _damped_steps(curvature, downhill)
+        with np.errstate(over="ignore"):  # of predictions that ran away
+            curvature = with_prior(turned.T @ turned / variance)
+            downhill = turned.T @ law.normal_pseudo_residuals(whitened, sigma)[:, 0] / variance - z
+        tries = _damped_steps(curvature, downhill) if np.isfinite(curvature).all() else ()
         if not len(tries):
             break
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
@@ -424,6 +424,15 @@ def _fit_coroutine(
 
 def _points_after_steps(z: FloatArray, steps: FloatArray) -> FloatArray:
     return np.clip(z + np.clip(steps, -2.0, 2.0), -FARTHEST, FARTHEST)
+
+
+def with_prior(information: FloatArray) -> FloatArray:
+    """Return the precisions of standard-normal coordinates, (..., n, n), of which the readings give `information`.
+
+    They are definite also where the prior is lost in rounding: readings are met exactly, or a prediction runs away.
+    """
+    prior = np.eye(information.shape[-1])
+    return np.asarray(information * (1 + 1e-13 * prior) + prior)
 
 
 def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fit import Fit, fit, residual_degrees_of_freedom
+from probewise.diagnosis.fit import Fit, fit, residual_degrees_of_freedom, with_prior
 from probewise.diagnosis.noise import NoiseLaw, innovations_given_rest
 from probewise.recordings.plan import Recording
 
@@ -85,7 +85,7 @@ def held_out_gain(
         predicted, slopes = (part[usable] for part in found.model.predict_and_differentiate(about))
         free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.fisher_information), rest.n_kept)
         sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_kept / free)  # beside rounding it is known
-        curvature = turned.T @ turned * rest.fisher_information / sigma_2 + np.eye(slopes.shape[1])
+        curvature = with_prior(turned.T @ turned * rest.fisher_information / sigma_2)
         covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
         # Of values with one scale in common, those of the other parts tell how large this part's is, not which it is.
         hardly_told = found.model.has_shared_scale & (np.diag(covariance) > _HARDLY_TOLD) & np.any(slopes[out], axis=0)

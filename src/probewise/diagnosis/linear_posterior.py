@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps
+from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps, with_prior
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.effects import Effect, HeavyTailedPrior
 from probewise.priors import Prior, Product, SharedScalePrior
@@ -87,7 +87,7 @@ class LinearAmplitudes:
 
         `slopes`, `residual`: whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
         """
-        z_sd = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes + np.eye(len(found.z)))))
+        z_sd = np.sqrt(np.diag(np.linalg.inv(with_prior(slopes.T @ slopes))))
         groups = tuple(group for group in two_sided_amplitude_groups(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
         if not groups:
             return None

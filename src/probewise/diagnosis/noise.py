@@ -26,7 +26,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.effects.noise_distribution import FittedReadings, log_gaussian_mass_between
-from probewise.inference import sd_floor
+from probewise.inference import sd_floor, sd_of_numbers
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
@@ -538,10 +538,13 @@ def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
 
 
 def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
-    """Return independent noise of a recording's usable readings, with its declared relative sds."""
+    """Return independent noise of a recording's usable readings, with its declared relative sds.
+
+    Its sd is at least `least`, and `sd_of_numbers`.
+    """
     usable, censored = recording.usable, recording.censored
     return replace(
-        white_noise(int(usable.sum()), least=least),
+        white_noise(int(usable.sum()), least=max(least, sd_of_numbers(recording))),
         sd=recording.relative_sd[usable],
         censored=censored[usable] if censored.any() else np.zeros(0, dtype=np.bool_),
     )
@@ -798,7 +801,7 @@ class NoiseModel:
             value_at_node(noise.wide_share),
             value_at_node(noise.wide_times),
             log_extra,
-            least=self.least_sd,
+            least=max(self.least_sd, sd_of_numbers(self.recording)),
             walk=step**2 * self._n_rows_since_previous if step else np.zeros(0),
             before=self._before_if_interleaved if rho else np.zeros(0, dtype=np.int64),
             censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),

@@ -16,7 +16,7 @@ from scipy.special import betaln, ndtri, stdtr
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
-from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start
+from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
 from probewise.diagnosis.noise import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
@@ -165,7 +165,7 @@ def find_lost_readings(
     kept = recording.with_readings(np.where(is_kept, recording.readings, np.nan))
     sd = max(float(min(spread)) / MAD_OF_NORMAL, sd_floor(kept))
     slopes, every = known(found.slopes) / sd, found.slopes / law.sd[:, None] / sd
-    told = np.linalg.solve(slopes.T @ slopes + np.eye(slopes.shape[1]), every.T)
+    told = np.linalg.solve(with_prior(slopes.T @ slopes), every.T)
     unknown = np.sqrt(1 + np.einsum("ij,ji->i", every, told))
     size = np.abs(_beyond_neighbours(residual, run, aside)) / (sd * unknown)
     far = aside & (size > LARGEST_SIZE * by_chance)

@@ -31,7 +31,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, with_prior
 from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.sensors import CalibratedSensor
@@ -222,12 +222,6 @@ _RETURNS, _PROXIMAL_STEPS = 2, 3  # Gauss-Newton steps to the ridge, of a walker
 _ROUNDING = 1e-13
 
 
-def _scale_and_unit(precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Split precisions, definite but for rounding, into the roots of their diagonals and definite matrices."""
-    scale = np.sqrt(np.einsum("kpp->kp", precision))
-    return scale, precision / scale[:, :, None] / scale[:, None] + _ROUNDING * np.eye(precision.shape[1])
-
-
 @dataclass(frozen=True, eq=False)
 class _Kernels:
     """A mixture of Student-t kernels: means (k, n_params), precisions (k, n_params, n_params), shares (k,), tails."""
@@ -240,7 +234,8 @@ class _Kernels:
     @cached_property
     def lower(self) -> FloatArray:
         """Cholesky factors of the precisions, definite but for rounding."""
-        scale, unit = _scale_and_unit(self.precision)
+        scale = np.sqrt(np.einsum("kpp->kp", self.precision))
+        unit = self.precision / scale[:, :, None] / scale[:, None] + _ROUNDING * np.eye(self.mean.shape[1])
         return np.asarray(np.linalg.cholesky(unit) * scale[:, :, None])
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -257,7 +252,8 @@ class _Kernels:
         blocks = np.array_split(z, max(len(z) * self.mean.size // NUMBERS, 1))
         squares = (np.sum(((block - self.mean[:, None]) @ self.lower) ** 2, axis=2) for block in blocks)
         each = (norm[:, None] - 0.5 * (nu + n_params) * np.log1p(square / nu) for square in squares)
-        return np.concatenate([logsumexp(densities, axis=0) for densities in each])
+        with np.errstate(over="ignore"):  # beside a kernel where a prediction runs away
+            return np.concatenate([logsumexp(densities, axis=0) for densities in each])
 
 
 def draw_by_importance(
@@ -340,7 +336,7 @@ class _Ridge:
             # A prediction that ran away has squares beyond all numbers.
             possible = np.isfinite(np.sum(slopes**2, axis=(1, 2)) + np.sum(residuals**2, axis=1))
         slopes, residuals = np.where(possible[:, None, None], slopes, 0.0), np.where(possible[:, None], residuals, 0.0)
-        return slopes, residuals, slopes @ slopes.transpose(0, 2, 1) + self.eye, possible
+        return slopes, residuals, with_prior(slopes @ slopes.transpose(0, 2, 1)), possible
 
     def _drawn_to_ridge(self, anchors: FloatArray, firmness: FloatArray, n_steps: int) -> FloatArray:
         """Return points by Gauss-Newton steps towards the mode, held to anchors by a precision (k or 1, p, p)."""
@@ -349,8 +345,7 @@ class _Ridge:
             slopes, residuals, precision, _ = self._linearise(z)
             downhill = np.einsum("kpn,kn->kp", slopes, residuals) - z
             downhill += ((anchors - z)[:, None] @ firmness)[:, 0]
-            scale, unit = _scale_and_unit(precision + firmness)
-            step = np.linalg.solve(unit, (downhill / scale)[:, :, None])[:, :, 0] / scale
+            step = np.linalg.solve(precision + firmness, downhill[:, :, None])[:, :, 0]
             z = np.clip(z + step, -FARTHEST, FARTHEST)
         return z
 
@@ -359,7 +354,7 @@ class _Ridge:
         slopes = np.stack([self.law(found.slopes).T / math.sqrt(self._variance(found)) for found in fits])
         log_z = np.array([log_evidence_of(found, self.law) for found in fits])
         share = np.maximum(np.exp(log_z - log_z.max()), 0.1)
-        precision = slopes @ slopes.transpose(0, 2, 1) + self.eye
+        precision = with_prior(slopes @ slopes.transpose(0, 2, 1))
         mean = np.stack([found.z for found in fits])
         return _Kernels(mean, precision, share / share.sum(), self.degrees_of_freedom)
 
@@ -708,7 +703,7 @@ class _Laplace:
         whitened, turned = law(found.residuals)[:, None], law(found.slopes)
         sigma = law.likeliest_sigma(whitened)
         sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), LEAST_SCALE)
-        curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
+        curvature = with_prior(turned.T @ turned / sd**2)
         # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps
         # leave the SSF's geometry unchanged, which speeds up vectorised predictions.
         order = np.roll(np.arange(len(found.z)), -found.model.sensor.n_params)
@@ -720,7 +715,7 @@ class _Laplace:
     @cached_property
     def center(self) -> FloatArray:
         """The mode, one Newton step from the fit, (n_params,)."""
-        found, curvature = self.found, self.slopes.T @ self.slopes + np.eye(len(self.found.z))
+        found, curvature = self.found, with_prior(self.slopes.T @ self.slopes)
         center = found.z + np.linalg.solve(curvature, self.slopes.T @ self.residual - found.z)
         center = np.asarray(np.clip(center, -FARTHEST, FARTHEST))
         if np.isfinite(found.model.predict(center[None, :])[0, self.recording.usable]).all():

@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import covariance_root
-from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start
+from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, rough_sd, white_noise_of_recording
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Uniform
@@ -295,7 +295,7 @@ def with_step_for_likely_parameters(
             left, slopes = (recording.readings - predicted)[usable] / scale, slopes[usable] / scale[:, None]
             if not (np.isfinite(left).all() and np.isfinite(slopes).all()):
                 return z, -np.inf
-            curvature = slopes.T @ slopes + np.eye(len(others))
+            curvature = with_prior(slopes.T @ slopes)
             z = z.copy()
             z[others] = np.clip(
                 z[others] + np.linalg.solve(curvature, slopes.T @ left - z[others]), -FARTHEST, FARTHEST

@@ -11,6 +11,7 @@ from probewise.inference.problem import (
     reading_span,
     sd_ceiling,
     sd_floor,
+    sd_of_numbers,
     student_t_of,
 )
 from probewise.inference.rounded import Rounded
@@ -26,5 +27,6 @@ __all__ = [
     "reading_span",
     "sd_ceiling",
     "sd_floor",
+    "sd_of_numbers",
     "student_t_of",
 ]

@@ -110,6 +110,11 @@ def reading_span(recording: Recording) -> float:
     return 1.0
 
 
+def sd_of_numbers(recording: Recording) -> float:
+    """Return the distance between two floating-point numbers at the largest reading: no noise is known below that."""
+    return float(np.spacing(np.max(np.abs(recording.readings[recording.usable]), initial=0.0)))
+
+
 def sd_floor(recording: Recording) -> float:
     """Return the lower bound of the noise sd: that of rounding, step / sqrt(12), or a share of the range if larger.
 
@@ -118,7 +123,8 @@ def sd_floor(recording: Recording) -> float:
     is `recording.least_share_of_span`, 0.001 for a light sensor.
     """
     step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
-    return max(step / math.sqrt(12.0), recording.least_share_of_span * reading_span(recording))
+    share = recording.least_share_of_span * reading_span(recording)
+    return max(step / math.sqrt(12.0), share, sd_of_numbers(recording))
 
 
 def sd_ceiling(recording: Recording) -> float:

@@ -373,7 +373,7 @@ def _fit_coroutine(
         with np.errstate(over="ignore"):  # of predictions that ran away
             curvature = with_prior(turned.T @ turned / variance)
             downhill = turned.T @ law.normal_pseudo_residuals(whitened, sigma)[:, 0] / variance - z
-        tries = _damped_steps(curvature, downhill) if np.isfinite(curvature).all() else ()
+        tries = _damped_steps(curvature, downhill)
         if not len(tries):
             break
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
@@ -438,10 +438,10 @@ def with_prior(information: FloatArray) -> FloatArray:
 def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
     """Return the Levenberg-Marquardt step for each damping, (n_solved, n_params).
 
-    If readings are fitted exactly, the prior is lost in rounding; weakly damped systems that are singular are left out.
+    Weakly damped systems that are singular are left out, and all where a prediction ran away.
     """
     scale, solved = np.diag(curvature), []
-    for damping in _DAMPINGS:
+    for damping in _DAMPINGS if np.isfinite(curvature).all() else ():
         with contextlib.suppress(np.linalg.LinAlgError):
             solved.append(np.linalg.solve(curvature + np.diag(damping * scale), downhill))
     return np.array(solved).reshape(-1, len(downhill))

@@ -27,7 +27,6 @@ from probewise.nested.importance import evenly_weighted, weighted_draws
 _MATTERS = 1e-4  # probability, by the raised odds, from which on a kind is solved at a doubt, and wakes
 _HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
 _SLEEPS = 1e-8  # probability, by the raised odds, below which a kind falls asleep
-_SURE = 1.0  # error of the log evidence by the genealogy, beyond which samples from no search are unsure
 _EACH = 2  # kinds that are solved after a reading: the most probable of the unsure, and those solved longest ago
 _OLD = 0.5  # share of the readings: a kind that was solved with fewer is solved again before a run ends
 _MOVES = 4.0  # of each new live point: its samples are only where draws are made
@@ -42,16 +41,12 @@ _WIDE, _OF_WIDE = 3.0, 0.15  # factor on the width of some kernels, beyond the s
 def can_sleep_mask(now: Posterior) -> BoolArray:
     """Mark the kinds whose samples need not follow the next reading, (n_kinds,).
 
-    Such a kind is known to be far behind, and even if it had predicted every reading since exactly, it would be; which
-    is what its evidence then says.
+    A search of the prior has found that such a kind is far behind, and even if it had predicted every reading since
+    exactly, it would be; which is what its evidence then says.
     """
-    asleep, raised = np.array([p.asleep for p in now.particles]), now.with_raised_fault_odds().probability
-    return np.asarray((asleep | _known_mask(now)) & (raised < _SLEEPS) & now.doubts_sensor)
-
-
-def _known_mask(now: Posterior) -> BoolArray:
-    """Mark the kinds whose samples followed all readings without difficulty, from a search or from many, (n_kinds,)."""
-    return np.array([not p.is_doubtful and (p.searched_at > -math.inf or p.log_z_error < _SURE) for p in now.particles])
+    raised = now.with_raised_fault_odds().probability
+    known = np.array([p.asleep or (p.searched_at > -math.inf and not p.is_doubtful) for p in now.particles])
+    return np.asarray(known & (raised < _SLEEPS) & now.doubts_sensor)
 
 
 def with_evidence_from_prior(
@@ -66,22 +61,22 @@ def with_evidence_from_prior(
     """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those of few readings too.
 
     `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. Unsure is a
-    kind whose samples followed a reading with difficulty, were woken, or descend from few and no search. In doubt, a
-    few of these are solved after a reading; of those far behind, only where no sample predicted it. Before a run ends,
-    all are solved, with those awake that were last solved with fewer than half of the readings: samples lose a mode
-    without a sign. Where no effect can be left out, the end changes samples only if they had lost a mode.
+    kind whose samples followed a reading with difficulty or were woken, and in doubt one never solved, too. After a
+    reading, a few of these are solved; before a run ends, all, with those that were last solved with fewer than half of
+    the readings: samples lose a mode without a sign. Where no effect can be left out, the end changes samples only if
+    they had lost a mode.
     """
     n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
     raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
-    names = ("asleep", "is_doubtful", "strained")
-    asleep, doubtful, strained = (np.array([getattr(p, name) for p in now.particles]) for name in names)
+    asleep, doubtful = (np.array([getattr(p, name) for p in now.particles]) for name in ("asleep", "is_doubtful"))
     searched_at, matters = np.array([p.searched_at for p in now.particles]), raised > _MATTERS
-    unsure = np.where(asleep, matters, doubtful | (searched_at < _OLD * n_readings) if at_end else ~_known_mask(now))
+    unsure = np.where(asleep, matters, doubtful | (searched_at == -math.inf))
     if at_end:
+        unsure |= searched_at < _OLD * n_readings
         due = np.flatnonzero(unsure & (now.doubts_sensor | (raised > _HAS_A_SAY)))
     else:
         in_doubt = raised[doubtful].sum() > 0.5 or (now.doubts_sensor and possible and now.left_out[""] < 0.5)
-        unsure &= (in_doubt & (strained | (raised > _SLEEPS))) | ((doubtful | asleep) & matters)
+        unsure &= np.full(len(raised), in_doubt) | ((doubtful | asleep) & matters)
         likely, old = np.lexsort((-raised, ~unsure)), np.lexsort((-raised, searched_at, ~unsure))
         due = np.unique(np.concatenate([likely[:_EACH], old[:_EACH]]))
         due = due[unsure[due]]

@@ -126,23 +126,6 @@ def test_a_pair_of_noises_has_no_less_evidence_than_all_its_nodes():
     assert _mean_and_sd(own)[0][0] == pytest.approx(0.75, abs=0.05)
 
 
-@pytest.mark.parametrize("size", [2, 3])
-def test_noises_together_have_the_evidence_of_all_combinations_of_their_nodes(size):
-    """AR(1) noise that is larger in the second half and sometimes wide; a few nodes of each against all of them."""
-    grows = np.repeat([1.0, 2.5], 150)
-    found, recording = _found_with(grows * _correlated(np.where(WIDE[:300] > 1, 8.0, 1.0) * WHITE[:300], 0.5))
-    effects = {each.name: each() for each in (correlated_noise, drifting_noise, outliers)}
-    noises = NoiseModels(recording, effects, PriorOdds())
-    assert noises.add_significant_pairs(found, noises.evidence_by_noise(found))
-    names = [names for names in noises.models if len(names) == size]
-    assert names
-    for own in names:
-        every = laplace_evidence(found, NoiseModel(tuple(effects[name] for name in own), recording))
-        few = laplace_evidence(found, noises.models[own])
-        assert len(few.nodes.laws) < len(every.nodes.laws) / 3
-        assert few.log_z == pytest.approx(every.log_z, abs=0.5)
-
-
 def test_a_fit_at_the_edge_of_its_formula_is_impossible_under_any_noise():
     """A slope there is no number; neither is it a warning."""
     found, recording = _found_with(WHITE[:100])

@@ -58,10 +58,8 @@ class NoiseEvidence:
         settings, node_of = np.unique(own, axis=0, return_inverse=True)
         node_of = node_of.ravel()
         weights = np.bincount(node_of, self.weights)
-        # The other effects may have a few nodes alone, which are not their whole prior.
-        others = sum(mass for other, mass in self.nodes.log_masses.items() if other != name)
         top = float(self.nodes.log_weights.max())
-        log_prior = top - others + np.log(np.bincount(node_of, np.exp(self.nodes.log_weights - top)))
+        log_prior = top + np.log(np.bincount(node_of, np.exp(self.nodes.log_weights - top)))
         best = np.argsort(-weights)[:4]
         return settings[best], log_prior[best] - math.log(float(weights[best].sum()))
 

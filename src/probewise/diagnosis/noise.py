@@ -20,7 +20,7 @@ from functools import cache, cached_property, lru_cache
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
 from scipy.linalg.lapack import dtbtrs
-from scipy.special import expit, logsumexp
+from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.effects import NoiseEffect
@@ -690,15 +690,11 @@ _FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
 
 @dataclass(frozen=True, eq=False)
 class NoiseNodes:
-    """The nodes of a noise model about a fit: parameters (n_nodes, n_params), distributions and log prior weights.
-
-    `log_masses`: log of the sum of the weights of each effect's nodes, by its name; 0 for all nodes of its prior.
-    """
+    """The nodes of a noise model about a fit: parameters (n_nodes, n_params), distributions and log prior weights."""
 
     settings: FloatArray
     laws: tuple[NoiseLaw, ...]
     log_weights: FloatArray
-    log_masses: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -743,8 +739,7 @@ class NoiseModel:
             )
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
-        masses = {e.name: float(logsumexp(each)) for e, (_, each) in zip(self.effects, banks, strict=True) if len(each)}
-        return NoiseNodes(settings, laws, log_weights, masses)
+        return NoiseNodes(settings, laws, log_weights)
 
     def laws_at(self, settings: FloatArray, predicted: FloatArray) -> tuple[NoiseLaw, ...]:
         """Return the noise distributions at settings of the parameters, (n_nodes, n_params), without rounding.

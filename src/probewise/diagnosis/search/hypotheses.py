@@ -282,12 +282,11 @@ class NoiseModels:
                     # Of all nodes of each effect, the likeliest beside the likeliest of the others.
                     best_of = {name: nearby.likeliest_nodes_of_effect(name) for name in self._uncertain_names(both)}
                     recentred = {}
-                    # All nodes of a third effect beside those of two would take most of the time of a search.
-                    for name in self._uncertain_names(first if size == 1 else both):
+                    for name in self._uncertain_names(first):
                         beside = {k: nodes for k, nodes in best_of.items() if k != name}
                         again = laplace_evidence(found, self._build_model(both, beside))
                         recentred[name] = again.likeliest_nodes_of_effect(name)
-                    self.models[both], known[both] = self._build_model(both, coarse | recentred), own
+                    self.models[both], known[both] = self._build_model(both, recentred | coarse), own
         return True
 
     def _uncertain_names(self, names: Names) -> Names:

@@ -209,15 +209,15 @@ def _second_estimate(
     found = budget.run(posed, n_live, chain)
     if found is None:
         return None
-    met, parts = [enter(theta)], None
+    parts, n_met = None, 1
     if peaks:
-        fewest = _SAMPLES_IN_CLUSTER * theta.shape[1]
-        clusters = find_clusters(met[0], least=fewest)
-        home = clusters.assign(met[0])
+        whole, fewest = enter(theta), _SAMPLES_IN_CLUSTER * theta.shape[1]
+        clusters, met = find_clusters(whole, least=fewest), [whole]
+        home = clusters.assign(whole)
         if np.bincount(home, minlength=len(clusters)).min() >= fewest:  # the last division of space may leave fewer
-            met = [met[0][home == k] for k in range(len(clusters))]
-        parts = Clusters.from_groups([*met, *map(enter, peaks)])
-    second, again = _SecondEstimate(name, found, parts, len(met), enter), _AGAIN * first.n_calls
+            met = [whole[home == k] for k in range(len(clusters))]
+        parts, n_met = Clusters.from_groups([*met, *map(enter, peaks)]), len(met)
+    second, again = _SecondEstimate(name, found, parts, n_met, enter), _AGAIN * first.n_calls
     room = budget.left - again if budget.left > again else budget.left
     n_more = int(min(first.n_live, n_live * room / found.n_calls))
     if second.disagreement_in_words(first) and not second.missing_part_in_words(first) and n_more > n_live:

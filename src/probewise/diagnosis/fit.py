@@ -359,6 +359,7 @@ def _fit_coroutine(
         return _prediction_and_slopes((yield points)[:, usable], steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
+    eye = np.eye(len(z))
     if dear:
         yield z[None, :]
     predicted, slopes = yield from request_slopes(z)
@@ -371,7 +372,7 @@ def _fit_coroutine(
         sigma = law.likeliest_sigma(whitened)
         variance = float(sigma[0]) ** 2 / law.fisher_information
         with np.errstate(over="ignore"):  # of predictions that ran away
-            curvature = with_prior(turned.T @ turned / variance)
+            curvature = turned.T @ turned / variance + eye
             downhill = turned.T @ law.normal_pseudo_residuals(whitened, sigma)[:, 0] / variance - z
         tries = _damped_steps(curvature, downhill)
         if not len(tries):

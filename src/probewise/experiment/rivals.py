@@ -131,12 +131,18 @@ def rivals_of(
 
 def _forms_of_effect_in_run(effect: Effect, extent: Extent, field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """Return the forms in which an effect may act in a run, with a run's prior; effects of time act in paced time."""
-    forms: list[DescribedEffect] = [EffectWithRunPrior(effect, field_mm)]
-    if another := {"backlash": play_of_axes, "gain_drift": gain_loss}.get(effect.name):
-        forms.append(EffectWithRunPrior(cast(Effect, another.for_extent(extent)), field_mm))
+    in_run = EffectWithRunPrior(effect, field_mm)
+    if effect.name == "backlash":
+        of_axes = EffectWithRunPrior(cast(Effect, play_of_axes.for_extent(extent)), field_mm)
+        return [in_run, FromRest(in_run), of_axes, FromRest(of_axes)]
     if effect.name in OF_MOTION:
-        return [way for form in forms for way in (form, FromRest(form))]
-    return [EffectInPacedTime(form) for form in forms] if effect.name in _IN_TIME else forms
+        return [in_run, FromRest(in_run)]
+    if effect.name not in _IN_TIME:
+        return [in_run]
+    forms: list[DescribedEffect] = [EffectInPacedTime(in_run)]
+    if effect.name == "gain_drift":
+        forms.append(EffectInPacedTime(EffectWithRunPrior(cast(Effect, gain_loss.for_extent(extent)), field_mm)))
+    return forms
 
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
@@ -197,8 +203,19 @@ def gain(kind: LightEffect, of: Extent) -> Effect:
     return kind.linear(of, {"frac": "1"}, 0.02, lambda value, theta, _: value * np.maximum(1 + theta[:, :1], 0.0), says)
 
 
-def scale_of_axis(axis: str, other: str) -> LightEffect:
-    """Declare a wrong scale of one axis alone, which no circle can imitate."""
+@light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
+def scale_of_x(kind: LightEffect, of: Extent) -> Effect:
+    """Return a wrong scale of X alone, which no circle can imitate."""
+    return _scale_of_axis(kind, of, "x", "y")
+
+
+@light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
+def scale_of_y(kind: LightEffect, of: Extent) -> Effect:
+    """Return a wrong scale of Y alone, which no circle can imitate."""
+    return _scale_of_axis(kind, of, "y", "x")
+
+
+def _scale_of_axis(kind: LightEffect, of: Extent, axis: str, other: str) -> Effect:
     place = f"{axis}_mm"
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -207,17 +224,13 @@ def scale_of_axis(axis: str, other: str) -> LightEffect:
     def says(mean: FloatArray, sd: FloatArray) -> str:
         return _SCALE_SAYS.format(value_with_sd(mean[0], sd[0], factor=100), axis.upper(), other.upper())
 
-    @light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
-    def scale(kind: LightEffect, of: Extent) -> Effect:
-        return kind.linear(of, {axis: "1"}, 0.01, act, says)
-
-    return scale
+    return kind.linear(of, {axis: "1"}, 0.01, act, says)
 
 
 SINCE_CALIBRATION = (dark_level, gain)
 """Changes of the levels since the calibration, constant in a run."""
 
-ONLY_IN_RUNS = (*SINCE_CALIBRATION, scale_of_axis("x", "y"), scale_of_axis("y", "x"))
+ONLY_IN_RUNS = (*SINCE_CALIBRATION, scale_of_x, scale_of_y)
 """Effects that only a run without cards has as rivals, besides those in `ON_FIELD`."""
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -111,6 +112,12 @@ def test_trust_is_a_probability_and_below_one_only_for_a_sensor_that_has_rivals(
     assert [kind.left_out for kind in experiment_of(row).kinds] == [""]
     with pytest.raises(ParameterError, match="trust"):
         replace(experiment_of(row), trust=trust)
+
+
+def test_a_step_with_all_its_rivals_reaches_another_process():
+    for rival in rivals():
+        again = pickle.loads(pickle.dumps(rival))
+        assert again.name == rival.name
 
 
 def test_a_rival_is_of_a_size_and_at_a_time_that_a_run_can_show():

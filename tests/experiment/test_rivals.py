@@ -114,7 +114,7 @@ def test_trust_is_a_probability_and_below_one_only_for_a_sensor_that_has_rivals(
         replace(experiment_of(row), trust=trust)
 
 
-def test_a_step_with_all_its_rivals_reaches_another_process():
+def test_every_rival_reaches_another_process():
     for rival in rivals():
         again = pickle.loads(pickle.dumps(rival))
         assert again.name == rival.name

@@ -91,7 +91,6 @@ def fitted_system_from_samples(
 _LEAST_ERROR = 1e-3  # of the log evidence
 _N_LIVE = 200
 _MOST_SAMPLES = 2000  # equally weighted, where many predictions cost little; else as few as a diagnosis has
-_ROUNDING = 1e-15  # of the largest reading: least noise sd
 _MISSED = 4.0  # nats by which all samples are less likely than the best fit, beyond the mean loss
 
 
@@ -206,9 +205,9 @@ def fit_simulator(
     first = cast(FloatArray, cast(System, prepared.null).first)
     modes, n_even = modes_of(system, recording, law, first)
     fits = _distinct(fit_each_start(Model(system, (), recording.plan), recording, [first, *modes], law), law)
-    step, largest = recording.plan.instrumentation.step or 0.0, float(np.abs(recording.readings[usable]).max())
+    step = recording.plan.instrumentation.step or 0.0
     rounding = step if fits[0].sd < HIDDEN * step else 0.0
-    noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding, _ROUNDING * largest))
+    noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding))
     problem = HypothesisProblem(fits[0].model, recording, noise)
     progress("sampling the posterior")
     draws, is_settled = draw_by_importance(problem, fits, law, rng=rng, progress=progress)

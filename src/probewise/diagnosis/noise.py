@@ -796,11 +796,15 @@ class NoiseModel:
             value_at_node(noise.wide_share),
             value_at_node(noise.wide_times),
             log_extra,
-            least=max(self.least_sd, sd_of_numbers(self.recording)),
+            least=self._floor,
             walk=step**2 * self._n_rows_since_previous if step else np.zeros(0),
             before=self._before_if_interleaved if rho else np.zeros(0, dtype=np.int64),
             censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
         )
+
+    @cached_property
+    def _floor(self) -> float:
+        return max(self.least_sd, sd_of_numbers(self.recording))
 
     @cached_property
     def _censored(self) -> BoolArray:

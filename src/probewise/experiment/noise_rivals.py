@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Self
 
 import numpy as np
@@ -108,7 +108,7 @@ class DeclaredNoise:
         return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))
 
 
-@cache
+@lru_cache(maxsize=64)  # a sensor has some thirty
 def _rounded(sd: float, step: float) -> Rounded:
     return Rounded(sd, step)  # keeps its table
 

@@ -111,8 +111,8 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_of_numbers(recording: Recording) -> float:
-    """Return the distance between two floating-point numbers at the largest reading: no noise is known below that."""
-    return float(np.spacing(np.max(np.abs(recording.readings[recording.usable]), initial=0.0)))
+    """Return the least noise sd of which floating-point readings can tell: 1e-15 of the largest."""
+    return 1e-15 * float(np.max(np.abs(recording.readings[recording.usable]), initial=0.0))
 
 
 def sd_floor(recording: Recording) -> float:

@@ -245,7 +245,7 @@ def _recorded_before(
         lost = [fitted.samples[:, k] for k, name in enumerate(fitted.names) if name == f"{dropouts.name}.value"]
         usable = predicted & (recording.usable & ~recording.censored)[rows] & ~np.isin(readings, lost)
         run = np.array(recorded.scan_names)[recorded.scan[rows]]
-        between = np.concatenate([np.diff(recorded.time_s[own]) for own in recorded.rows_by_scan()])
+        gap = recorded.median_gap
         for name, own in zip(table.scan_names, table.rows_by_scan(), strict=True):
             before = np.flatnonzero(run == name)
             if not usable[before].any():
@@ -253,7 +253,7 @@ def _recorded_before(
             last[own] = before[usable[before]][-1]
             order = np.argsort(np.argsort(table.time_s[own], kind="stable")) + 1
             elapsed = table.time_s[own] - recorded.time_s[rows[last[own]]]
-            in_rows = np.round(elapsed / np.median(between[between > 0])).astype(np.int64)
+            in_rows = np.round(elapsed / gap).astype(np.int64)
             n_since[own] = np.maximum(order + np.count_nonzero(before > last[own[0]]), in_rows)
     return RecordedBefore(rows, usable, later, last, n_since), readings
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
@@ -154,6 +154,13 @@ class RunTable:
         own = [self.time_s[rows] for rows in self.rows_by_scan()]
         first, last = np.array(sorted((times.min(), times.max()) for times in own)).T
         return bool((first[1:] < np.maximum.accumulate(last)[:-1]).any())
+
+    @cached_property
+    def median_gap(self) -> float:
+        """Median time from a row to the next of its run, in the unit of time; 1 if no time passes."""
+        gaps = np.concatenate([np.diff(self.time_s[rows]) for rows in self.rows_by_scan()])
+        gaps = gaps[gaps > rounding_error(self.time_s)]
+        return float(np.median(gaps)) if gaps.size else 1.0
 
     def rows_by_scan(self) -> list[IntArray]:
         """Return the row indices of each run, in the order of the table."""

@@ -71,7 +71,7 @@ def late_forms(about: ReferenceFit) -> Iterator[Form]:
         def at_rows(value: FloatArray, theta: FloatArray, table: RunTable, act: Act = act) -> FloatArray:
             return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
 
-        prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.median_gap * tried)
+        prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.table.median_gap * tried)
         if prior is None:
             continue
         variants: list[Form] = []
@@ -290,7 +290,7 @@ def settling_time_prior(about: ReferenceFit) -> LogUniform:
     It begins at a hundredth of the longest run if that is less.
     """
     longest = float(time_since_start_of_run(about.table).max()) or 1.0
-    return LogUniform(min(0.5 * about.median_gap, 0.01 * longest), 2 * longest)
+    return LogUniform(min(0.5 * about.table.median_gap, 0.01 * longest), 2 * longest)
 
 
 def _settling_form(about: ReferenceFit) -> Iterator[Form]:

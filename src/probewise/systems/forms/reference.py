@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error, varies
+from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     ROWS_OF_A_SIDE,
@@ -366,13 +366,6 @@ class ReferenceFit:
     def duration(self) -> float:
         """Range of the times of the rows, in the unit of time; 1 if no time passes."""
         return float(np.ptp(self.table.time_s)) or 1.0
-
-    @cached_property
-    def median_gap(self) -> float:
-        """Median time from a row to the next of its run, in the unit of time; 1 if no time passes."""
-        gaps = np.concatenate([np.diff(self.table.time_s[rows]) for rows in self.table.rows_by_scan()])
-        gaps = gaps[gaps > rounding_error(self.table.time_s)]
-        return float(np.median(gaps)) if gaps.size else 1.0
 
     def is_held_between_rows(self, column: str) -> bool:
         """Return whether the model holds a column until the next row, so that a value acts on later readings only."""

@@ -33,15 +33,16 @@ def _plain(motion, theta):
 
 
 def _rubbed(motion, theta):
-    return motion.with_friction("omega", 0.2 + 0 * theta[:, :1])
+    return motion.plus(friction={"omega": 0.2 + 0 * theta[:, :1]})
 
 
 def _stopped(motion, theta):
-    return motion.with_limit(Limit("phi", 0.9 * theta[:, 2:3]))
+    return motion.plus(limits=(Limit("phi", 0.9 * theta[:, 2:3]),))
 
 
 def _forced(motion, theta):
-    return motion.with_term("omega", lambda s, p, u: 0.3 * np.sin(4 * u["t_s"]) - theta[:, :1] * s["phi"] ** 3)
+    force = ("omega", lambda s, p, u: 0.3 * np.sin(4 * u["t_s"]) - theta[:, :1] * s["phi"] ** 3)
+    return motion.plus(terms=(force,))
 
 
 class _Case:

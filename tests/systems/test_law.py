@@ -70,7 +70,7 @@ def test_runs_go_on_side_by_side_as_each_would_alone():
 def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts():
     """v = v0 - a t until 0, then it sticks."""
     law, table = Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]}), _table(np.linspace(0, 4, 81))
-    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 0.5)), table, {}, 0.05)["v"]
+    found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 0.5)}), table, {}, 0.05)["v"]
     np.testing.assert_allclose(found, np.maximum(1 - 0.5 * table.time_s, 0), atol=0.03)
     assert np.all(found[table.time_s > 2.1] == 0)
 
@@ -78,7 +78,7 @@ def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts(
 def test_a_body_at_rest_sticks_until_the_force_is_larger_than_its_friction():
     law = Law({"v": 0.0}, lambda s, p, u: {"v": u["force"] + 0 * s["v"]}, hold="linear")
     table = _table(np.linspace(0, 4, 401), force=np.linspace(0, 4, 401))
-    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 2.0)), table, {}, 0.01)["v"]
+    found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 2.0)}), table, {}, 0.01)["v"]
     assert np.all(found[table.time_s < 1.99] == 0)
     assert found[-1] == pytest.approx(0.5 * 2.0**2, abs=0.05)
 
@@ -87,7 +87,7 @@ def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction()
     """Closed form: a force of 2 t exceeds a friction of 1 at 0.5, amid the first step, and v = (t - 0.5)^2 after it."""
     law = Law({"v": 0.0}, lambda s, p, u: {"v": 2 * u["t_s"] + 0 * s["v"]})
     table = _table(np.linspace(0, 4, 6))
-    found = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), 1.0)), table, {}, 0.8)["v"]
+    found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 1.0)}), table, {}, 0.8)["v"]
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
 
 
@@ -95,7 +95,7 @@ def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction()
 def test_friction_that_vanishes_holds_nothing_at_rest(size):
     law = Law({"x": 0.0, "v": 0.0}, lambda s, p, u: {"x": 1 - s["x"], "v": s["x"] - s["v"]})
     table = _table(np.linspace(0, 5, 11))
-    held = _states(LawWithEffects(law).with_friction("v", np.full((1, 1), size)), table, {}, 0.5)["v"]
+    held = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), size)}), table, {}, 0.5)["v"]
     np.testing.assert_allclose(held, _states(law, table, {}, 0.5)["v"], atol=1e-8)
 
 
@@ -103,7 +103,7 @@ def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_en
     law = Law({"level": 0.0}, lambda s, p, u: {"level": u["inflow"] - 0.5 * s["level"]})
     times = np.linspace(0, 10, 201)
     table = _table(times, inflow=np.where(times < 5, 1.0, 0.0))
-    found = _states(LawWithEffects(law).with_limit(Limit("level", np.full((1, 1), 1.2))), table, {}, 0.05)["level"]
+    found = _states(LawWithEffects(law).plus(limits=(Limit("level", np.full((1, 1), 1.2)),)), table, {}, 0.05)["level"]
     assert found.max() == pytest.approx(1.2)
     after = times >= 5
     np.testing.assert_allclose(found[after], 1.2 * np.exp(-0.5 * (times[after] - 5)), atol=1e-3)
@@ -117,7 +117,7 @@ def test_what_a_tank_spills_into_the_next_one_is_there():
     law = Law({"upper": 0.0, "lower": 0.0}, lambda s, p, u: {"upper": 1 - 0.5 * s["upper"], "lower": 0.5 * s["upper"]})
     table = _table(np.linspace(0, 6, 121))
     bound = Limit("upper", np.full((1, 1), 1.0), spilt={"lower": np.full((1, 1), 0.6)})
-    found = _states(LawWithEffects(law).with_limit(bound), table, {}, 0.05)
+    found = _states(LawWithEffects(law).plus(limits=(bound,)), table, {}, 0.05)
     spilt = 0.5 * np.maximum(table.time_s - 2 * np.log(2), 0)
     np.testing.assert_allclose(found["upper"], np.minimum(2 * (1 - np.exp(-0.5 * table.time_s)), 1), atol=1e-3)
     np.testing.assert_allclose(found["upper"] + found["lower"] + 0.4 * spilt, table.time_s, atol=1e-3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.systems.integrate import Stepper
-from probewise.systems.law import LawWithEffects, Limit
+from probewise.systems.law import LawWithEffects, Limit, StepInputs
 from probewise.systems.simulator import Law
 from probewise.systems.step import FOURTH_ORDER, RODAS, cheapest_steps, eighth_order_method
 
@@ -12,9 +12,14 @@ EIGHTH_ORDER = eighth_order_method()
 SWINGS = LawWithEffects(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))
 
 
+def _between(gap, **parameters):
+    """Return the inputs in a gap of this time, from time 0 on."""
+    return StepInputs("t", (parameters, {}), ({}, {"t": (np.zeros(np.shape(gap)), np.asarray(gap))}))
+
+
 def _error(method, n_steps):
     """Return the error of a swing of 4 rad, of which the closed form is a cosine."""
-    stepper = Stepper(SWINGS, method, lambda share: ({}, {"t": 4.0 * share}), np.array([[4.0]]))
+    stepper = Stepper(SWINGS, method, _between([[4.0]]))
     s = {"x": np.ones((1, 1)), "v": np.zeros((1, 1))}
     for k in range(n_steps):
         s = stepper.step(s, k / n_steps, 1 / n_steps)
@@ -51,10 +56,10 @@ def test_the_method_is_the_one_whose_accuracy_costs_least(in_gap, method, steps)
 
 def test_a_state_that_meets_its_bound_within_a_step_of_eighth_order_stays_there():
     """A filling of rate 1 with a bound at 2.5: what an eighth-order step weighs negatively must not take it back."""
-    fills = LawWithEffects(Law({"x": 0.0}, lambda s, p, u: {"x": 1.0 + 0 * s["x"]})).with_limit(
-        Limit("x", np.array([[2.5]]))
+    fills = LawWithEffects(Law({"x": 0.0}, lambda s, p, u: {"x": 1.0 + 0 * s["x"]})).plus(
+        limits=(Limit("x", np.array([[2.5]])),)
     )
-    stepper = Stepper(fills, EIGHTH_ORDER, lambda share: ({}, {}), np.array([[1.0]]))
+    stepper = Stepper(fills, EIGHTH_ORDER, _between([[1.0]]))
     s, found = {"x": np.zeros((1, 1))}, []
     for _ in range(4):
         s = stepper.step(s, 0.0, 1.0)
@@ -65,12 +70,10 @@ def test_a_state_that_meets_its_bound_within_a_step_of_eighth_order_stays_there(
 END = 2.0
 
 
-def _after(law, n_steps, *, gap=END, between=None):
+def _after(law, n_steps):
     """Return the states after a gap in a number of steps."""
-    stepper = Stepper(
-        LawWithEffects(law), RODAS, between or (lambda share: ({}, {"t": gap * share})), np.atleast_2d(gap)
-    )
-    s = {name: np.full(np.shape(stepper.gap), float(value)) for name, value in law.states.items()}
+    stepper = Stepper(LawWithEffects(law), RODAS, _between([[END]]))
+    s = {name: np.full((1, 1), float(value)) for name, value in law.states.items()}
     with np.errstate(all="ignore"):
         for k in range(n_steps):
             s = stepper.step(s, k / n_steps, 1 / n_steps)
@@ -97,12 +100,8 @@ def test_a_run_that_ended_stands_still_and_one_that_runs_away_leaves_the_others(
     def rates(s, p, u):
         return {"x": s["x"] ** 2 * p["k"] - s["x"]}
 
-    stepper = Stepper(
-        LawWithEffects(Law({"x": 1.0}, rates)),
-        RODAS,
-        lambda share: ({"k": np.array([[0.0], [1e200]])}, {}),
-        np.array([[1.0, 0.0, 2.0]]),
-    )
+    between = _between([[1.0, 0.0, 2.0]], k=np.array([[0.0], [1e200]]))
+    stepper = Stepper(LawWithEffects(Law({"x": 1.0}, rates)), RODAS, between)
     s = {"x": np.array([[1.0, 7.0, 1.0], [1.0, 7.0, 1e200]])}
     with np.errstate(all="ignore"):
         for k in range(10):

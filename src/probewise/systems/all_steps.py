@@ -24,9 +24,8 @@ from probewise.systems.integrate import (
     n_parts_of_steps,
     states_by_step,
     step_in_part,
-    time_gaps,
 )
-from probewise.systems.law import LawInputs, LawWithEffects
+from probewise.systems.law import LawInputs, LawWithEffects, StepPart
 from probewise.systems.step import Steps
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
@@ -220,17 +219,14 @@ class _NewtonState:
     steps: Steps
     states: FloatArray
     n_evaluated: int = 0
-    _end: Callable[[FloatArray], FloatArray] = lambda begins: begins
-    _n_columns: int = 0
 
     def __post_init__(self) -> None:
         n_samples = self.states.shape[1]
         self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
-        self._chosen = np.zeros(0, dtype=np.int64)
-        motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
-        start = motion.clip_and_stop_states({}, initial_states(motion.law, self.steps, parameters, n_samples))
-        self.states[:, :, 0] = np.stack(list(start.values()))
+        self._chosen, self._parts = np.zeros(0, dtype=np.int64), list[StepPart]()
+        self._motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
+        self.states[:, :, 0] = [*initial_states(self._motion, self.steps, parameters, n_samples).values()]
 
     @property
     def active_mask(self) -> BoolArray:
@@ -239,11 +235,20 @@ class _NewtonState:
 
     def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
+        gap, begins = self.steps.gap_of_step, states[:, :, :-1]
         if not np.array_equal(samples, self._chosen):
-            self._chosen = samples
-            self._end, self._n_columns = _stepping_function(self.law_and_inputs, self.steps, samples)
-        self.n_evaluated += len(samples) * self._n_columns
-        return self._end(states[:, :, :-1])
+            self._motion, parameters, columns = self.law_and_inputs(samples)
+            given = LawInputs(self._motion, self.steps, parameters, columns)
+            whole = given.parts_of_steps(given.of_gaps(gap, len(gap)), gap, *self.steps.begin_and_length, whole=False)
+            self._chosen, self._parts = samples, list(whole)
+        s = dict(zip(self._motion.law.states, begins.reshape(len(begins), len(samples), -1), strict=True))
+        after: dict[str, Any] = s
+        for part in self._parts:
+            columns_of_part = part[0]
+            n_columns = len(gap) * self.steps.n_runs if columns_of_part is None else len(columns_of_part)
+            self.n_evaluated += len(samples) * n_columns
+            after = step_in_part(self._motion, self.steps.method, part, after)
+        return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(begins.shape)
 
     def step_residuals(self, samples: IntArray) -> FloatArray:
         """Return each step's end minus the trajectory's state there, (n_states, n, n_steps, n_runs); 0 if solved."""
@@ -271,34 +276,6 @@ class _NewtonState:
         self.possible[samples] = np.isfinite(change)
         self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < _SETTLED)
         self.change[samples], self.rate[samples] = change, rate
-
-
-def _stepping_function(
-    law_and_inputs: LawAndInputs, steps: Steps, samples: IntArray
-) -> tuple[Callable[[FloatArray], FloatArray], int]:
-    """Return a function from the states before each step to those after, (n_states, n, n_steps, n_runs) each.
-
-    With it comes the number of steps and their parts that it takes of a sample, in all runs.
-    """
-    motion, parameters, columns = law_and_inputs(samples)
-    n_states = len(motion.law.states)
-    given = LawInputs.of(motion, steps, parameters, columns)
-    gap = steps.gap_of_step
-    passing = time_gaps(steps, columns)[:, gap]
-    passing = passing.reshape(len(passing), -1)
-    inputs = given.of_gaps(gap, len(gap))
-    parts = list(given.parts_of_steps(inputs, gap, *steps.begin_and_length, whole=False))
-
-    def states_after_each_step(begins: FloatArray) -> FloatArray:
-        shape = begins.shape
-        s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
-        after: dict[str, Any] = s
-        for part in parts:
-            after = step_in_part(motion, steps.method, part, passing, after)
-        return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
-
-    n_steps = len(gap) * steps.n_runs
-    return states_after_each_step, sum(n_steps if columns is None else len(columns) for columns, *_ in parts)
 
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,17 +46,15 @@ def states_by_step(
     columns: Mapping[str, NDArray[Any]],
 ) -> Iterator[dict[str, FloatArray]]:
     """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
-    gaps = time_gaps(steps, columns)
-    start = initial_states(motion.law, steps, parameters, number_of_samples(parameters, columns))
-    s = motion.clip_and_stop_states({}, start)
+    s = initial_states(motion, steps, parameters, number_of_samples(parameters, columns))
     with np.errstate(all="ignore"):
-        given = LawInputs.of(motion, steps, parameters, columns)
+        given = LawInputs(motion, steps, parameters, columns)
         yield s
         for k, n in enumerate(steps.n_steps.tolist()):
             inputs = given.of_gaps(slice(k, k + 1), 1)
             for i in range(n):
                 for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n, whole=True):
-                    s = step_in_part(motion, steps.method, part, gaps[:, k], s)
+                    s = step_in_part(motion, steps.method, part, s)
                 yield s
 
 
@@ -68,7 +65,7 @@ def evaluations_per_step(motion: LawWithEffects, method: RungeKutta | Rosenbrock
     as much again, where samples of a search do so at different times.
     """
     if isinstance(method, Rosenbrock):
-        n_stages = method.n_evaluations(len(motion.law.states))
+        n_stages = 13 + 2 * len(motion.law.states)  # its linear algebra included
     elif motion.limits or motion.friction:
         n_stages = len(method.b) if method is FOURTH_ORDER else N_LONGER * len(FOURTH_ORDER.b)
     else:
@@ -81,38 +78,27 @@ def n_parts_of_steps(motion: LawWithEffects, steps: Steps) -> int:
     return int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))
 
 
-def time_gaps(steps: Steps, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Return the time from each position to the next by the time column, (1 or n_samples, n_places - 1, n_runs).
-
-    An effect on the clock changes the time column, and so these gaps.
-    """
-    return np.asarray(np.diff(values_at_rows(columns[str(steps.table.time)], steps.row_by_position_and_run), axis=1))
-
-
 def initial_states(
-    law: Law, steps: Steps, parameters: Mapping[str, FloatArray], n_samples: int
+    motion: LawWithEffects, steps: Steps, parameters: Mapping[str, FloatArray], n_samples: int
 ) -> dict[str, FloatArray]:
-    """Return the states in which the runs start, by name, (n_samples, n_runs) each."""
+    """Return the states in which the runs start, within their bounds, by name, (n_samples, n_runs) each."""
     start, first = {}, steps.row_by_position_and_run[:1]
-    for state, given in law.states.items():
+    for state, given in motion.law.states.items():
         at = values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
         start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
-    return start
+    return motion.clip_and_stop_states({}, start)
 
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """Steps of a law, by a Runge-Kutta or a Rosenbrock method, within a gap between rows.
+    """Steps of a law, by a Runge-Kutta or a Rosenbrock method, with its inputs `between` two rows.
 
-    `gap` is its time, (1 or n_samples, n_runs); `between` is a function of a share of the gap that returns parameters
-    and columns. In the methods `begin` and `length` are shares of the gap: numbers, or one for each column of the
-    states.
+    In the methods `begin` and `length` are shares of the gap: numbers, or one for each column of the states.
     """
 
     motion: LawWithEffects
     method: RungeKutta | Rosenbrock
     between: StepInputs
-    gap: FloatArray
 
     def step(self, s: dict[str, Any], begin: Any, length: Any) -> dict[str, Any]:
         """Return the states after a step; it is split where friction brings a state to rest or lets it go.
@@ -163,11 +149,7 @@ class Stepper:
             return after, ways
         n_columns, some = ends.shape[1], np.flatnonzero(ends.any(axis=0))
         if n_columns > _MANY_COLUMNS and 2 * len(some) <= n_columns:
-            few = replace(
-                self,
-                between=self.between.mapped(partial(of_columns, columns=some)),
-                gap=of_columns(self.gap, some),
-            )
+            few = replace(self, between=self.between.of_columns(some))
             s, own, ends_of = ({name: v[:, some] for name, v in each.items()} for each in (s, after, ways))
             begin, length = of_columns(begin, some), of_columns(length, some)
             split = few._split_at_transitions(state, way[:, some], s, own, begin, length, ends_of)
@@ -196,9 +178,9 @@ class Stepper:
         method = self.method
         if isinstance(method, Rosenbrock):
             return method.advanced(
-                lambda at, share: self.motion.rates(at, *self.between(share), ways), s, begin, length, self.gap
+                lambda at, share: self.motion.rates(at, *self.between(share), ways), s, begin, length, self.between.gap
             )
-        width, given = self.gap * length, self.between(begin)
+        width, given = self.between.gap * length, self.between(begin)
         _, *later, end = method.terms
         rates = [self.motion.rates(s, *given, ways)]
         for k, terms in enumerate(later, 1):
@@ -209,16 +191,13 @@ class Stepper:
 
 
 def step_in_part(
-    motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, gap: FloatArray, s: dict[str, Any]
+    motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, s: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the states, (n_samples, n_columns), after a part of some steps; other columns stay as they are.
-
-    `gap` is the time of the gap in which each column's step lies, (1 or n_samples, n_columns).
-    """
+    """Return the states, (n_samples, n_columns), after a part of some steps; other columns stay as they are."""
     columns, inputs, begin, length = part
+    stepper = Stepper(motion, method, inputs)
     if columns is None:
-        return Stepper(motion, method, inputs, gap).step(s, begin, length)
-    stepper = Stepper(motion, method, inputs, of_columns(gap, columns))
+        return stepper.step(s, begin, length)
     some = {state: values[:, columns] for state, values in s.items()}
     return _with_columns(s, columns, stepper.step(some, begin, length))
 

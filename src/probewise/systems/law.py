@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
 from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.simulator import Law
@@ -62,29 +62,15 @@ class LawWithEffects:
     drifts: Mapping[str, FloatArray] = field(default_factory=dict)
     jumps: tuple[Jump, ...] = ()
 
-    def with_term(self, state: str, term: Term) -> LawWithEffects:
-        """Return the law with a term added to the rate of a state."""
-        return replace(self, terms=(*self.terms, (state, term)))
+    def plus(self, **more: Any) -> LawWithEffects:
+        """Return the law with more `terms`, `limits` or `jumps`, or values by name, of which two of one name add up."""
 
-    def with_limit(self, limit: Limit) -> LawWithEffects:
-        """Return the law with a bound of a state added."""
-        return replace(self, limits=(*self.limits, limit))
+        def with_more(known: Any, new: Any) -> Any:
+            if isinstance(new, tuple):
+                return (*known, *new)
+            return {**known, **{name: known[name] + value if name in known else value for name, value in new.items()}}
 
-    def with_jump(self, jump: Jump) -> LawWithEffects:
-        """Return the law with a jump of a parameter added."""
-        return replace(self, jumps=(*self.jumps, jump))
-
-    def with_friction(self, state: str, size: FloatArray) -> LawWithEffects:
-        """Return the law with dry friction of this size, (n_samples, 1), added to a state."""
-        return replace(self, friction=_with_added(self.friction, state, size))
-
-    def with_dead_time(self, column: str, dead_time: FloatArray) -> LawWithEffects:
-        """Return the law with a column that acts after a dead time, (n_samples, 1); two of one column add up."""
-        return replace(self, dead_times=_with_added(self.dead_times, column, dead_time))
-
-    def with_drift(self, parameter: str, slope: FloatArray) -> LawWithEffects:
-        """Return the law with a drift of a parameter, a slope in time, (n_samples, 1); two of one add up."""
-        return replace(self, drifts=_with_added(self.drifts, parameter, slope))
+        return replace(self, **{name: with_more(getattr(self, name), new) for name, new in more.items()})
 
     def directions_of_motion(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
         """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
@@ -137,10 +123,6 @@ class LawWithEffects:
         return after
 
 
-def _with_added(known: Mapping[str, FloatArray], name: str, value: FloatArray) -> dict[str, FloatArray]:
-    return {**known, name: known[name] + value if name in known else value}
-
-
 def readings_of_states(
     law: Law, states: Mapping[str, FloatArray], parameters: Mapping[str, Any], columns: Mapping[str, Any]
 ) -> FloatArray:
@@ -167,90 +149,55 @@ def rounding_of_times(times: FloatArray) -> float:
     return float(_ROUNDING * np.spacing(np.abs(times).max()))
 
 
-@dataclass(frozen=True, eq=False)
-class Timeline:
-    """All rows of a table on one line of time, run after run, so that one search finds the rows of all runs.
+class LateColumn:
+    """A column, (n_points,) or (n_samples, n_points), that acts after a dead time, (n_samples, 1).
 
-    `rows` are in the order of the line, `at` their places on it, `is_first` marks the first of each run, and `rounding`
-    may be the difference of two places by rounding alone. Each run is from `first` to `last`, as printed, and `shift`
-    places its times on the line, (n_runs,) each; `margin` beyond either end is of no other run.
+    Before a run, its first value holds. All rows are on one line of time, run after run, so that one search finds the
+    rows of all runs: `shift` places the times of each run there, and `margin` beyond either end is of no other run.
     """
 
-    rows: IntArray
-    at: FloatArray
-    is_first: BoolArray
-    rounding: float
-    first: FloatArray
-    last: FloatArray
-    shift: FloatArray
-    margin: float
-
-    @classmethod
-    def of(cls, table: RunTable) -> Timeline:
-        """Place the rows of a table."""
+    def __init__(self, table: RunTable, column: FloatArray, dead_time: FloatArray, *, linear: bool) -> None:
         rows = np.concatenate(table.rows_by_scan())
         run, time = table.scan[rows], table.time_s[rows]
         is_first = np.append(True, run[1:] != run[:-1])
-        begins = np.flatnonzero(is_first)
-        first, last = time[begins], time[np.append(begins[1:], len(time)) - 1]
-        width = float((last - first).max()) or 1.0
-        shift = 2 * width * np.arange(len(first)) - first
-        at = time + shift[run]
-        rounding = rounding_of_times(np.append(table.time_s, at[-1]))
-        return cls(rows, at, is_first, rounding, first, last, shift, 0.25 * width)
-
-
-@dataclass(frozen=True, eq=False)
-class LateColumn:
-    """A column that acts after a dead time, (n_samples, 1); before a run, its first value holds.
-
-    `values` and `slopes` are those of the rows on the timeline, (1 or n_samples, n_points); `breaks` are the places on
-    it at which the column itself jumps, or bends where it is `linear`.
-    """
-
-    timeline: Timeline
-    values: FloatArray
-    slopes: FloatArray
-    breaks: FloatArray
-    dead_time: FloatArray
-    linear: bool
-
-    @classmethod
-    def of(cls, timeline: Timeline, column: FloatArray, dead_time: FloatArray, *, linear: bool) -> LateColumn:
-        """Find where a column, (n_points,) or (n_samples, n_points), jumps or bends."""
-        values = np.atleast_2d(column)[:, timeline.rows]
-        gap = np.append(np.diff(timeline.at), 1.0)
-        ends = np.append(timeline.is_first[1:], True) | (gap <= 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            slopes = np.where(ends, 0.0, np.diff(values, axis=1, append=0.0) / gap) if linear else np.zeros((1, 1))
-        course = slopes if linear else values
-        changes = np.any(np.diff(course, axis=1, prepend=course[:, :1]) != 0, axis=0)
+        self.begins = np.flatnonzero(is_first)
+        self.first, self.last = time[self.begins], time[np.append(self.begins[1:], len(time)) - 1]
+        width = float((self.last - self.first).max()) or 1.0
+        self.margin, self.shift = 0.25 * width, 2 * width * np.arange(len(self.first)) - self.first
+        self.at = time + self.shift[run]
+        self.rounding = rounding_of_times(np.append(table.time_s, self.at[-1]))
+        self.dead_time, self.linear = dead_time, linear
+        self.values = np.atleast_2d(column)[:, rows]
+        gap = np.append(np.diff(self.at), 1.0)
+        ends = np.append(is_first[1:], True) | (gap <= 0)
+        self.slopes = np.zeros((1, 1))
         if linear:
-            changes |= timeline.is_first | np.append(False, gap[:-1] <= 0)
-        else:
-            changes &= ~timeline.is_first
-        return cls(timeline, values, slopes, timeline.at[changes], dead_time, linear)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                self.slopes = np.where(ends, 0.0, np.diff(self.values, axis=1, append=0.0) / gap)
+        course = self.slopes if linear else self.values
+        changes = np.any(np.diff(course, axis=1, prepend=course[:, :1]) != 0, axis=0)
+        changes = changes | is_first | np.append(False, gap[:-1] <= 0) if linear else changes & ~is_first
+        self.breaks = self.at[changes]
+        """Places on the line at which the column jumps, or bends where it is linear."""
 
     def next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
         """Return the time of the next break after `now`, (n_samples, n_columns); infinite if none is left."""
-        line = self.timeline
-        earlier = np.clip(now - self.dead_time, line.first[run] - line.margin, line.last[run] + line.margin)
-        sought = earlier + line.shift[run] + line.rounding
+        first, last = self.first[run] - self.margin, self.last[run] + self.margin
+        sought = np.clip(now - self.dead_time, first, last) + self.shift[run] + self.rounding
         at = np.append(self.breaks, np.inf)[np.searchsorted(self.breaks, sought, side="right")]
-        return np.asarray(at - line.shift[run] + self.dead_time)
+        return np.asarray(at - self.shift[run] + self.dead_time)
 
     def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> Line:
         """Return its straight line around the times `at`, (n_samples, n_columns): value at `start`, slope in time."""
-        line, earlier = self.timeline, at - self.dead_time
-        before = earlier < line.first[run]
-        inside = np.clip(earlier, line.first[run], line.last[run]) + line.shift[run]
-        row = np.searchsorted(line.at, inside, side="right") - 1
-        row = np.where(before, np.flatnonzero(line.is_first)[run], row)
+        earlier = at - self.dead_time
+        before = earlier < self.first[run]
+        inside = np.clip(earlier, self.first[run], self.last[run]) + self.shift[run]
+        row = np.where(before, self.begins[run], np.searchsorted(self.at, inside, side="right") - 1)
         value = _of_rows(self.values, row)
         if not self.linear:
             return value, 0.0
         slope = np.where(before, 0.0, _of_rows(self.slopes, row))
-        return value + slope * (start - self.dead_time - (line.at[row] - line.shift[run])), slope
+        return value + slope * (start - self.dead_time - (self.at[row] - self.shift[run])), slope
 
 
 def _of_rows(values: FloatArray, row: IntArray) -> FloatArray:
@@ -265,10 +212,17 @@ class StepInputs:
 
     Over a table arrays are (1 or n_samples, n_places, n_runs), those of a constant (1 or n_samples, 1, 1 or n_runs);
     of some steps (1 or n_samples, n_columns), with a column for each step and run, the runs of a step in turn, or 1.
+    `time` is the name of the time, which is always on such a line.
     """
 
+    time: str
     held: tuple[Mapping[str, Any], Mapping[str, Any]]
     lines: tuple[Mapping[str, Line], Mapping[str, Line]]
+
+    @property
+    def gap(self) -> Any:
+        """Time of the gap by the time column, which an effect on the clock changes, (1 or n_samples, n_columns)."""
+        return self.lines[1][self.time][1]
 
     def __call__(self, share: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
         """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
@@ -281,7 +235,11 @@ class StepInputs:
         for values in (*p.values(), *u.values()):
             values.setflags(False)
         moving, sloping = ({name: (chosen(v), chosen(d)) for name, (v, d) in each.items()} for each in self.lines)
-        return StepInputs((p, u), (moving, sloping))
+        return replace(self, held=(p, u), lines=(moving, sloping))
+
+    def of_columns(self, columns: IntArray) -> StepInputs:
+        """Return them in some of the columns."""
+        return self.mapped(partial(of_columns, columns=columns))
 
 
 def _values_on_lines(held: Mapping[str, Any], lines: Mapping[str, Line], share: Any) -> Mapping[str, Any]:
@@ -302,28 +260,20 @@ or arrays with one value per column.
 """
 
 
-@dataclass(frozen=True, eq=False)
 class LawInputs:
-    """Parameters and columns of a law over the table of its steps, the columns with a dead time, and jumps."""
+    """Parameters and columns of a law over the table of its steps, (n_points,) or (n_samples, n_points) each.
 
-    steps: Steps
-    over_table: StepInputs
-    late: Mapping[str, LateColumn] = field(default_factory=dict)
-    jumps: tuple[Jump, ...] = ()
+    Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `motion` has
+    their drifts and jumps, and the columns that are late.
+    """
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         motion: LawWithEffects,
         steps: Steps,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
-    ) -> LawInputs:
-        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
-
-        Parameters that vary from row to row go on between the rows as columns do, since a column moves them; `motion`
-        has their drifts and jumps, and the columns that are late.
-        """
+    ) -> None:
         rows, table, linear = steps.row_by_position_and_run, steps.table, motion.law.hold == "linear"
         held: dict[str, Any] = {}
         moving: dict[str, Line] = {}
@@ -348,13 +298,13 @@ class LawInputs:
                 sloping[name] = own, np.diff(own, axis=1)
             else:
                 still[name] = own
-        over_table = StepInputs((read_only_views(held), read_only_views(still)), (moving, sloping))
-        late = {}
-        if motion.dead_times:
-            timeline = Timeline.of(table)
-            for name, dead_time in motion.dead_times.items():
-                late[name] = LateColumn.of(timeline, columns[name], dead_time, linear=linear)
-        return cls(steps, over_table, late, motion.jumps)
+        values_at_places = read_only_views(held), read_only_views(still)
+        self.steps, self.jumps = steps, motion.jumps
+        self.over_table = StepInputs(str(table.time), values_at_places, (moving, sloping))
+        self.late = {
+            name: LateColumn(table, columns[name], dead_time, linear=linear)
+            for name, dead_time in motion.dead_times.items()
+        }
 
     def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
         """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""
@@ -379,16 +329,20 @@ class LawInputs:
         if not (self.late or self.jumps):
             yield None, inputs, begin, length
             return
-        rows = self.steps.row_by_position_and_run
-        run = np.tile(np.arange(rows.shape[1]), len(gap))
+        rows, time = self.steps.row_by_position_and_run, self.steps.table.time_s
+        run, rounding = np.tile(np.arange(rows.shape[1]), len(gap)), rounding_of_times(time)
         n_columns = len(run)
-        start, gap_s = self.steps.table.time_s[rows[gap]].ravel(), self.steps.gaps[gap].ravel()
+        start, gap_s = time[rows[gap]].ravel(), self.steps.gaps[gap].ravel()
         end = np.broadcast_to(begin + length, n_columns)
         share = np.broadcast_to(begin, (1, n_columns))
         columns = np.arange(n_columns)
         while True:
             now, last = start + share * gap_s, start + end * gap_s
-            stop = self._next_break(now, run)
+            stop: Any = np.inf  # time of the next jump or bend, infinite if none is left
+            for late in self.late.values():
+                stop = np.minimum(stop, late.next_break(now, run))
+            for jump in self.jumps:
+                stop = np.minimum(stop, np.where(jump.at > now + rounding, jump.at, np.inf))
             over = ~(stop < last)
             part = self._with_breaks(inputs, 0.5 * (now + np.where(over, last, stop)), run, start, gap_s)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -402,17 +356,7 @@ class LawInputs:
                 some = np.flatnonzero(going)
                 columns, run = columns[some], run[some]
                 start, gap_s, end, share = start[some], gap_s[some], end[some], share[:, some]
-                inputs = inputs.mapped(partial(of_columns, columns=some))
-
-    def _next_break(self, now: FloatArray, run: IntArray) -> FloatArray:
-        """Return the time of the next jump or bend of an input after `now`, of that shape; infinite if none is left."""
-        rounding = rounding_of_times(self.steps.table.time_s)
-        out: Any = np.inf
-        for late in self.late.values():
-            out = np.minimum(out, late.next_break(now, run))
-        for jump in self.jumps:
-            out = np.minimum(out, np.where(jump.at > now + rounding, jump.at, np.inf))
-        return np.asarray(out)
+                inputs = inputs.of_columns(some)
 
     def _with_breaks(
         self, inputs: StepInputs, at: FloatArray, run: IntArray, start: FloatArray, gap_s: FloatArray
@@ -431,7 +375,7 @@ class LawInputs:
                 moving[name] = moving[name][0] + own, moving[name][1]
             else:
                 p[name] = p[name] + own
-        return StepInputs((read_only_views(p), read_only_views(u)), (moving, sloping))
+        return replace(inputs, held=(read_only_views(p), read_only_views(u)), lines=(moving, sloping))
 
 
 def of_columns(values: Any, columns: IntArray) -> Any:

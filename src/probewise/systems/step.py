@@ -52,10 +52,6 @@ Rates = Callable[[Mapping[str, Any], Any], Mapping[str, Any]]
 class Rosenbrock:
     """The method RODAS; one step is one linear system for each sample and run, solved six times."""
 
-    def n_evaluations(self, n_states: int) -> int:
-        """Return about how many evaluations of the rates a step costs, its linear algebra included."""
-        return 2 * len(_ALPHA) + 2 * n_states + 1
-
     def advanced(self, rates: Rates, s: Mapping[str, Any], begin: Any, length: Any, gap: FloatArray) -> dict[str, Any]:
         """Return the states after a step from `s`, (n_samples, n_runs) each, by name.
 

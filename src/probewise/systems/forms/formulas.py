@@ -130,7 +130,9 @@ def _proposal(
 
     @acting
     def act(value: Any, rows: RunTable, *v: FloatArray) -> Any:
-        return value.with_term(state, lambda s, p, u: change(s, u, *v)) if state else value + change(value, rows, *v)
+        if not state:
+            return value + change(value, rows, *v)
+        return value.plus(terms=((state, lambda s, p, u: change(s, u, *v)),))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         each = zip(parameters.items(), mean, sd, strict=True)

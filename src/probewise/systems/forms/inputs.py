@@ -113,7 +113,7 @@ def _column_delayer(about: ReferenceFit, name: str) -> Act:
     if about.system.simulator.law is None:
         return _column_changer(name, mean_of_delayed_held_column if held else delayed_values)
     at_rows = _column_changer(name, delayed_held_column if held else delayed_values)
-    return ActInTime(at_rows, lambda motion, theta: motion.with_dead_time(name, theta[:, :1]))
+    return ActInTime(at_rows, lambda motion, theta: motion.plus(dead_times={name: theta[:, :1]}))
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:

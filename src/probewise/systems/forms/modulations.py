@@ -195,7 +195,7 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
             "says": lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {time_unit}",
             "counted_from": origin_in_words(table.time, origin, time_unit),
         },
-        lambda name: lambda motion, theta: motion.with_drift(name, theta[:, :1]),
+        lambda name: lambda motion, theta: motion.plus(drifts={name: theta[:, :1]}),
     )
 
 
@@ -244,7 +244,7 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
         return own | {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
 
     def jump_in_time(parameter: str) -> ActBetween:
-        return lambda motion, theta: motion.with_jump(Jump(parameter, theta[:, :1], theta[:, 1:2]))
+        return lambda motion, theta: motion.plus(jumps=(Jump(parameter, theta[:, :1], theta[:, 1:2]),))
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]

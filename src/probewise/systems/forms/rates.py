@@ -78,7 +78,7 @@ def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> I
             return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], '')}"
         return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], '')}"
 
-    act = acting(lambda motion, rows, a: motion.with_term(state, lambda s, p, u: a * term(s[other])))
+    act = acting(lambda motion, rows, a: motion.plus(terms=((state, lambda s, p, u: a * term(s[other])),)))
     size = {"a": (AMPLITUDE, f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}")}
     largest = float(np.nanmax(np.abs(about.states[other]))) or 1.0
     own = (name, Stage.RATE, size, (f"state:{other}", "time"), act, says)
@@ -88,7 +88,7 @@ def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> I
 def _friction_form(about: ReferenceFit, state: str) -> Iterator[Form]:
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
     tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
-    act = acting(lambda motion, rows, a: motion.with_friction(state, a))
+    act = acting(lambda motion, rows, a: motion.plus(friction={state: a}))
     says = in_words(f"dry friction slows {state} by {{0}} per {about.time_unit}, and holds it at rest")
     size = ("a", f"{state} per {about.time_unit}")
     return about.sized(f"friction:{state}", Stage.RATE, size, (f"state:{state}", "level"), act, says, tried)
@@ -100,7 +100,8 @@ def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Form]:
 
     @acting
     def act(motion: LawWithEffects, rows: Any, a: FloatArray, hz: FloatArray, phase: FloatArray) -> LawWithEffects:
-        return motion.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[time] - origin) + phase))
+        term = lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[time] - origin) + phase)  # noqa: E731
+        return motion.plus(terms=((state, term),))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         size, period = value_with_sd(mean[0], sd[0]), period_with_sd(mean[1], sd[1], per)
@@ -136,7 +137,7 @@ def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:
         spilt = {other: theta[:, k : k + 1] for k, other in enumerate(others, 1) if theta[:, k].any()}
         ceiling = Limit(state, np.where(above, level, np.inf), spilt=spilt)
         floor = Limit(state, np.where(above, -np.inf, level), upper=False, spilt=spilt)
-        return value.with_limit(ceiling).with_limit(floor)
+        return value.plus(limits=(ceiling, floor))
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         shares = {other: value_with_sd(mean[k], sd[k]) for k, other in enumerate(others, 1) if mean[k] > _NO_SHARE}

@@ -8,12 +8,11 @@ others have their own; those that do not converge are left to be stepped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
@@ -26,6 +25,7 @@ from probewise.systems.integrate import (
     step_in_part,
 )
 from probewise.systems.law import LawInputs, LawWithEffects, StepPart
+from probewise.systems.simulator import Columns, Values
 from probewise.systems.step import Steps
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
@@ -44,7 +44,7 @@ _WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at th
 # evaluations of all steps suffice, and far from them, where a dozen are needed.
 _FEW_NEAR, _FEW_FAR = 300, 40
 
-LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
+LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Values, Columns]]
 """Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
 
 

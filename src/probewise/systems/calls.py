@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import itertools
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -21,7 +21,7 @@ from probewise.errors import FileError, ParameterError, ShapeError, message_of
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
 from probewise.recordings.io import EndedByFile
-from probewise.systems.simulator import Simulate, Simulator, read_simulator
+from probewise.systems.simulator import Columns, Simulate, Simulator, Values, read_simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
 _NODES = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))  # in its range
@@ -34,7 +34,7 @@ _WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
 }
 
 
-def read_only_views(values: Mapping[str, Any]) -> dict[str, Any]:
+def read_only_views(values: Values) -> dict[str, Any]:
     """Return values by name with read-only views of the arrays among them, for `call_on_read_only`."""
     out = dict(values)
     for name, value in out.items():
@@ -44,7 +44,7 @@ def read_only_views(values: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def call_on_read_only(function: Callable[..., Any], *given: Mapping[str, Any]) -> Any:
+def call_on_read_only(function: Callable[..., Any], *given: Values) -> Any:
     """Call a user's function with dicts of read-only arrays by name; with copies instead, if it writes into one.
 
     To a user a parameter is a number, so `k = p["k"]; k /= 60` must leave p["k"], and the engine's own, as they are.
@@ -61,7 +61,7 @@ def call_on_read_only(function: Callable[..., Any], *given: Mapping[str, Any]) -
 class _CopyingDict(dict[str, Any]):
     """A dict of arrays and numbers that returns a new copy of an array whenever it is asked for one."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, values: Values) -> None:
         super().__init__({name: _copied(value) for name, value in values.items()})
 
     def __getitem__(self, name: str) -> Any:
@@ -119,8 +119,8 @@ class Caller:
     def from_trial_calls(
         cls,
         simulate: Simulate,
-        samples: Mapping[str, FloatArray],
-        columns: Mapping[str, NDArray[Any]],
+        samples: Values,
+        columns: Columns,
         *,
         per_run: tuple[str, ...],
         broadcasts: bool,
@@ -156,18 +156,14 @@ class Caller:
                 taken.add(own)
         return cls(simulate, broadcasts=False, by_row=frozenset(taken), name=name)
 
-    def _returns(
-        self, readings: FloatArray, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
-    ) -> bool:
+    def _returns(self, readings: FloatArray, samples: Values, columns: Columns) -> bool:
         """Return whether a call for samples returns these readings; False if it raises an error."""
         try:
             return _nearly_equal(self(samples, columns, strict=True), readings)
         except Exception:
             return False
 
-    def _require_finite_and_repeatable(
-        self, readings: FloatArray, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
-    ) -> None:
+    def _require_finite_and_repeatable(self, readings: FloatArray, samples: Values, columns: Columns) -> None:
         """Raise ParameterError unless readings of samples hold a finite number, and another call for one returns it."""
         sound = np.isfinite(readings).any(axis=1)
         if not sound.any():
@@ -184,9 +180,7 @@ class Caller:
                 "calls",
             )
 
-    def __call__(
-        self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], *, strict: bool = False
-    ) -> FloatArray:
+    def __call__(self, parameters: Values, columns: Columns, *, strict: bool = False) -> FloatArray:
         """Simulate parameters (n_samples, 1 or n_points) over columns (n_points,) or (n_samples, n_points).
 
         A sample at which `simulate` raises an error gives NaN; with `strict`, the first error is raised if all fail.
@@ -225,12 +219,7 @@ class Caller:
         return out
 
     def _call_together(
-        self,
-        parameters: Mapping[str, FloatArray],
-        columns: Mapping[str, NDArray[Any]],
-        shape: tuple[int, int],
-        *,
-        strict: bool,
+        self, parameters: Values, columns: Columns, shape: tuple[int, int], *, strict: bool
     ) -> FloatArray:
         """Call a broadcasting `simulate` once; if it raises, halve the samples until failing ones are alone: NaN."""
         n_samples = shape[0]
@@ -252,9 +241,7 @@ class Caller:
             )
         return _readings_broadcast_to_shape(readings, shape, self.name)
 
-    def _takes_changed_columns_together(
-        self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
-    ) -> bool:
+    def _takes_changed_columns_together(self, parameters: Values, columns: Columns) -> bool:
         """Return whether samples may be simulated together if some columns, (n_samples, n_points), differ among them.
 
         A `simulate` that takes a column's mean, sum or first row means that of one sample. Two samples are tried with
@@ -275,7 +262,7 @@ class Caller:
                 self._taken_together[changed] = False
         return not changed or self._taken_together[changed]
 
-    def _cached_call(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
+    def _cached_call(self, own: Values, columns: Columns, n_points: int) -> FloatArray:
         """Return the readings of one sample, (n_points,), by a call or from an earlier one with the same arguments."""
         known = self._known.pop(key := _digest_of_arguments(own, columns), None)
         if known is None:
@@ -286,9 +273,7 @@ class Caller:
             self._known.pop(next(iter(self._known)))
         return known
 
-    def _call_ahead(
-        self, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, NDArray[Any]]]], n_points: int
-    ) -> None:
+    def _call_ahead(self, samples: Sequence[tuple[Values, Columns]], n_points: int) -> None:
         """Make the calls for some samples at once where `simulate` is a `SpreadCalls`; those that fail are left."""
         if not isinstance(self.simulate, SpreadCalls):
             return
@@ -302,16 +287,14 @@ class Caller:
                 self._count_call()
                 self._known[key] = readings
 
-    def _simulated(self, parameters: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Any:
+    def _simulated(self, parameters: Values, columns: Columns) -> Any:
         return call_on_read_only(self.simulate, read_only_views(parameters), read_only_views(columns))
 
     def _count_call(self) -> None:
         self.n_calls += 1
         self.on_call()
 
-    def _interpolation(
-        self, own: Mapping[str, Any], n_points: int
-    ) -> Iterator[tuple[FloatArray | None, Mapping[str, Any]]]:
+    def _interpolation(self, own: Values, n_points: int) -> Iterator[tuple[FloatArray | None, Values]]:
         """Yield arguments of calls for one sample, and the share of each in every reading; None for a single call.
 
         A share is that of Lagrange's interpolation.
@@ -338,11 +321,11 @@ class SpreadCalls:
     def __init__(self, simulate: Simulate, path: Path, executor: Executor, n_workers: int) -> None:
         self.__wrapped__, self._path, self._executor, self._n_chunks = simulate, path, executor, 4 * n_workers
 
-    def __call__(self, parameters: Mapping[str, Any], columns: Mapping[str, Any]) -> Any:
+    def __call__(self, parameters: Values, columns: Values) -> Any:
         """Call it here."""
         return self.__wrapped__(parameters, columns)
 
-    def many(self, given: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Iterator[FloatArray | None]:
+    def many(self, given: Sequence[tuple[Values, Values]]) -> Iterator[FloatArray | None]:
         """Yield what it returns for each parameters and columns, in this order; None where it raises an error."""
         chunks = [given[k :: self._n_chunks] for k in range(min(self._n_chunks, len(given)))]
         done = list(self._executor.map(partial(_call_each, self._path), chunks))
@@ -354,7 +337,7 @@ def _simulate_of_file(path: Path) -> Any:
     return read_simulator(path).simulate
 
 
-def _call_each(path: Path, given: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[FloatArray | None]:
+def _call_each(path: Path, given: Sequence[tuple[Values, Values]]) -> list[FloatArray | None]:
     out: list[FloatArray | None] = []
     with np.errstate(all="ignore"):
         for each in given:
@@ -365,7 +348,7 @@ def _call_each(path: Path, given: Sequence[tuple[Mapping[str, Any], Mapping[str,
     return out
 
 
-def _digest_of_arguments(own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
+def _digest_of_arguments(own: Values, columns: Columns) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for name, values in (*own.items(), *columns.items()):
         digest.update(name.encode())
@@ -393,9 +376,7 @@ class ProgressWithCallCount:
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
 
-def _readings_or_nan(
-    together: Caller, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
-) -> FloatArray:
+def _readings_or_nan(together: Caller, samples: Values, columns: Columns) -> FloatArray:
     """Return the readings of samples, NaN where `simulate` raises; raise its error if no reading is finite then."""
     try:
         return together(samples, columns, strict=True)
@@ -408,18 +389,18 @@ def _readings_or_nan(
         return readings
 
 
-def number_of_samples(*values: Mapping[str, Any]) -> int:
+def number_of_samples(*values: Values) -> int:
     """Return the number of samples of values by name, of which those of two axes have one row for each, or one row."""
     return max((len(v) for each in values for v in each.values() if np.ndim(v) == 2), default=1)
 
 
-def take_samples(values: Mapping[str, Any], samples: slice | IntArray) -> dict[str, Any]:
+def take_samples(values: Values, samples: slice | IntArray) -> dict[str, Any]:
     """Select some samples of values by name; arrays of one axis, or of one sample, apply to all and are kept."""
     return {name: v[samples] if np.ndim(v) == 2 and len(v) > 1 else v for name, v in values.items()}
 
 
 def _values_of_sample(
-    parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], k: int
+    parameters: Values, columns: Columns, k: int
 ) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
     """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
     own, table = (take_samples(each, slice(k, k + 1)) for each in (parameters, columns))
@@ -450,9 +431,7 @@ def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], 
     raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")
 
 
-def user_function_error(
-    what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]
-) -> FileError:
+def user_function_error(what: str, error: Exception, simulator: Simulator, columns: Columns) -> FileError:
     """Return a FileError for an exception that the function `what` raises at every call with these columns."""
     law = simulator.law
     functions: list[Any] = [simulator.simulate] if law is None else [law.rates, law.observe]

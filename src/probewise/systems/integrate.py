@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, StepPart, of_columns, values_at_rows
-from probewise.systems.simulator import Law
+from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import FOURTH_ORDER, N_LONGER, Rosenbrock, RungeKutta, Steps, Terms
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
 
 
 def integrate_states(
-    motion: LawWithEffects | Law,
-    steps: Steps,
-    parameters: Mapping[str, FloatArray],
-    columns: Mapping[str, NDArray[Any]],
+    motion: LawWithEffects | Law, steps: Steps, parameters: Values, columns: Columns
 ) -> dict[str, FloatArray]:
     """Integrate a law step by step; return every state at every row, by name, (n_samples, n_points).
 
@@ -40,10 +36,7 @@ def integrate_states(
 
 
 def states_by_step(
-    motion: LawWithEffects,
-    steps: Steps,
-    parameters: Mapping[str, FloatArray],
-    columns: Mapping[str, NDArray[Any]],
+    motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns
 ) -> Iterator[dict[str, FloatArray]]:
     """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
     s = initial_states(motion, steps, parameters, number_of_samples(parameters, columns))
@@ -78,9 +71,7 @@ def n_parts_of_steps(motion: LawWithEffects, steps: Steps) -> int:
     return int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))
 
 
-def initial_states(
-    motion: LawWithEffects, steps: Steps, parameters: Mapping[str, FloatArray], n_samples: int
-) -> dict[str, FloatArray]:
+def initial_states(motion: LawWithEffects, steps: Steps, parameters: Values, n_samples: int) -> dict[str, FloatArray]:
     """Return the states in which the runs start, within their bounds, by name, (n_samples, n_runs) each."""
     start, first = {}, steps.row_by_position_and_run[:1]
     for state, given in motion.law.states.items():
@@ -135,7 +126,7 @@ class Stepper:
         """
         motion, between, at_rest = self.motion, self.between, way == 0
 
-        def margin_to_transition(at: Mapping[str, Any], share: Any) -> Any:
+        def margin_to_transition(at: Values, share: Any) -> Any:
             """Return the margin, negative after the transition, until the state comes to rest or breaks loose."""
             moving = way * at[state]
             if not at_rest.any():
@@ -159,9 +150,7 @@ class Stepper:
         there = self._step_without_split(s, begin, until * length, ways)
         left = margin_to_transition(there, begin + until * length)
         closer = np.where(
-            left > 0,
-            _zero_of_straight_line(until, left, 1.0, last),
-            _zero_of_straight_line(0.0, first, until, left),
+            left > 0, _zero_of_straight_line(until, left, 1.0, last), _zero_of_straight_line(0.0, first, until, left)
         )
         until = np.where(ends, closer, 1.0)
         there = self._step_without_split(s, begin, until * length, ways)
@@ -171,9 +160,7 @@ class Stepper:
         anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
         return self._step_without_split(there, begin + until * length, (1 - until) * length, anew), anew
 
-    def _step_without_split(
-        self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
-    ) -> dict[str, Any]:
+    def _step_without_split(self, s: Values, begin: Any, length: Any, ways: Values) -> dict[str, Any]:
         """Return the states after one step of the method, with friction against the fixed directions `ways`."""
         method = self.method
         if isinstance(method, Rosenbrock):
@@ -202,7 +189,7 @@ def step_in_part(
     return _with_columns(s, columns, stepper.step(some, begin, length))
 
 
-def _with_columns(s: Mapping[str, Any], columns: IntArray, new: Mapping[str, Any]) -> dict[str, Any]:
+def _with_columns(s: Values, columns: IntArray, new: Values) -> dict[str, Any]:
     """Return arrays by state, (n_samples, n_columns), with the values `new` in some of their columns."""
     out = {state: values.copy() for state, values in s.items()}
     for state, values in new.items():
@@ -210,9 +197,7 @@ def _with_columns(s: Mapping[str, Any], columns: IntArray, new: Mapping[str, Any
     return out
 
 
-def _advanced_states(
-    s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
+def _advanced_states(s: Values, width: Any, terms: Terms, rates: Sequence[Values]) -> dict[str, Any]:
     """Return the states after the time `width` at a constant rate, the weighted sum `terms` of `rates`."""
     (first, weight), *others = terms
     if not others:  # of one stage, as all of fourth order are: one product less

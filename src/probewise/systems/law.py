@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
 from probewise.systems.calls import call_on_read_only, read_only_views
-from probewise.systems.simulator import Law
+from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import Steps
 from probewise.systems.table import RunTable
 
 _ROUNDING = 16  # last digits of a time by which two times may differ by rounding alone
 
-Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
+Term = Callable[[Values, Values, Values], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
 
 
@@ -72,7 +72,7 @@ class LawWithEffects:
 
         return replace(self, **{name: with_more(getattr(self, name), new) for name, new in more.items()})
 
-    def directions_of_motion(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
+    def directions_of_motion(self, s: Values, p: Values, u: Values) -> dict[str, Any]:
         """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
         if not self.friction:
             return {}
@@ -86,16 +86,14 @@ class LawWithEffects:
             for state, size in self.friction.items()
         }
 
-    def rates(
-        self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any], ways: Mapping[str, Any]
-    ) -> Mapping[str, Any]:
+    def rates(self, s: Values, p: Values, u: Values, ways: Values) -> Values:
         """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`.
 
         `p` and `u` are read-only, as an interpolator of `LawInputs` returns them; so are the states `s` afterwards.
         """
         for values in s.values():
             values.setflags(False)  # of writing; a keyword would double the time
-        given: Mapping[str, Any] = call_on_read_only(self.law.rates, s, p, u)
+        given: Values = call_on_read_only(self.law.rates, s, p, u)
         if not (self.terms or self.friction or self.limits):
             return given
         out = {state: given[state] for state in self.law.states}
@@ -111,7 +109,7 @@ class LawWithEffects:
                 out[other] = out[other] + share * np.where(stopped, rate, 0.0)
         return out
 
-    def clip_and_stop_states(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    def clip_and_stop_states(self, ways: Values, after: dict[str, Any]) -> dict[str, Any]:
         """Return the states after a step: clipped to their bounds, and 0 where they reversed against friction."""
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
@@ -123,11 +121,9 @@ class LawWithEffects:
         return after
 
 
-def readings_of_states(
-    law: Law, states: Mapping[str, FloatArray], parameters: Mapping[str, Any], columns: Mapping[str, Any]
-) -> FloatArray:
+def readings_of_states(law: Law, states: Values, parameters: Values, columns: Values) -> FloatArray:
     """Return a law's readings, (n_samples, n_points), from its states at every row, each of that shape."""
-    first = next(iter(states.values()))
+    first: FloatArray = next(iter(states.values()))
     if law.observe is None:
         return first
     with np.errstate(all="ignore"):
@@ -216,7 +212,7 @@ class StepInputs:
     """
 
     time: str
-    held: tuple[Mapping[str, Any], Mapping[str, Any]]
+    held: tuple[Values, Values]
     lines: tuple[Mapping[str, Line], Mapping[str, Line]]
 
     @property
@@ -224,7 +220,7 @@ class StepInputs:
         """Time of the gap by the time column, which an effect on the clock changes, (1 or n_samples, n_columns)."""
         return self.lines[1][self.time][1]
 
-    def __call__(self, share: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    def __call__(self, share: Any) -> tuple[Values, Values]:
         """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
         (p, u), (moving, sloping) = self.held, self.lines
         return _values_on_lines(p, moving, share), _values_on_lines(u, sloping, share)
@@ -242,7 +238,7 @@ class StepInputs:
         return self.mapped(partial(of_columns, columns=columns))
 
 
-def _values_on_lines(held: Mapping[str, Any], lines: Mapping[str, Line], share: Any) -> Mapping[str, Any]:
+def _values_on_lines(held: Values, lines: Mapping[str, Line], share: Any) -> Values:
     if not lines:
         return held
     out = dict(held)
@@ -267,13 +263,7 @@ class LawInputs:
     their drifts and jumps, and the columns that are late.
     """
 
-    def __init__(
-        self,
-        motion: LawWithEffects,
-        steps: Steps,
-        parameters: Mapping[str, FloatArray],
-        columns: Mapping[str, NDArray[Any]],
-    ) -> None:
+    def __init__(self, motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns) -> None:
         rows, table, linear = steps.row_by_position_and_run, steps.table, motion.law.hold == "linear"
         held: dict[str, Any] = {}
         moving: dict[str, Line] = {}

@@ -23,7 +23,7 @@ from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_tr
 from probewise.systems.calls import Caller, IntegrationTally, take_samples, user_function_error
 from probewise.systems.integrate import evaluations_per_step, integrate_states
 from probewise.systems.law import LawWithEffects, readings_of_states
-from probewise.systems.simulator import Simulator
+from probewise.systems.simulator import Columns, Simulator, Values
 from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import RunTable, relative_sds_of_column
 
@@ -308,7 +308,7 @@ class SystemChain:
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
     def _call_for_each_recording(
-        self, caller: Caller, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], plan: RunTable
+        self, caller: Caller, parameters: Values, columns: Columns, plan: RunTable
     ) -> FloatArray:
         """Call `simulate` with the whole table, or with one recording after the other if the simulator names no run.
 
@@ -318,7 +318,7 @@ class SystemChain:
             return caller(parameters, columns)
         runs = plan.rows_by_scan()
 
-        def values_in_rows(values: Mapping[str, NDArray[Any]], rows: IntArray) -> dict[str, NDArray[Any]]:
+        def values_in_rows(values: Columns, rows: IntArray) -> dict[str, NDArray[Any]]:
             return {name: v[..., rows] if np.shape(v)[-1] == len(plan) else v for name, v in values.items()}
 
         each = [caller(values_in_rows(parameters, rows), values_in_rows(columns, rows)) for rows in runs]
@@ -328,12 +328,7 @@ class SystemChain:
         return out
 
     def _integrated_readings(
-        self,
-        parameters: Mapping[str, FloatArray],
-        columns: Mapping[str, NDArray[Any]],
-        given: Mapping[str, NDArray[Any]],
-        theta: FloatArray,
-        plan: RunTable,
+        self, parameters: Values, columns: Columns, given: Columns, theta: FloatArray, plan: RunTable
     ) -> FloatArray:
         """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise.
 

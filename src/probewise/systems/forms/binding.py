@@ -21,7 +21,7 @@ from probewise.systems.forms.readings import forms_on_readings
 from probewise.systems.forms.reference import Form, ReferenceFit, StoredFit
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
-from probewise.systems.table import RunTable, covariate_of_column
+from probewise.systems.table import covariate_of_column
 
 WORDS: Mapping[str, str] = MappingProxyType(
     {
@@ -60,7 +60,7 @@ WORDS: Mapping[str, str] = MappingProxyType(
 """A noun phrase for each form, with places for its targets, to follow "the model leaves out"."""
 
 _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
-_KINDS_OF_TERMS = "damping", "drag", "friction", "forcing", "periodic_forcing", "cubic", "quadratic", "coupling"
+_IN_RATES = "rate", "damping", "drag", "friction", "forcing", "periodic_forcing", "cubic", "quadratic", "coupling"
 _IN_ORDER = frozenset({"offset_step", "gain_step", "steps", "hysteresis", "backlash", "lag", "delay", "input_delay"})
 
 
@@ -117,14 +117,13 @@ def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset
 
     A bound is none of them: a position may stop, though its rate is the speed.
     """
-    places = tuple(
-        begin
-        for state in about.states_with_rates_by_definition
-        for begin in (*(f"{kind}:{state}" for kind in _KINDS_OF_TERMS), f"formula:rate:{state}")
-    )
-    return frozenset(
-        name for name in names if f"{name_without_copy_suffix(name)}:".startswith(tuple(f"{p}:" for p in places))
-    )
+    states = about.states_with_rates_by_definition
+
+    def is_in_definition(name: str) -> bool:
+        kind, *target = name_without_copy_suffix(name).removeprefix("formula:").split(":")
+        return kind in _IN_RATES and target[0] in states
+
+    return frozenset(filter(is_in_definition, names))
 
 
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:
@@ -143,13 +142,15 @@ def rebind_forms(
     """
     wanted = list(dict.fromkeys(names))
     found = _bind_wanted_forms(wanted, simulator, known)
-    longer = _table_with_more_runs(known.table, list(more_runs))
-    if longer is not known.table:
-        rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
+    table, more = known.table, list(more_runs)
+    if more and table.run is not None:  # the last row again under the name of each
+        rows = np.append(np.arange(len(table)), np.full(len(more), len(table) - 1))
+        of_rows = [table.scan_names[k] for k in table.scan.tolist()]
+        longer = table.take(rows)
+        longer = replace(longer, columns={**longer.columns, table.run: np.array([*of_rows, *more])})
         states = {name: values[rows] for name, values in known.states.items()}
         beyond = StoredFit(longer, known.predicted[rows], known.sd, states, known.held)
-        per_run = [name for name in wanted if has_value_per_run(name)]
-        found |= _bind_wanted_forms(per_run, simulator, beyond)
+        found |= _bind_wanted_forms([name for name in wanted if has_value_per_run(name)], simulator, beyond)
     lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
     if lost:
         raise ParameterError("effects", lost[0], "a term that this version knows; diagnose again with it")
@@ -176,13 +177,3 @@ def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit
 def has_value_per_run(name: str) -> bool:
     """Return whether the effect of this name has one value per run."""
     return name.partition(":")[0] in _WITH_VALUE_PER_RUN
-
-
-def _table_with_more_runs(table: RunTable, more_runs: list[str]) -> RunTable:
-    """Append one row for each further run: the last row of the table, under the run's name."""
-    if not more_runs or table.run is None:
-        return table
-    rows = np.append(np.arange(len(table)), np.full(len(more_runs), len(table) - 1))
-    of_rows = [table.scan_names[k] for k in table.scan.tolist()]
-    longer = table.take(rows)
-    return replace(longer, columns={**longer.columns, table.run: np.array([*of_rows, *more_runs])})

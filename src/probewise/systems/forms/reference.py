@@ -9,10 +9,9 @@ from itertools import combinations
 from typing import Any, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, varies
+from probewise._arrays import BoolArray, FloatArray, distinct_values, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     ROWS_OF_A_SIDE,
@@ -123,11 +122,16 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
 
     It is 1 too where a time was recorded, where equal rows are apart, and where readings rise or fall along all rows.
     """
-    own, readings = simulator, table.columns.get(simulator.reading)
+    readings = table.columns.get(simulator.reading)
     if table.has_varying_time or readings is None or readings.dtype != np.float64:
         return 1.0
-    inputs = [values for name, values in table.columns.items() if name not in (own.reading, own.noise.sd)]
-    codes = [_codes_of_equal_cells(values) for values in inputs]
+    inputs = [values for name, values in table.columns.items() if name not in (simulator.reading, simulator.noise.sd)]
+    codes = [  # a number for each cell, the same for cells that are equal but for rounding
+        np.where(np.isfinite(values), np.searchsorted(distinct_values(values), values, side="right"), 0)
+        if values.dtype == np.float64
+        else np.unique(values, return_inverse=True)[1]
+        for values in inputs
+    ]
     group = np.unique(np.stack([*codes, np.zeros(len(table), dtype=np.int64)]), axis=1, return_inverse=True)[1].ravel()
     there = np.flatnonzero(np.isfinite(readings))
     n_changes = np.count_nonzero(np.diff(group[there]))
@@ -138,17 +142,8 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
     log_chance = np.log(2.0) - np.sum(gammaln(sizes + 1)) + np.sum(gammaln(ties + 1))
     whole = np.diff(readings[there])
     along = whole[np.diff(group[there]) == 0]  # equal rows are beside each other
-    for sign in (1.0, -1.0):
-        if np.all(sign * along >= 0) and not np.all(sign * whole >= 0):
-            return float(min(np.exp(log_chance), 1.0))
-    return 1.0
-
-
-def _codes_of_equal_cells(values: NDArray[Any]) -> IntArray:
-    """Return a number for each cell of a column, (n_points,), the same for cells that are equal but for rounding."""
-    if values.dtype != np.float64:
-        return np.unique(values, return_inverse=True)[1]
-    return np.where(np.isfinite(values), np.searchsorted(distinct_values(values), values, side="right"), 0)
+    is_sorted = any(np.all(sign * along >= 0) and not np.all(sign * whole >= 0) for sign in (1.0, -1.0))
+    return float(min(np.exp(log_chance), 1.0)) if is_sorted else 1.0
 
 
 def rows_are_in_order(simulator: Simulator, table: RunTable) -> bool:
@@ -158,13 +153,13 @@ def rows_are_in_order(simulator: Simulator, table: RunTable) -> bool:
 
 def note_on_row_order(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
     """Return a note where rows are in no order of recording; else ()."""
-    if rows_are_in_order(simulator, table):
+    chance = chance_of_sorted_readings(simulator, table)
+    if chance > _BY_CHANCE:
         return ()
-    once_in = 1 / max(chance_of_sorted_readings(simulator, table), 1e-300)
     return (
         f"rows are in no order of recording: wherever the other columns are equal, {simulator.reading} is sorted, by "
-        f"chance once in {once_in:.0e} tables; nothing is asked that needs their order, such as a jump at a row, "
-        "hysteresis or correlated noise",
+        f"chance once in {1 / max(chance, 1e-300):.0e} tables; nothing is asked that needs "
+        "their order, such as a jump at a row, hysteresis or correlated noise",
     )
 
 
@@ -400,10 +395,7 @@ class ReferenceFit:
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
     def _typical_amplitude(self, form: Form, guess: float) -> float:
-        """Find the amplitude at which the readings change by one sd (median over entries); 0 if they do not change.
-
-        The form is declared with amplitudes of 1; the readings change in proportion to them up to `guess`.
-        """
+        """Find the amplitude at which the readings change by one sd (median over entries); 0 if they do not change."""
         settings, amplitudes = form.entries.reshape(-1, form.entries.shape[-1]), list(form.amplitudes)
         settings = settings[:: max(len(settings) // 16, 1)].copy()
         settings[:, amplitudes] *= guess
@@ -438,7 +430,8 @@ class ReferenceFit:
         default a noise sd, is an amplitude so small that the readings change in proportion.
         """
         priors, units = priors_and_units(parameters)
-        amplitudes = tuple(k for k, prior in enumerate(priors.values()) if prior is AMPLITUDE or prior is POSITIVE)
+        sizes = {own: prior for own, prior in priors.items() if prior is AMPLITUDE or prior is POSITIVE}
+        amplitudes = tuple(k for k, own in enumerate(priors) if own in sizes)
         given = (name, stage, priors, units, covariates, act, entries, says)
         form = kind(*given, **{"amplitudes": amplitudes, **more})
         if not amplitudes:
@@ -448,12 +441,8 @@ class ReferenceFit:
         if np.isfinite(typical) and typical > 0:
             scaled = entries.copy()
             scaled[..., list(amplitudes)] *= typical
-            sizes = {
-                own: self.amplitude_prior(typical, positive=prior is POSITIVE)
-                for own, prior in priors.items()
-                if prior is AMPLITUDE or prior is POSITIVE
-            }
-            yield replace(form, parameters=priors | sizes, entries=scaled)
+            of_size = {own: self.amplitude_prior(typical, positive=prior is POSITIVE) for own, prior in sizes.items()}
+            yield replace(form, parameters=priors | of_size, entries=scaled)
 
     def sized(
         self, name: str, stage: Stage, size: tuple[str, str], covariates: tuple[str, ...], act: Act, says: Say,

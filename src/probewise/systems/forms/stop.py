@@ -11,8 +11,8 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.priors import Uniform
-from probewise.recordings.plan import Plan, Recording
-from probewise.sensor.stages import NoiseParameters, Stage
+from probewise.recordings.plan import Recording
+from probewise.sensor.stages import Stage
 
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
@@ -41,32 +41,21 @@ class MeterStop:
     def effect(self) -> NoiseEffect:
         """The stop as an effect, whose level is certain to within rounding."""
         near = 1e-9 * (1 + abs(self.level))
+        way, beyond = ("rises", np.maximum) if self.is_ceiling else ("falls", np.minimum)
+        says = f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip()
         return NoiseEffect(
             "saturation",
             Stage.NOISE,
             {"level": Uniform(self.level - near, self.level + near)},
             ("reading",),
             ("level",),
-            _unchanged,
+            lambda noise, theta, plan: noise,
             np.array([[[self.level]]]),
-            self._in_words,
+            lambda mean, sd: f"{says}, where the meter stops",
             amplitudes=(),
             known=np.array([self.level]),
-            change_of_readings=self._change,
+            change_of_readings=lambda predicted: -beyond(predicted - self.level, 0.0),
         )
-
-    def _change(self, predicted: FloatArray) -> FloatArray:
-        """Return the change of predicted readings, of any shape, by the stop: 0 or level - predicted."""
-        beyond = np.maximum if self.is_ceiling else np.minimum
-        return -beyond(predicted - self.level, 0.0)
-
-    def _in_words(self, mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if self.is_ceiling else "falls"
-        return f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip() + ", where the meter stops"
-
-
-def _unchanged(noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-    return noise
 
 
 def meter_stops_and_masks(

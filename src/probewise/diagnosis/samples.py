@@ -230,7 +230,7 @@ def can_share_one_model(first: Sequence[Effect], second: Sequence[Effect]) -> bo
     """
     known = {effect.name: effect for effect in first}
     shared = {effect.name for effect in second if effect.name in known}
-    alike = all(known[effect.name].act is effect.act for effect in second if effect.name in shared)
+    alike = all(known[effect.name].apply is effect.apply for effect in second if effect.name in shared)
     return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
 
 

@@ -106,7 +106,7 @@ class Effect:
         Prior of each parameter, by name, or of all together; and unit of each.
     covariates
         Names of the covariates along which the residual shows if the effect is left out.
-    act, says
+    apply, sentence
         What it does to its stage's value, and a sentence that describes it; see `Act` and `Say`.
     entries
         Template bank: trial settings, (n_entries, n_columns, n_params). The columns of an entry span the change of the
@@ -125,7 +125,7 @@ class Effect:
         Whether it looks back to earlier times of a run, which time must then not fall within.
     where, form, source
         Of a light sensor's effect: origin, scans, patterns; which of several formulas it has; and a function that
-        builds one with the same `act` and `says`, by which a pickled effect finds them again.
+        builds one with the same `apply` and `sentence`, by which a pickled effect finds them again.
     """
 
     name: str
@@ -133,9 +133,9 @@ class Effect:
     parameters: Mapping[str, Marginal] | Prior
     units: tuple[str, ...]
     covariates: tuple[str, ...]
-    act: Act
+    apply: Act
     entries: FloatArray
-    says: Say
+    sentence: Say
     amplitudes: tuple[int, ...] = (0,)
     absent: Mapping[int, float] = field(default_factory=dict)
     alternatives: tuple[Effect, ...] = ()
@@ -152,7 +152,7 @@ class Effect:
     def __reduce__(self) -> tuple[Callable[..., Effect], tuple[Any, ...]]:
         state = {each.name: getattr(self, each.name) for each in fields(self)}
         if self.source is not None:
-            del state["act"], state["says"]
+            del state["apply"], state["sentence"]
         return _restored_effect, (type(self), state)
 
     @cached_property
@@ -190,17 +190,9 @@ class Effect:
         """Prior of each parameter, by name; none where all have one together."""
         return self.parameters if isinstance(self.parameters, Mapping) else {}
 
-    def apply(self, value: Any, theta: FloatArray, plan: Any) -> Any:
-        """Return the stage's value with the effect, with parameters theta (n_samples, n_params); see `Act`."""
-        return self.act(value, theta, plan)
-
     def bank(self) -> FloatArray:
         """Return the template bank, (n_entries, n_columns, n_params)."""
         return self.entries
-
-    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect by the mean and sd of its parameters, (n_params,) each."""
-        return self.says(mean, sd)
 
     @property
     def n_peaks(self) -> int:
@@ -252,7 +244,7 @@ class Effect:
 def _restored_effect(kind: type[Effect], state: dict[str, Any]) -> Effect:
     source = state["source"]
     made = None if source is None else source()
-    return kind(**state) if made is None else kind(**state, act=made.act, says=made.says)
+    return kind(**state) if made is None else kind(**state, apply=made.apply, sentence=made.sentence)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -79,7 +79,7 @@ def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
         x, y = (theta[:, :1] / 2 * side for side in _side_of_each_axis(plan))
         return replace(value, x_mm=value.x_mm - x, y_mm=value.y_mm - y)
 
-    return replace(cast(Effect, backlash.build(kind, of)), act=act, form="of each axis")
+    return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
 
 
 def _side_of_each_axis(plan: Plan) -> FloatArray:

@@ -336,7 +336,7 @@ class SystemChain:
         """
         system, law = self.system, self.system.simulator.law
         assert law is not None
-        between = {effect: getattr(getattr(effect, "act", None), "between_rows", None) for effect in self.effects}
+        between = {effect: getattr(effect.apply, "between_rows", None) for effect in self.effects}
         of_rates = columns
         if any(act is not None and effect.stage is Stage.INPUT for effect, act in between.items()):
             of_rates = self._apply_stage(Stage.INPUT, given, theta, plan, but=between)

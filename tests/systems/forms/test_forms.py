@@ -426,7 +426,7 @@ def test_the_rates_of_a_law_lack_nothing_where_no_time_passes():
 def test_a_cubic_term_is_minus_the_third_power():
     about = _about_law(_rising, max_step_s=0.2)
     values, law = np.random.default_rng(3).normal(size=(300, 1)), about.system.simulator.law
-    ((_, term),) = bind_forms(about)["cubic:x:x"].act(LawWithEffects(law), np.ones((300, 1)), None).terms
+    ((_, term),) = bind_forms(about)["cubic:x:x"].apply(LawWithEffects(law), np.ones((300, 1)), None).terms
     np.testing.assert_allclose(term({"x": values}, {}, {}), -(values**3), rtol=1e-14)
 
 

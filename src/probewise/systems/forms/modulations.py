@@ -184,9 +184,9 @@ class Modulation:
     between_rows: Callable[[str], ActBetween] | None = None
 
 
-def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
+def linear_drift_modulation(about: ReferenceFit) -> Modulation:
     """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0."""
-    origin = origin_of_column(table.time_s)
+    table, time_unit, origin = about.table, about.time_unit, origin_of_column(about.table.time_s)
     return Modulation(
         lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
         lambda what, unit: {
@@ -199,9 +199,9 @@ def linear_drift_modulation(table: RunTable, time_unit: str) -> Modulation:
     )
 
 
-def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
+def column_proportional_modulation(about: ReferenceFit, name: str) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
-    middle, per = float(np.nanmean(table.covariates[name])), unit_of_name(name) or "unit"
+    middle, per = float(np.nanmean(about.table.covariates[name])), unit_of_name(name) or "unit"
     return Modulation(
         lambda theta, rows: np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle)),
         lambda what, unit: {
@@ -212,9 +212,9 @@ def column_proportional_modulation(name: str, table: RunTable) -> Modulation:
     )
 
 
-def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bool = False) -> Modulation:
+def change_point_step_modulation(about: ReferenceFit, *, may_end: bool = False) -> Modulation:
     """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number; it may go back."""
-    by_row = not table.has_varying_time
+    table, time_unit, by_row = about.table, about.time_unit, not about.table.has_varying_time
     along = np.arange(float(len(table))) if by_row else table.time_s
     ends = sorted((along[rows].max(), along[rows].min()) for rows in table.rows_by_scan())
     change_points = ChangePoints.of(along, by_row=by_row)
@@ -243,19 +243,20 @@ def change_point_step_modulation(table: RunTable, time_unit: str, *, may_end: bo
         until = {f"until_{place}": (never, of_place)}
         return own | {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
 
-    def jump_in_time(parameter: str) -> ActBetween:
-        return lambda motion, theta: motion.plus(jumps=(Jump(parameter, theta[:, :1], theta[:, 1:2]),))
-
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
         return np.asarray(theta[:, :1] * ((at > begin) & ((at <= end) | (end <= begin))))
 
-    return Modulation(at_rows, declared, None if by_row else jump_in_time)
+    if by_row:
+        return Modulation(at_rows, declared)
+    return Modulation(
+        at_rows, declared, lambda name: lambda law, theta: law.plus(jumps=(Jump(name, theta[:, :1], theta[:, 1:2]),))
+    )
 
 
-def value_per_run_modulation(table: RunTable) -> Modulation:
+def value_per_run_modulation(about: ReferenceFit) -> Modulation:
     """Return a variation by one value per run: a_run; 0 for runs outside the recording that are like none of it."""
-    names = table.scan_names
+    names = about.table.scan_names
     known = {name: k for k, name in enumerate(names)}
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
@@ -277,13 +278,9 @@ def value_per_run_modulation(table: RunTable) -> Modulation:
 
 def modulations_over_rows(about: ReferenceFit) -> dict[str, Modulation]:
     """Return a drift where time passes, a step, and a value per run where there are several, by what each is called."""
-    table, out = about.table, dict[str, Modulation]()
-    if table.has_varying_time:
-        out["drift"] = linear_drift_modulation(table, about.time_unit)
-    out["step"] = change_point_step_modulation(table, about.time_unit)
-    if about.can_fit_value_per_run:
-        out["per_run"] = value_per_run_modulation(table)
-    return out
+    drift = {"drift": linear_drift_modulation(about)} if about.table.has_varying_time else {}
+    per_run = {"per_run": value_per_run_modulation(about)} if about.can_fit_value_per_run else {}
+    return {**drift, "step": change_point_step_modulation(about), **per_run}
 
 
 def sinusoid_modulation(about: ReferenceFit) -> Modulation:
@@ -352,17 +349,17 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(prior.from_unit(_QUARTILES))))
 
         def varied(form: str, how: Modulation, size: float, name: str = name) -> Iterator[Form]:
-            act = _parameter_shifter(name, how)
-            if how.between_rows is not None:
-                act = ActInTime(act, how.between_rows(name))
-            own = (form, Stage.PARAMETER, how, act, size, name, unit_of_name(name))
-            return modulated_form(about, *own)
+            def at_rows(value: Any, theta: FloatArray, table: RunTable) -> Any:
+                return {**value, name: value[name] + how.at_rows(theta, table)}
+
+            act = at_rows if how.between_rows is None else ActInTime(at_rows, how.between_rows(name))
+            return modulated_form(about, form, Stage.PARAMETER, how, act, size, name, unit_of_name(name))
 
         for kind, how in over.items():
             if kind != "differs" or name not in simulator.per_run:
                 yield from varied(f"{kind}:{name}", how, guess / (about.duration if kind == "drifts" else 1.0))
         for column in about.varying_columns:
-            how = column_proportional_modulation(column, table)
+            how = column_proportional_modulation(about, column)
             for form in varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column]))):
                 yield _linear_or_by_factor(about, form, name, how) if isinstance(prior, LogUniform) else form
 
@@ -385,22 +382,18 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         by_factor = ", and in proportion to itself (exponentially)" if mean[1] > 0.5 else ""
-        return form.says(mean, sd) + by_factor
+        return form.sentence(mean, sd) + by_factor
 
     def variant(as_factor: bool) -> Form:
         value, prior = flag(as_factor)
         priors: dict[str, Marginal] = {**form.marginals, _AS_FACTOR: prior}
         bank = np.insert(form.entries, 1, value, axis=2)
-        return replace(form, parameters=priors, units=(*form.units, "1"), act=act, entries=bank, says=says)
+        return replace(form, parameters=priors, units=(*form.units, "1"), apply=act, entries=bank, sentence=says)
 
-    linear = variant(False)
     there = about.system.parameters(about.theta, about.table)[name]
     most = float(np.abs(how.at_rows(form.entries[0, :1], about.table)).max()) * max(about.misfit, 1.0)
-    return linear if most < _FAR * float(np.abs(there).min()) else replace(linear, alternatives=(variant(True),))
-
-
-def _parameter_shifter(name: str, how: Modulation) -> Act:
-    return lambda value, theta, table: {**value, name: value[name] + how.at_rows(theta, table)}
+    is_near = most < _FAR * float(np.abs(there).min())
+    return variant(False) if is_near else replace(variant(False), alternatives=(variant(True),))
 
 
 def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:

@@ -197,14 +197,14 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     for kind, how in modulations_over_rows(about).items():
         yield from added(f"offset_{kind}", how)
         # Rows may be in another unit for a while.
-        of_gain = change_point_step_modulation(table, about.time_unit, may_end=True) if kind == "step" else how
+        of_gain = change_point_step_modulation(about, may_end=True) if kind == "step" else how
         yield from scaled(f"gain_{kind}", of_gain)
     if table.has_varying_time:
         yield from added("interference", sinusoid_modulation(about))
         yield from _settling_form(about)
         yield from late_forms(about)
     for name in about.varying_columns:
-        yield from added(f"sensitivity:{name}", column_proportional_modulation(name, table))
+        yield from added(f"sensitivity:{name}", column_proportional_modulation(about, name))
         yield from _curve_form(about, name)
         if name not in about.states:
             yield from _friction_form(about, name)

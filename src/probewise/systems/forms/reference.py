@@ -404,7 +404,7 @@ class ReferenceFit:
         for times in _GROWTH if form.stage in (Stage.OFFSET, Stage.GAIN) else (1.0,):
             larger = settings.copy()
             larger[:, amplitudes] *= times
-            rms = self.rms_change_in_sds(form.stage, form.act, larger)
+            rms = self.rms_change_in_sds(form.stage, form.apply, larger)
             rms = rms[np.isfinite(rms)]
             if rms.size and rms.max() > _UNSEEN:
                 return times * guess / float(np.median(rms[rms > _UNSEEN]))

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.polynomial.chebyshev import chebfit, chebval
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, distinct_values, rounding_error
+from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Declared, Fixed, acting, in_words, single_column_bank
 from probewise.effects.reading import decaying_sum
@@ -130,7 +130,7 @@ def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> F
     if smooth.size:
         by, own = theta[smooth, 0], value[smooth] if len(value) > 1 else value
         for rows in table.rows_by_scan():
-            out[np.ix_(smooth, rows)] = _smooth_values_at_earlier_times(table.time_s[rows], own[:, rows], by)
+            out[np.ix_(smooth, rows)] = values_at_earlier_times(table.time_s[rows], own[:, rows], by, smooth=True)
     return out
 
 
@@ -143,38 +143,30 @@ def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> Fl
     return out
 
 
-def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
+def values_at_earlier_times(
+    time: FloatArray, values: FloatArray, by: FloatArray, *, smooth: bool = False
+) -> FloatArray:
     """Interpolate values (1 or n_samples, n), given at times (n,), at times earlier by `by`: (n_samples, n).
 
-    Before the first time, the first value holds.
+    Before the first time, the first value holds. Values lie on straight lines, or on a spline if they are `smooth`.
     """
     if len(time) < 2:
         return np.broadcast_to(values, (len(by), len(time)))
-    asked = time[None, :] - by[:, None]
-    after = _index_of_next_row(time, asked)
-    gap = time[after] - time[after - 1]
-    share = np.clip((asked - time[after - 1]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    values = np.broadcast_to(values, asked.shape)
-    low, high = np.take_along_axis(values, after - 1, axis=1), np.take_along_axis(values, after, axis=1)
+    asked = np.maximum(time - by[:, None], time[0])
+    before = np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1) - 1
+    every = np.broadcast_to(values, asked.shape)
+    if smooth:
+        since, found = asked - time[before], np.zeros(asked.shape)
+        for power in _cubics(time, values):
+            gaps = np.broadcast_to(power, (len(by), len(time) - 1))
+            found = found * since + np.take_along_axis(gaps, before, axis=1)
+    else:
+        gap = time[before + 1] - time[before]
+        share = np.clip((asked - time[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+        low, high = (np.take_along_axis(every, row, axis=1) for row in (before, before + 1))
+        found = low + share * (high - low)
     # Where two rows have the same time, interpolation would take the last for the first.
-    return np.where(by[:, None] == 0, values, low + share * (high - low))
-
-
-def _index_of_next_row(time: FloatArray, asked: FloatArray) -> IntArray:
-    """Return the index of the row after each time asked for, (n_samples, n), from 1 to that of the last row."""
-    return np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1)
-
-
-def _smooth_values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
-    """Return what `values_at_earlier_times` does, by a spline."""
-    if len(time) < 2:
-        return np.broadcast_to(values, (len(by), len(time)))
-    asked = np.maximum(time[None, :] - by[:, None], time[0])
-    gap = _index_of_next_row(time, asked) - 1
-    since, found = asked - time[gap], np.zeros(asked.shape)
-    for power in _cubics(time, values):
-        found = found * since + np.take_along_axis(np.broadcast_to(power, (len(by), len(time) - 1)), gap, axis=1)
-    return np.where(by[:, None] == 0, np.broadcast_to(values, asked.shape), found)
+    return np.where(by[:, None] == 0, every, found)
 
 
 def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:

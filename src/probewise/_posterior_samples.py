@@ -9,17 +9,46 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_texts
-from probewise.errors import ParameterError, ShapeError, require
+from probewise.errors import ShapeError, require
 
 MIN_SAMPLES = 500
 """Least number of posterior samples in a file: fewer do not give 95 % intervals."""
 
 
 class NamedSamples(ShowsItself):
-    """Base of models with posterior `samples`, (n_samples, n_params), and `names`, one per column."""
+    """Base of models with posterior `samples`, (n_samples, n_params), and `names`, one per column.
+
+    `noise_sd` (n_samples,) is that of a reading; `absent`, by name of an effect, is the mask of the samples without it.
+    """
 
     names: tuple[str, ...]
     samples: FloatArray
+    noise_sd: FloatArray
+    effects: tuple[str, ...]
+    absent: Mapping[str, BoolArray]
+
+    def require_sound_samples(self) -> None:
+        """Make samples and noise sds read-only copies; raise an error if they do not fit the names and effects.
+
+        A ShapeError or ParameterError if the shapes do not fit, a name is no text, there are fewer than 500 samples, a
+        value is not finite, an sd is not positive, or an effect's mask is that of no effect or of other samples.
+        """
+        checked_texts("names", self.names, "names of the columns of samples")
+        samples, noise_sd = read_only_floats(self.samples), read_only_floats(self.noise_sd)
+        n, n_params = len(samples), len(self.names)
+        if samples.ndim != 2 or samples.shape[1] != n_params:
+            raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {n_params})")
+        require(n >= MIN_SAMPLES, "n_samples", n, f"{MIN_SAMPLES} or more posterior samples")
+        if noise_sd.shape != (n,):
+            raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({n},), one per sample")
+        require_finite("samples", samples)
+        require_finite("noise_sd", noise_sd)
+        require((noise_sd > 0).all(), "noise_sd", float(noise_sd.min()), "greater than 0")
+        for name, without in self.absent.items():
+            fits = name in self.effects and without.shape == (n,)
+            require(fits, "absent", name, f"effects of the model, each with {n} truth values")
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "noise_sd", noise_sd)
 
     def mean(self) -> dict[str, float]:
         """Return the posterior mean by name of the parameter."""
@@ -47,30 +76,3 @@ def interval_table_lines(rows: Sequence[tuple[str, float, tuple[float, float]]])
         f"{'parameter':<{width}}  {'median':>11}  95 % interval",
         *(f"{name:<{width}}  {value:>11.5g}  {low:.5g} to {high:.5g}" for name, value, (low, high) in rows),
     ]
-
-
-def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return read-only copies of samples (n_samples, n_params) and noise sds (n_samples,); `names` has n_params names.
-
-    Raises ShapeError or ParameterError if the shapes do not fit, a name is no text, there are fewer than 500 samples, a
-    value is not finite, or an sd is not positive.
-    """
-    checked_texts("names", names, "names of the columns of samples")
-    samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)
-    if samples.ndim != 2 or samples.shape[1] != len(names):
-        raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(names)})")
-    require(len(samples) >= MIN_SAMPLES, "n_samples", len(samples), f"{MIN_SAMPLES} or more posterior samples")
-    if noise_sd.shape != (len(samples),):
-        raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one per sample")
-    require_finite("samples", samples)
-    require_finite("noise_sd", noise_sd)
-    if not (noise_sd > 0).all():
-        raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
-    return samples, noise_sd
-
-
-def require_masks_of_absent_effects(absent: Mapping[str, BoolArray], effects: tuple[str, ...], n_samples: int) -> None:
-    """Raise ParameterError unless `absent` maps names in `effects` to boolean arrays of shape (n_samples,)."""
-    for name, without in absent.items():
-        if name not in effects or without.shape != (n_samples,):
-            raise ParameterError("absent", name, f"effects of the model, each with {n_samples} truth values")

@@ -16,12 +16,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_path, require_kind
-from probewise._posterior_samples import (
-    NamedSamples,
-    checked_samples,
-    interval_table_lines,
-    require_masks_of_absent_effects,
-)
+from probewise._posterior_samples import NamedSamples, interval_table_lines
 from probewise._version import __version__
 from probewise.calibration.fields import QuantitySummary, posterior_mean_ssf_field, ssf_quantities
 from probewise.calibration.noise import ScanNoise
@@ -29,7 +24,7 @@ from probewise.calibration.priors import PriorRow
 from probewise.effects import EFFECTS, OTHER_FORMS, Extent, Origin
 from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
 from probewise.effects.reference import ZERO
-from probewise.errors import FileError, ParameterError, ProbewiseError, printable, require, shown
+from probewise.errors import FileError, ProbewiseError, printable, require, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
@@ -133,10 +128,8 @@ class FittedSensor(NamedSamples):
     version: str = __version__
 
     def __post_init__(self) -> None:
-        samples, noise_sd = checked_samples(self.samples, self.noise_sd, self.names)
-        unknown = [name for name in self.effects if name not in EFFECTS]
-        if unknown:
-            raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
+        for name in self.effects:
+            require(name in EFFECTS, "effects", name, ", ".join(sorted(EFFECTS)))
         can_have: dict[str, Callable[[str], bool]] = {
             "forms": lambda name: (name, self.forms.get(name)) in OTHER_FORMS,
             "patterns": _BOUND_TO_PATTERNS.__contains__,
@@ -144,27 +137,20 @@ class FittedSensor(NamedSamples):
         }
         for key, able in can_have.items():
             stray = [name for name in getattr(self, key) if name not in self.effects or not able(name)]
-            if stray:
-                able_ones = [name for name in self.effects if able(name)]
-                raise ParameterError(key, stray[0], f"effects of the model among {able_ones}")
-        require_masks_of_absent_effects(self.absent, self.effects, len(samples))
-        if not 1 <= self.n_gaussians <= len(self.names) // 6:
-            allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
-            raise ParameterError("n_gaussians", self.n_gaussians, allowed)
-        wanted = (*mixture_parameter_names(self.n_gaussians), "I_min", "I_max")
-        if self.names[: len(wanted)] != wanted:
-            raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
+            able_ones = [name for name in self.effects if able(name)]
+            require(not stray, key, next(iter(stray), ""), f"effects of the model among {able_ones}")
+        self.require_sound_samples()
+        n, most = self.n_gaussians, len(self.names) // 6
+        require(1 <= n <= most, "n_gaussians", n, f"1 to {most}, for {len(self.names)} parameters")
+        wanted = (*mixture_parameter_names(n), "I_min", "I_max")
+        require(self.names[: len(wanted)] == wanted, "names", self.names, f"{wanted} first, for n_gaussians = {n}")
         owners = {name.partition(".")[0] for name in self.names[len(wanted) :]}
         columns = {f"{effect.name}.{p}" for effect in self.effects_on_new_scans for p in effect.prior.names}
-        if owners != set(self.effects) or not columns <= set(self.names):
-            raise ParameterError(
-                "names", self.names, f"after I_max the columns of the effects {self.effects}: {sorted(columns)}"
-            )
-        det = _precision_determinants(samples, self.n_gaussians)
-        if not (det > 0).all():
-            raise ParameterError("A B - C^2 of a Gaussian", float(det.min()), "greater than 0 in every sample")
-        object.__setattr__(self, "samples", samples)
-        object.__setattr__(self, "noise_sd", noise_sd)
+        allowed = f"after I_max the columns of the effects {self.effects}: {sorted(columns)}"
+        require(owners == set(self.effects) and columns <= set(self.names), "names", self.names, allowed)
+        a, b, c = (self.samples[:, k : 6 * self.n_gaussians : 6] for k in (3, 4, 5))
+        det = np.where(a > 0, a * b - c * c, -np.inf)
+        require((det > 0).all(), "A B - C^2 of a Gaussian", float(det.min()), "greater than 0 in every sample")
 
     @property
     def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
@@ -412,12 +398,6 @@ def require_fitted_sensor(sensor: object, more: str = "") -> None:
     elif hasattr(sensor, "fitted_sensor"):
         allowed = "a FittedSensor: take its .fitted_sensor(recording, rng=rng), of the recording that was diagnosed"
     require_kind("sensor", sensor, FittedSensor, f"{allowed}{', ' if more else ''}{more}")
-
-
-def _precision_determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
-    """Compute A B - C^2 of each Gaussian, (n_samples, N); -inf where A is not positive."""
-    a, b, c = (samples[:, k : 6 * n_gaussians : 6] for k in (3, 4, 5))
-    return np.where(a > 0, a * b - c * c, -np.inf)
 
 
 _NUMBERS, _ROWS = 1, 2  # forms of arrays, by their dimensions

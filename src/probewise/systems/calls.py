@@ -140,7 +140,10 @@ class Caller:
         """
         together = cls(simulate, broadcasts=True, name=name)
         if broadcasts:
-            together._require_finite_and_repeatable(_readings_or_nan(together, samples, columns), samples, columns)
+            readings = together(samples, columns)
+            if not np.isfinite(readings).any():
+                together(samples, columns, strict=True)  # raises its own error, if there is one
+            together._require_finite_and_repeatable(readings, samples, columns)
             return together
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         alone = one(samples, columns, strict=True)
@@ -148,11 +151,11 @@ class Caller:
         if together._returns(alone, samples, columns):
             return together
         taken = set(per_run)
-        for own, values in samples.items():  # parameters that may be arrays (n_points,) in a call for one sample
-            trial = cls(simulate, broadcasts=False, by_row=frozenset({*per_run, own}))
-            if own not in per_run and trial._returns(
-                alone, {**samples, own: np.broadcast_to(values, alone.shape)}, columns
-            ):
+        for own in [
+            own for own in samples if own not in taken
+        ]:  # parameters that may be arrays (n_points,) in a call for one sample
+            by_row = {**samples, own: np.broadcast_to(samples[own], alone.shape)}
+            if cls(simulate, broadcasts=False, by_row=frozenset({*per_run, own}))._returns(alone, by_row, columns):
                 taken.add(own)
         return cls(simulate, broadcasts=False, by_row=frozenset(taken), name=name)
 
@@ -332,9 +335,7 @@ class SpreadCalls:
         return (done[k % len(done)][k // len(done)] for k in range(len(given)))
 
 
-@cache
-def _simulate_of_file(path: Path) -> Any:
-    return read_simulator(path).simulate
+_simulate_of_file: Callable[[Path], Any] = cache(lambda path: read_simulator(path).simulate)
 
 
 def _call_each(path: Path, given: Sequence[tuple[Values, Values]]) -> list[FloatArray | None]:
@@ -374,19 +375,6 @@ class ProgressWithCallCount:
         most = "" if self._caller.broadcasts else f" of about {MOST_CALLS:,}"
         calls = f"{self._caller.n_calls:,}{most} calls of simulate"
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
-
-
-def _readings_or_nan(together: Caller, samples: Values, columns: Columns) -> FloatArray:
-    """Return the readings of samples, NaN where `simulate` raises; raise its error if no reading is finite then."""
-    try:
-        return together(samples, columns, strict=True)
-    except ShapeError:
-        raise
-    except Exception:
-        readings = together(samples, columns)
-        if not np.isfinite(readings).any():
-            raise
-        return readings
 
 
 def number_of_samples(*values: Values) -> int:

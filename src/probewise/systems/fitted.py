@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_texts, require_kind
-from probewise._posterior_samples import (
-    NamedSamples,
-    checked_samples,
-    interval_table_lines,
-    require_masks_of_absent_effects,
-)
+from probewise._posterior_samples import NamedSamples, interval_table_lines
 from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
 from probewise.errors import FileError, ParameterError, message_of, printable, require
@@ -88,20 +83,15 @@ class FittedSystem(NamedSamples):
     version: str = __version__
 
     def __post_init__(self) -> None:
-        samples, noise_sd = checked_samples(self.samples, self.noise_sd, self.names)
-        simulator = self.simulator
+        self.require_sound_samples()
+        simulator, known = self.simulator, {*self.names, *(name.partition("[")[0] for name in self.names)}
         for name in simulator.parameters:
-            if name not in self.names and not (
-                name in simulator.per_run and any(own.startswith(f"{name}[") for own in self.names)
-            ):
-                raise ParameterError("names", self.names, f"all parameters of the simulator; {name} is missing")
+            there = name in (known if name in simulator.per_run else self.names)
+            require(there, "names", self.names, f"all parameters of the simulator; {name} is missing")
         checked_texts("notes", self.notes, "reasons to use the result with care")
         effects = checked_texts("effects", self.effects, "names of effects")
         if self.known is None and any(getattr(EFFECTS.get(name), "stage", None) != Stage.NOISE for name in effects):
             raise ParameterError("effects", list(self.effects), "effects on the noise alone, unless `known` is given")
-        require_masks_of_absent_effects(self.absent, self.effects, len(samples))
-        object.__setattr__(self, "samples", samples)
-        object.__setattr__(self, "noise_sd", noise_sd)
 
     def summary(self) -> str:
         """Return a plain-text summary: simulator, effects, number of samples, noise sd, and the table of parameters."""
@@ -131,10 +121,8 @@ class FittedSystem(NamedSamples):
         median, interval = self.median(), self.interval()
         lines = interval_table_lines([(name, median[name], interval[name]) for name in self.names])
         if self.best:
-            lines = [
-                f"{line:<{max(map(len, lines))}}  {mode}"
-                for line, mode in zip(lines, ["mode", *(f"{value:.8g}" for value in self.best)], strict=True)
-            ]
+            width, modes = max(map(len, lines)), ["mode", *(f"{value:.8g}" for value in self.best)]
+            lines = [f"{line:<{width}}  {mode}" for line, mode in zip(lines, modes, strict=True)]
         return "\n".join(lines)
 
     @property

@@ -128,39 +128,34 @@ def noise_of_runs(runs: tuple[str, ...], n_rows: Any = 1) -> NoiseEffect:
 
     `n_rows` (n_runs,) are the numbers of readings from which each run's value was estimated, where that counts.
     """
+    known, widths = {name: k for k, name in enumerate(runs)}, 1 / np.sqrt(2 * np.maximum(n_rows, 1))
+
+    def act(noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
+        at = np.array([known.get(name, len(runs)) for name in plan.scan_names])
+        values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
+        return replace(noise, sd=noise.sd * values[:, at[plan.scan]])
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        low, high = int(np.argmin(mean)), int(np.argmax(mean))
+        return (
+            f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
+            f"in run {runs[high]} and {value_with_sd(mean[low], sd[low])} times in run {runs[low]}"
+        )
+
     return NoiseEffect(
         noise_per_run.name,
         noise_per_run.stage,
         {f"values[{run}]": LogHeavyTailedPrior(0.3) for run in runs},
         ("1",) * len(runs),
         noise_per_run.covariates,
-        partial(_times_run_value, runs),
+        act,
         np.ones((1, 1, len(runs))),
-        partial(_runs_in_words, runs),
+        says,
         amplitudes=(),
         absent=dict.fromkeys(range(len(runs)), 1.0),
         nodes_about=partial(_most_probable_run_values, len(runs)),
-        draws_about=partial(_drawn_run_values, 1 / np.sqrt(2 * np.maximum(n_rows, 1))),
+        draws_about=lambda nodes, rng: np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape))),
     )
-
-
-def _times_run_value(runs: tuple[str, ...], noise: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
-    known = {name: k for k, name in enumerate(runs)}
-    at = np.array([known.get(name, len(runs)) for name in plan.scan_names])
-    values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)
-    return replace(noise, sd=noise.sd * values[:, at[plan.scan]])
-
-
-def _runs_in_words(runs: tuple[str, ...], mean: FloatArray, sd: FloatArray) -> str:
-    low, high = int(np.argmin(mean)), int(np.argmax(mean))
-    return (
-        f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
-        f"in run {runs[high]} and {value_with_sd(mean[low], sd[low])} times in run {runs[low]}"
-    )
-
-
-def _drawn_run_values(widths: FloatArray, nodes: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
 
 
 def _most_probable_run_values(

@@ -366,10 +366,8 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
         return tables[0], ()
     first, notes = tables[0], list[str]()
     for source, table in zip(sources[1:], tables[1:], strict=True):
-        notes += [
-            f"{source} has no column {name}: missing there" for name in first.columns if name not in table.columns
-        ]
-        beyond = [name for name in table.columns if name not in first.columns]
+        lacking, beyond = ([n for n in a.columns if n not in b.columns] for a, b in ((first, table), (table, first)))
+        notes += [f"{source} has no column {name}: missing there" for name in lacking]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
     run = first.run or unused_name(_FILE, first.columns)
     by_table = _distinct_run_names(tables, sources, named=first.run is not None)
@@ -397,11 +395,10 @@ def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:
 def _concatenated_column(
     name: str, parts: Sequence[NDArray[Any] | None], lengths: Sequence[int], sources: Sequence[str]
 ) -> NDArray[Any]:
-    first = parts[0]
+    first, out = parts[0], list[NDArray[Any]]()
     assert first is not None
     has_texts = any(part is not None and part.dtype != np.float64 for part in parts)
     numeric = first.dtype == np.float64 and not (has_texts and np.isnan(first).all())
-    out: list[NDArray[Any]] = []
     for part, n, source in zip(parts, lengths, sources, strict=True):
         if part is None:
             out.append(np.full(n, np.nan) if numeric else np.full(n, ""))
@@ -419,15 +416,13 @@ def _text(value: object) -> str:
 
 def _distinct_run_names(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> list[dict[str, str]]:
     """Return for each table the names of its runs, in order: a number is appended to one that an earlier table has."""
-    taken: set[str] = set()
-    out: list[dict[str, str]] = []
+    taken, out = set[str](), list[dict[str, str]]()
     for table, source in zip(tables, sources, strict=True):
         names: tuple[str, ...] = table.scan_names if named else (source,)
-        own: dict[str, str] = {}
+        out.append({})
         for name in names:  # a new name must not be one of this table's own either, which follows unchanged
-            own[name] = unused_name(name, taken | set(own.values()) | (set(names) - {name}))
-        taken |= set(own.values())
-        out.append(own)
+            out[-1][name] = unused_name(name, taken | (set(names) - {name}))
+            taken |= {out[-1][name]}
     return out
 
 
@@ -440,12 +435,5 @@ def unused_name(name: str, taken: Iterable[str]) -> str:
 
 
 def _same_tables(first: RunTable, second: RunTable) -> bool:
-    if len(first) != len(second) or first.columns.keys() != second.columns.keys():
-        return False
-    pairs = [(values, second.columns[name]) for name, values in first.columns.items()]
-    return all(
-        np.array_equal(a, b, equal_nan=True)
-        if a.dtype == b.dtype == np.float64
-        else [*map(str, a.tolist())] == [*map(str, b.tolist())]
-        for a, b in pairs
-    )
+    one, other = ({name: [*map(_text, v.tolist())] for name, v in t.columns.items()} for t in (first, second))
+    return one == other

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.calibration.priors import MomentCoordinates, SSFPrior, view_by_kind_and_gaussian
+from probewise.calibration.priors import SSFPrior, view_by_kind_and_gaussian
 
 _TAPER = 3.0
 _LEAST = 1e-12
@@ -36,7 +36,7 @@ class WholeFootprintCoordinates:
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates, both (n, 6 N + 2)."""
-        x = self._moment_coordinates.enter(theta)
+        x = self.prior.coordinates.enter(theta)
         g = view_by_kind_and_gaussian(x)
         ratio = np.exp(g[0, 1:])
         g[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
@@ -44,9 +44,8 @@ class WholeFootprintCoordinates:
         covariance = _covariance_from_logs(g[3:6, 0])
         whole_mean = mean + first * g[1:3, 0]
         off = g[1:3, 0] - whole_mean
-        whole = first * (covariance + _squares_and_product(off)) + self._covariance_contribution_of_others(
-            g, whole_mean
-        )
+        others = self._covariance_contribution_of_others(g, whole_mean)
+        whole = first * (covariance + _squares_and_product(off)) + others
         g[1:3, 0] = whole_mean
         g[3:6, 0] = _logs_from_covariance(whole)
         return x
@@ -76,14 +75,10 @@ class WholeFootprintCoordinates:
         g[3:6, 0] = _logs_from_covariance(own)
         heaviest = 1.0 / (1.0 + ratio.sum(axis=0))
         g[1:3, 0] = heaviest * (g[1:3, 0] + (ratio * g[1:3, 1:]).sum(axis=1))
-        theta, log_density = self._moment_coordinates.leave(y)
+        theta, log_density = self.prior.coordinates.leave(y)
         log_density += 2.0 * np.log(heaviest) - 5.0 * np.log(first) + _log_volume_ratio(whole) - _log_volume_ratio(own)
         real &= sorted_by_mass & np.isfinite(log_density)
         return theta, np.where(real, log_density, -np.inf)
-
-    @property
-    def _moment_coordinates(self) -> MomentCoordinates:
-        return MomentCoordinates(self.prior)
 
     def _tapered_light_shares(self, g: FloatArray) -> FloatArray:
         """Share of the light of each Gaussian but the first, reduced for wide or distant Gaussians, (N - 1, n)."""
@@ -100,12 +95,8 @@ class WholeFootprintCoordinates:
 
     def _covariance_contribution_of_others(self, g: FloatArray, mean: FloatArray) -> FloatArray:
         """Return the contribution of all but the first to the covariance of the whole: xx, yy, xy, (3, n)."""
-        off = g[1:3, 1:] - mean[:, None]
-        return np.asarray(
-            (self._tapered_light_shares(g) * (_covariance_from_logs(g[3:6, 1:]) + _squares_and_product(off))).sum(
-                axis=1
-            )
-        )
+        own = _covariance_from_logs(g[3:6, 1:]) + _squares_and_product(g[1:3, 1:] - mean[:, None])
+        return np.asarray((self._tapered_light_shares(g) * own).sum(axis=1))
 
 
 def _covariance_from_logs(logs: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, rounding_error
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
 from probewise.recordings import Uniform as UniformPattern
@@ -116,11 +116,10 @@ class SSFPrior:
     reasons: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.n_gaussians < 1:
-            raise ParameterError("n_gaussians", self.n_gaussians, "1 or more")
+        require(self.n_gaussians >= 1, "n_gaussians", self.n_gaussians, "1 or more")
         require(0 < self.max_correlation < 1, "max_correlation", self.max_correlation, "above 0, below 1")
-        if self.unit_mass_mm2 is not None and not self.unit_mass_mm2 > 0:
-            raise ParameterError("unit_mass_mm2", self.unit_mass_mm2, "greater than 0, or None")
+        is_mass = self.unit_mass_mm2 is None or self.unit_mass_mm2 > 0
+        require(is_mass, "unit_mass_mm2", self.unit_mass_mm2, "greater than 0, or None")
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -169,9 +168,7 @@ class SSFPrior:
         each += (offset[0] + offset[1]) + (precision[0] + precision[1])
         each -= math.log(2 * self.max_correlation)
         each[~inside] = -np.inf
-        total = each.sum(axis=0)
-        total += self.i_min.log_prob(i_min) + self.i_max.log_prob(i_max)
-        return np.asarray(total)
+        return np.asarray(each.sum(axis=0) + (self.i_min.log_prob(i_min) + self.i_max.log_prob(i_max)))
 
     @property
     def coordinates(self) -> MomentCoordinates:
@@ -180,23 +177,16 @@ class SSFPrior:
 
     def table_rows(self) -> tuple[PriorRow, ...]:
         """Return the rows of the report's table of priors, one per kind of parameter."""
-        why = dict(self.reasons)
-        by_mass = self.unit_mass_mm2 is not None
+        why, mass, ratios = dict(self.reasons), "", "readings depend only on ratios"
+        if self.unit_mass_mm2 is not None:
+            mass = f" times {self.unit_mass_mm2:.3g} sqrt(A_n B_n - C_n^2)"
+            ratios = f"the mass of each Gaussian is uniform; {ratios}"
+        within = f"uniform -{self.max_correlation:g} to {self.max_correlation:g} times sqrt(A_n B_n)"
         rows = (
-            (
-                "a_n",
-                "1",
-                f"{self.amplitude}" + (f" times {self.unit_mass_mm2:.3g} sqrt(A_n B_n - C_n^2)" if by_mass else ""),
-                ("the mass of each Gaussian is uniform; " if by_mass else "") + "readings depend only on ratios",
-            ),
+            ("a_n", "1", f"{self.amplitude}{mass}", ratios),
             ("u_n, v_n", "mm", str(self.offset_mm), why.get("offset_mm", "given")),
             ("A_n, B_n", "mm^-2", str(self.precision), why.get("precision", "given")),
-            (
-                "C_n",
-                "mm^-2",
-                f"uniform -{self.max_correlation:g} to {self.max_correlation:g} times sqrt(A_n B_n)",
-                "every draw is positive definite",
-            ),
+            ("C_n", "mm^-2", within, "every draw is positive definite"),
             ("I_min", "reading", str(self.i_min), why.get("levels", "given")),
             ("I_max", "reading", str(self.i_max), why.get("levels", "given")),
         )
@@ -235,11 +225,8 @@ class MomentCoordinates:
         det = g[..., 3] * g[..., 4] - g[..., 5] ** 2
         log_mass = np.log(g[..., 0]) - 0.5 * np.log(det)
         order = np.argsort(-log_mass, axis=1)
-        g, det, log_mass = (
-            np.take_along_axis(g, order[..., None], axis=1),
-            np.take_along_axis(det, order, axis=1),
-            np.take_along_axis(log_mass, order, axis=1),
-        )
+        g = np.take_along_axis(g, order[..., None], axis=1)
+        det, log_mass = (np.take_along_axis(a, order, axis=1) for a in (det, log_mass))
         out = np.empty_like(g)
         out[:, 0, 0] = np.log(g[:, 0, 0] / self.prior.amplitude_at_unit_mass(det[:, 0]))
         out[:, 1:, 0] = log_mass[:, 1:] - log_mass[:, :1]
@@ -331,14 +318,11 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     named = recording.source or "recording"
     require(readings.size != 0, named, f"{len(recording)} rows, none usable", "readings present and within min..max")
     low, high = float(readings.min()), float(readings.max())
-    if not low < high:
-        raise ParameterError(
-            named, f"all {readings.size} usable readings equal {low:g}", "readings that differ: scan an edge"
-        )
+    found = f"all {readings.size} usable readings equal {low:g}"
+    require(low < high, named, found, "readings that differ: scan an edge")
     place = np.stack([plan.x_mm, plan.y_mm], axis=-1)
     still = rounding_error(place)
-    moves: list[FloatArray] = []
-    lengths: list[float] = []
+    moves, lengths = list[FloatArray](), list[float]()
     for rows in plan.rows_by_scan():
         places = place[rows[usable[rows]]]
         steps = np.hypot(*np.diff(places, axis=0).T)
@@ -346,17 +330,15 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
             moves.append(steps[steps > still])
             lengths.append(float(np.hypot(*np.ptp(places, axis=0))))
     extent = float(np.hypot(*np.ptp(place[usable], axis=0)))
-    if not lengths and extent <= still:
-        raise ParameterError("recording", "every usable reading taken at one place", "scans that move over an edge")
+    moved = bool(lengths) or extent > still
+    require(moved, "recording", "every usable reading taken at one place", "scans that move over an edge")
     span = float(np.median(lengths)) if lengths else extent
     # Places far apart, such as those a robot chooses, do not bound the footprint from below: use a factor of 50.
     step = min(float(np.median(np.concatenate(moves))) if moves else span, span / 50)
     albedo = _albedo_at_commanded_places(recording)[usable]
     albedo_low, albedo_high = float(albedo.min()), float(albedo.max())
-    if not albedo_low < albedo_high:
-        raise ParameterError(
-            "recording", f"albedo {albedo_low:g} under every usable place", "places on both sides of an edge"
-        )
+    found = f"albedo {albedo_low:g} under every usable place"
+    require(albedo_low < albedo_high, "recording", found, "places on both sides of an edge")
     covariance = float(np.mean((albedo - albedo.mean()) * (readings - readings.mean())))
     return ScanGeometry(step, span, low, high, albedo_low, albedo_high, inverted=covariance < 0)
 

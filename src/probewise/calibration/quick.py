@@ -81,9 +81,8 @@ class _NearPosterior:
         """Draw coordinates, (n, 6 N + 2); some match no possible parameters."""
         n_gaussians = self.prior.n_gaussians
         x = np.empty((n, len(self.names)))
-        g, drawn = (
-            view_by_kind_and_gaussian(a) for a in (x, self.prior.from_unit_cube(rng.random((n, len(self.names)))))
-        )
+        both = x, self.prior.from_unit_cube(rng.random(x.shape))
+        g, drawn = map(view_by_kind_and_gaussian, both)
         det = drawn[3] * drawn[4] - drawn[5] ** 2
         g[1:3], g[3:5] = drawn[1:3], np.log(0.5 * drawn[4:2:-1] / det)
         g[5] = np.arctanh(-drawn[5] / np.sqrt(drawn[3] * drawn[4]))
@@ -198,7 +197,9 @@ def fit_orders_quickly(
         peaks, gain, last = ends[high > high[0] - _LOWER], float(high[0]) - last, float(high[0])
         one = peaks[0] if n == 1 else one
         if fallen and gain < _MUCH_HIGHER:
-            note = _orders_left_out_in_words(sorted(m for m in orders if m >= n))
+            left = sorted(m for m in orders if m >= n)
+            which = f"order{'s' * (len(left) > 1)} {' and '.join(map(str, left))}"
+            note = f"{which} not tried: the evidence has clearly fallen before" if left else ""
             break
         if n not in orders:
             continue
@@ -223,13 +224,6 @@ def fit_orders_quickly(
             words = f"order {n} was searched in full, since the quick way missed a peak of order {chosen}: {why}"
             posteriors[n] = replace(full, notes=(*full.notes, words))
     return posteriors, note
-
-
-def _orders_left_out_in_words(orders: list[int]) -> str:
-    if not orders:
-        return ""
-    which = "order" if len(orders) == 1 else "orders"
-    return f"{which} {' and '.join(map(str, orders))} not tried: the evidence has clearly fallen before"
 
 
 def _missed_part_in_words(

@@ -208,7 +208,7 @@ def footprint_share_by_card(chain: Chain, poses: Poses, plan: Plan) -> list[Floa
         )
         rows = np.flatnonzero(within.any(axis=0))
         if rows.size:
-            there = Poses(*(a[:, rows] for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+            there = Poses(*(a[:, rows] for a in poses.arrays))
             part = plan.take(rows)
             regions = dict.fromkeys(part.pattern_names, card.region)
             out[:, rows] = response(RegionsAndPoses(regions, there, part), footprint, n_nodes=chain.n_nodes)

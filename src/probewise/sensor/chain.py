@@ -311,8 +311,7 @@ class RegionsAndPoses:
     @cached_property
     def n_samples(self) -> int:
         """Number of hypotheses over which the poses or regions vary, or 1."""
-        place = (self.poses.x_mm, self.poses.y_mm, self.poses.orientation_rad)
-        return max([1, *(len(a) for a in place), *(region.n_regions for _, region in self.rows_and_regions)])
+        return max([1, *map(len, self.poses.arrays), *(region.n_regions for _, region in self.rows_and_regions)])
 
     @cached_property
     def rows_and_regions(self) -> list[tuple[IntArray, Region]]:
@@ -325,7 +324,7 @@ class RegionsAndPoses:
 
         Empty where poses differ between hypotheses.
         """
-        if any(len(a) > 1 for a in (self.poses.x_mm, self.poses.y_mm, self.poses.orientation_rad)):
+        if any(len(a) > 1 for a in self.poses.arrays):
             return ()
         known = [(rows, region) for rows, region in self.rows_and_regions if region.n_regions == 1]
         edges = [(rows, region) for rows, region in known if isinstance(region, HalfPlaneRegion)]
@@ -356,11 +355,9 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
     `layout`: what lies under the sensor at each reading; `footprint`: SSF in the sensor frame, arrays broadcasting to
     (n_samples, n_points, n_gaussians); `n_nodes`: nodes of the quadrature over curved edges.
     """
-    out = np.zeros(
-        (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
-    )
-    poses, varies = layout.poses, any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
-    batches = () if varies else layout.straight_batches
+    parts = (footprint.weight, *footprint.moments)
+    out = np.zeros((max(layout.n_samples, *map(len, parts)), len(layout.plan)))
+    batches = () if any(a.shape[1] > 1 for a in parts) else layout.straight_batches
     for part in batches:
         out[:, part.rows] = part.response(footprint)
     for rows, region in layout.rows_and_regions_by_orientation:
@@ -371,7 +368,7 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
             for g in range(footprint.weight.shape[2]):
                 out[:, rows] += select_reading_columns(footprint.weight[:, :, g], rows) * level
             continue
-        x, y, turn = (select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
+        x, y, turn = (select_reading_columns(a, rows) for a in layout.poses.arrays)
         if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
             turn = turn[:, :1]
         for g in range(footprint.weight.shape[2]):
@@ -415,9 +412,9 @@ class _HypothesesByGeometry:
 
 
 def _discrete_response(layout: RegionsAndPoses, ssf: DiscreteSSF) -> FloatArray:
-    poses, found = layout.poses, []
+    found = []
     for rows, region in layout.rows_and_regions:
-        there = Poses(*(select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+        there = Poses(*(select_reading_columns(a, rows) for a in layout.poses.arrays))
         found.append((rows, mean_albedo_by_pixels(region, ssf.field, there)))
     out = np.zeros((max((len(part) for _, part in found), default=1), len(layout.plan)))
     for rows, part in found:

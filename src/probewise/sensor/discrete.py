@@ -28,7 +28,7 @@ def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> Floa
     sensor frame; its pixels turn with the sensor; `poses`: where the sensor stands; arrays broadcast to (n_samples,
     n_points).
     """
-    x, y, turn = np.broadcast_arrays(poses.x_mm, poses.y_mm, poses.orientation_rad)
+    x, y, turn = np.broadcast_arrays(*poses.arrays)
     n_poses, n_points = x.shape
     if n_poses not in (1, region.n_regions) and region.n_regions != 1:
         raise ShapeError(f"poses of {n_poses} hypotheses, {region.n_regions} regions; allowed: equal numbers, or 1")

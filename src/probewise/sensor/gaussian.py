@@ -58,20 +58,17 @@ class LabGaussian:
 
     def select_samples(self, rows: IntArray) -> LabGaussian:
         """Return the Gaussian of the samples `rows`; arrays shared by all samples are kept as they are."""
-        return LabGaussian(*(a[rows] if a.shape[0] != 1 else a for a in self._arrays()))
+        return LabGaussian(**{name: a[rows] if len(a) != 1 else a for name, a in vars(self).items()})
 
     @property
     def shape(self) -> tuple[int, ...]:
         """The shape that the arrays broadcast to."""
-        return np.broadcast_shapes(*(a.shape for a in self._arrays()))
+        return np.broadcast_shapes(*(a.shape for a in vars(self).values()))
 
     @property
     def centre_and_covariance(self) -> tuple[FloatArray, ...]:
         """The Gaussian's centre x and y in the lab frame, and its var_x, var_y, cov_xy."""
         return (self.x_mm + self.dx_mm, self.y_mm + self.dy_mm, self.var_x, self.var_y, self.cov_xy)
-
-    def _arrays(self) -> tuple[FloatArray, ...]:
-        return (self.x_mm, self.y_mm, self.dx_mm, self.dy_mm, self.var_x, self.var_y, self.cov_xy)
 
 
 def moments_in_lab_frame(

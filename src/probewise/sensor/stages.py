@@ -53,6 +53,11 @@ class Poses:
     y_mm: FloatArray
     orientation_rad: FloatArray
 
+    @property
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The three arrays: x_mm, y_mm, orientation_rad."""
+        return self.x_mm, self.y_mm, self.orientation_rad
+
 
 @dataclass(frozen=True, eq=False)
 class SceneView:

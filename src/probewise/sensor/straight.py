@@ -149,10 +149,7 @@ def _joined_rows(
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, IntArray]:
     """Return the rows of all parts, x, y and orientation of the sensor there, and each row's part, (n_rows,) each."""
     rows = np.concatenate([rows for rows, _ in parts])
-    places = (
-        np.broadcast_to(select_reading_columns(a, rows)[0], rows.shape)
-        for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)
-    )
+    places = (np.broadcast_to(select_reading_columns(a, rows)[0], rows.shape) for a in poses.arrays)
     return (rows, *places, np.repeat(np.arange(len(parts)), [len(rows) for rows, _ in parts]))  # type: ignore[return-value]
 
 

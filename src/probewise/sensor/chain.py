@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import checked_number, require_like
-from probewise.errors import ParameterError
+from probewise.errors import ParameterError, require
 from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, Region, UniformRegion
@@ -79,10 +79,10 @@ class FixedLevels:
     i_max: float
 
     def __post_init__(self) -> None:
-        for name in ("i_min", "i_max"):
-            checked_number(name, getattr(self, name))
-        if not (np.isfinite(self.i_min) and np.isfinite(self.i_max)):
-            raise ParameterError("FixedLevels(i_min, i_max)", (self.i_min, self.i_max), "finite numbers")
+        both = self.i_min, self.i_max
+        for name, level in zip(("i_min", "i_max"), both, strict=True):
+            checked_number(name, level)
+        require(np.isfinite(both).all(), "FixedLevels(i_min, i_max)", both, "finite numbers")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -133,12 +133,11 @@ class Chain:
         require_like("ssf", self.ssf, ("names", "footprint"), f"an SSF such as FreeMixture(1) or FixedMixture, {order}")
         require_levels(self.levels, order)
         require_scene(self.scene, order)
-        if isinstance(self.ssf, DiscreteSSF) and any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
-            names = [effect.name for effect in self.effects if effect.stage == Stage.FOOTPRINT]
-            raise ParameterError("effects", names, "none at the footprint with a DiscreteSSF; use mixture_of_field")
+        at_footprint = [effect.name for effect in self.effects if effect.stage == Stage.FOOTPRINT]
+        fits = not (at_footprint and isinstance(self.ssf, DiscreteSSF))
+        require(fits, "effects", at_footprint, "none at the footprint with a DiscreteSSF; use mixture_of_field")
         labels = [effect.name for effect in self.effects]
-        if len(set(labels)) < len(labels):
-            raise ParameterError("effects", labels, "each name once")
+        require(len(set(labels)) == len(labels), "effects", labels, "each name once")
         object.__setattr__(self, "effects", tuple(sorted(self.effects, key=lambda e: (e.stage, e.name))))
 
     @cached_property
@@ -202,8 +201,8 @@ class Chain:
         plan = self.plan_at_calibrated_height(plan)
         layout = self._layout_under_poses(theta, plan)
         if isinstance(self.ssf, DiscreteSSF):
-            if height_ratio(plan) is not None:
-                raise ParameterError("plan", "a commanded height_mm", "none with a DiscreteSSF; use mixture_of_field")
+            allowed = "none with a DiscreteSSF; use mixture_of_field"
+            require(height_ratio(plan) is None, "plan", "a commanded height_mm", allowed)
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = footprint_at_commanded_height(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._stage_applier(theta, plan)(Stage.FOOTPRINT, plain)

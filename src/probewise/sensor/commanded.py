@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint
@@ -38,7 +38,8 @@ def led_state(plan: Plan) -> FloatArray:
     led = plan.covariates.get("led")
     if led is None:
         return np.ones(1)
-    _require_values_allowed("led", led, (led < 0.0) | (led > 1.0), "0 (off) to 1 (on), NaN where it was not recorded")
+    for beyond in led[(led < 0.0) | (led > 1.0)]:
+        raise ParameterError("led", float(beyond), "0 (off) to 1 (on), NaN where it was not recorded")
     return np.where(np.isfinite(led), led, 1.0)
 
 
@@ -50,7 +51,8 @@ def height_ratio(plan: Plan) -> FloatArray | None:
     height_mm, usual_mm = plan.covariates.get("height_mm"), plan.instrumentation.height_mm
     if height_mm is None or usual_mm is None:
         return None
-    _require_values_allowed("height_mm", height_mm, height_mm <= 0.0, "greater than 0, NaN where it was not commanded")
+    for beyond in height_mm[height_mm <= 0.0]:
+        raise ParameterError("height_mm", float(beyond), "greater than 0, NaN where it was not commanded")
     ratio = np.where(np.isfinite(height_mm), height_mm / usual_mm, 1.0)
     return None if (ratio == 1.0).all() else ratio
 
@@ -71,11 +73,6 @@ def with_declared_height_commanded(plan: Plan, calibrated_mm: float | None) -> P
         covariates={**plan.covariates, "height_mm": np.where(np.isfinite(column), column, own_mm)},
         instrumentation=replace(plan.instrumentation, height_mm=calibrated_mm),
     )
-
-
-def _require_values_allowed(name: str, values: FloatArray, beyond: BoolArray, allowed: str) -> None:
-    if beyond.any():
-        raise ParameterError(name, float(values[beyond][0]), allowed)
 
 
 def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint:

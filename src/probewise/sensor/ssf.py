@@ -22,8 +22,7 @@ _ON_A_LINE = 1e-6  # of a pixel: root sum square distance from a line
 
 def mixture_parameter_names(n_gaussians: int) -> tuple[str, ...]:
     """Name the paper's parameters in order: a_1, u_1, v_1, A_1, B_1, C_1, a_2, ..."""
-    if n_gaussians < 1:
-        raise ParameterError("n_gaussians", n_gaussians, "1 or more")
+    require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
     return tuple(f"{letter}_{n}" for n in range(1, n_gaussians + 1) for letter in "auvABC")
 
 
@@ -102,11 +101,11 @@ class FixedMixture:
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: {shape}, one Gaussian or more")
             require_finite(name, values)
             object.__setattr__(self, name, values)
-        if (self.weights < 0).any() or not self.weights.sum() > 0:
-            raise ParameterError("weights", self.weights.tolist(), "0 or more, at least one greater than 0")
+        is_mass = (self.weights >= 0).all() and self.weights.sum() > 0
+        require(is_mass, "weights", self.weights.tolist(), "0 or more, at least one greater than 0")
         object.__setattr__(self, "weights", read_only_floats(self.weights / self.weights.sum()))
-        if not (np.linalg.eigvalsh(self.covs_mm2) > 0).all():
-            raise ParameterError("covs_mm2", self.covs_mm2.tolist(), "positive definite matrices")
+        is_definite = (np.linalg.eigvalsh(self.covs_mm2) > 0).all()
+        require(is_definite, "covs_mm2", self.covs_mm2.tolist(), "positive definite matrices")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,11 +127,8 @@ class FixedMixture:
 
     @cached_property
     def _footprint(self) -> Footprint:
-        covs = self.covs_mm2[None, None]
-        means = self.means_mm[None, None]
-        return Footprint(
-            self.weights[None, None], means[..., 0], means[..., 1], covs[..., 0, 0], covs[..., 1, 1], covs[..., 0, 1]
-        )
+        (u, v), (var_u, cov_uv, _, var_v) = self.means_mm.T, self.covs_mm2.reshape(-1, 4).T
+        return Footprint(*(part[None, None] for part in (self.weights, u, v, var_u, var_v, cov_uv)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,11 +210,9 @@ def mean_ssf_field(
     """
     if len(u_mm) < 2 or len(v_mm) < 2:
         raise ShapeError(f"u_mm has {len(u_mm)} pixels, v_mm {len(v_mm)}; allowed: 2 or more each")
-    pixel = float(u_mm[1] - u_mm[0])
-    if not (np.allclose(np.diff(u_mm), pixel) and np.allclose(np.diff(v_mm), pixel) and pixel > 0):
-        raise ParameterError(
-            "u_mm, v_mm", (u_mm[:2].tolist(), v_mm[:2].tolist()), "evenly spaced, one spacing for both"
-        )
+    pixel, begins = float(u_mm[1] - u_mm[0]), (u_mm[:2].tolist(), v_mm[:2].tolist())
+    is_even = np.allclose(np.diff(u_mm), pixel) and np.allclose(np.diff(v_mm), pixel) and pixel > 0
+    require(is_even, "u_mm, v_mm", begins, "evenly spaced, one spacing for both")
     w, mu, mv, var_u, var_v, cov = _gaussians_of_mean(footprint, weights)
     total = np.zeros((len(v_mm), len(u_mm)))
     weight = np.abs(w)  # a free form's may be negative
@@ -265,8 +259,7 @@ def merged_mean_mixture(
     `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture. Similar
     Gaussians of it are merged by the law of total covariance, so mean and covariance of the mean field are exact.
     """
-    if n_gaussians < 1:
-        raise ParameterError("n_gaussians", n_gaussians, "1 or more")
+    require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
     w, u, v, var_u, var_v, cov = _gaussians_of_mean(footprint, weights)
     w = w / w.sum()
     means, covs = np.stack([u, v], axis=-1), np.stack([var_u, cov, cov, var_v], axis=-1)
@@ -331,8 +324,7 @@ def _mass_mean_covariance(w: FloatArray, means: FloatArray, covs: FloatArray) ->
 
 def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
     """Merge weighted Gaussians (points: covariance 0) into at most `n_gaussians`, by expectation-maximisation."""
-    if n_gaussians < 1:
-        raise ParameterError("n_gaussians", n_gaussians, "1 or more")
+    require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
     w = w / w.sum()
     flat_covs = covs.reshape(len(w), 4)
     _, mean, cov = _mass_mean_covariance(w, means, flat_covs)
@@ -358,12 +350,10 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
         score = float(w @ (top + np.log(total))[:, 0])
         shares = w[:, None] * p / total
         alive = shares.sum(axis=0) > 1e-9
-        shares = shares[:, alive]
-        n_gaussians = int(alive.sum())
+        shares, n_gaussians = shares[:, alive], int(alive.sum())
         fitted = [_mass_mean_covariance(shares[:, k], means, flat_covs) for k in range(n_gaussians)]
-        weights = np.array([f[0] for f in fitted])
-        centers = np.array([f[1] for f in fitted])
-        shapes = np.array([f[2] for f in fitted]) + floor
+        weights, centers, shapes = (np.array(part) for part in zip(*fitted, strict=True))
+        shapes = shapes + floor
         if score - last < 1e-8:
             break
         last = score

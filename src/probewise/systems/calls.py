@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.errors import FileError, ParameterError, ShapeError, message_of
+from probewise.errors import FileError, ShapeError, message_of, require
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
 from probewise.recordings.io import EndedByFile
@@ -169,19 +169,15 @@ class Caller:
     def _require_finite_and_repeatable(self, readings: FloatArray, samples: Values, columns: Columns) -> None:
         """Raise ParameterError unless readings of samples hold a finite number, and another call for one returns it."""
         sound = np.isfinite(readings).any(axis=1)
-        if not sound.any():
-            found = f"not finite at any of the {sound.size} points of the prior that were tried"
-            allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
-            raise ParameterError(self.name, found, allowed)
+        found = f"not finite at any of the {sound.size} points of the prior that were tried"
+        allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
+        require(sound.any(), self.name, found, allowed)
         at = int(np.argmax(sound))
         again = Caller(self.simulate, self.broadcasts, self.by_row, name=self.name)
-        if not _nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]]):
-            raise ParameterError(
-                self.name,
-                "different when it is called again with the same parameters",
-                "the same readings each time: no random numbers (declare the noise instead), no state kept between "
-                "calls",
-            )
+        same = _nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]])
+        no_state = "no random numbers (declare the noise instead), no state kept between calls"
+        found = "different when it is called again with the same parameters"
+        require(same, self.name, found, f"the same readings each time: {no_state}")
 
     def __call__(self, parameters: Values, columns: Columns, *, strict: bool = False) -> FloatArray:
         """Simulate parameters (n_samples, 1 or n_points) over columns (n_points,) or (n_samples, n_points).
@@ -413,9 +409,8 @@ def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], 
             return np.array(np.broadcast_to(readings, wanted))
         except ValueError:
             pass
-    one = "for each row"
-    if len(wanted) > 1:
-        one = "for each sample and row: it is called with parameters (n_samples, 1), as vectorized = True says"
+    together = "for each sample and row: it is called with parameters (n_samples, 1), as vectorized = True says"
+    one = together if len(wanted) > 1 else "for each row"
     raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")
 
 

@@ -18,7 +18,7 @@ from probewise._words import count_with_noun
 from probewise.effects import EFFECTS, Effect
 from probewise.effects.noise import dropouts, noise_of_runs, noise_per_run, random_walk
 from probewise.effects.noise_distribution import PredictiveMixture, RecordedBefore
-from probewise.errors import DoubtfulResultWarning, ParameterError
+from probewise.errors import DoubtfulResultWarning, ParameterError, require
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.recordings.plan import Plan
@@ -259,9 +259,8 @@ def _recorded_before(
 
 
 def _first_times(table: RunTable) -> dict[str, float]:
-    return {
-        name: float(table.time_s[rows].min()) for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True)
-    }
+    each = zip(table.scan_names, table.rows_by_scan(), strict=True)
+    return {name: float(table.time_s[rows].min()) for name, rows in each}
 
 
 def _note_on_runs_started_again(fitted: FittedSystem, table: RunTable) -> tuple[str, ...]:
@@ -376,15 +375,15 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
             there = f"the table has {', '.join(table.columns)}"
             allowed = f"numbers in this column, which an effect of the model reads; {there}"
             raise ParameterError(f"column {min(lacking)!r}", "missing or without numbers", allowed)
-    for name in fitted.effects:
-        if name not in forms and name not in EFFECTS and name not in (random_walk.name, noise_per_run.name):
-            raise ParameterError("effects", name, "an effect that this version knows; diagnose again with it")
     seen = () if known is None else known.table.scan_names
     own: dict[str, Callable[[], Any]] = {
         **EFFECTS,
         random_walk.name: random_walk,
         noise_per_run.name: lambda: noise_of_runs(tuple(dict.fromkeys((*seen, *table.scan_names)))),
     }
+    for name in fitted.effects:
+        is_known = name in forms or name in own
+        require(is_known, "effects", name, "an effect that this version knows; diagnose again with it")
     return [forms[name] if name in forms else own[name]() for name in fitted.effects]
 
 
@@ -425,8 +424,9 @@ def _chain_samples_and_whether_drawn(
             continue
         is_drawn, prior = True, system.marginals.get(name)
         effect = next((own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}.")), None)
-        if prior is None and effect is None:  # its effect, bound to the recording again, has other parameters
-            raise ParameterError("names", fitted.names, f"all parameters of the effects; {name} is missing")
+        # Otherwise its effect, bound to the recording again, has other parameters.
+        is_known = prior is not None or effect is not None
+        require(is_known, "names", fitted.names, f"all parameters of the effects; {name} is missing")
         of = f"{effect}." if prior is None else f"{name.split('[')[0]}["
         known = fitted.samples[:, [j for own, j in at.items() if own.startswith(of)]]
         if prior is None:

@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.effects import Effect
-from probewise.errors import ParameterError, ProbewiseError
+from probewise.errors import ParameterError, ProbewiseError, require
 from probewise.priors import Marginal, Product
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
@@ -94,16 +94,13 @@ class System:
             every one.
         """
         declared, taken = simulator.noise.sd, (simulator.reading, simulator.time, simulator.run)
-        if isinstance(declared, str) and declared not in table.covariates:
-            allowed = f"a number, or a column of numbers: {', '.join(table.covariates)}"
-            raise ParameterError('noise["sd"]', declared, allowed)
+        is_sd = not isinstance(declared, str) or declared in table.covariates
+        require(is_sd, 'noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}")
+        settable = ", ".join(name for name in table.columns if name not in taken)
         for name in simulator.controls:
-            if name not in table.columns:
-                settable = ", ".join(name for name in table.columns if name not in taken)
-                raise ParameterError("controls", name, f"a column that can be set: {settable}")
-        if not columns_without_reading(simulator, table):
-            allowed = "a column besides the reading, such as the time or the number of each row"
-            raise ParameterError("columns", list(table.columns), allowed)
+            require(name in table.columns, "controls", name, f"a column that can be set: {settable}")
+        allowed = "a column besides the reading, such as the time or the number of each row"
+        require(columns_without_reading(simulator, table), "columns", list(table.columns), allowed)
         bare = cls(simulator, table.scan_names)
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])
@@ -153,11 +150,9 @@ class System:
                 wrong = wrong or error
         if not readings and wrong is not None:
             raise user_function_error("rates", wrong, self.simulator, columns) from wrong
-        if not np.isfinite(readings).any():
-            found = f"not finite at any of the {len(self.starts)} points of the prior that were tried"
-            raise ParameterError(
-                "rates, observe", found, "finite states and readings: narrower priors or a shorter max_step_s"
-            )
+        found = f"not finite at any of the {len(self.starts)} points of the prior that were tried"
+        allowed = "finite states and readings: narrower priors or a shorter max_step_s"
+        require(np.isfinite(readings).any(), "rates, observe", found, allowed)
 
     @cached_property
     def marginals(self) -> dict[str, Marginal]:
@@ -483,6 +478,5 @@ def _cost_of_integration(system: System, table: RunTable) -> float:
 
 
 def _has_affordable_steps(system: System, table: RunTable) -> bool:
-    """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
     steps = system.steps(table)
     return bool(steps.n_steps.sum() <= _MOST_STEPS + len(steps.row_by_position_and_run))

@@ -160,27 +160,15 @@ def _solve_all_steps(
     """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known.
 
     With the solution come up to eight converged samples that are far from the trajectories they began from, each with
-    its last Jacobian, as of `_bands_of_jacobian`, where one was computed.
+    its last Jacobian, as of `jacobian_bands`, where one was computed.
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
-    _iterate_with_shared_jacobians(search, known, nearest)
-    # A chord that led away is no better a start than the trajectory that it began from.
-    astray = search.active_mask & ~(search.rate < 1)
-    search.states[:, astray, 1:] = guess[:, astray, 1:]
-    search.change[~search.done] = np.inf
-    bands = _iterate_with_own_jacobians(search)
-    far = search.done & (_largest_relative_change(search.states - guess, guess) > _FAR)
-    return search, {k: [bands[k]] if k in bands else [] for k in np.flatnonzero(far)[:_MOST_NEW].tolist()}
-
-
-def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
-    """Take up to four chord iterations, each sample with the Jacobian of the known trajectory nearest to it."""
-    for _ in range(_CHORDS):
+    for _ in range(_CHORDS):  # each sample with the Jacobian of the known trajectory nearest to it
         active = search.active_mask & ((search.rate < _SLOW) | ~np.isfinite(search.change))
         samples = np.flatnonzero(active)
         if not samples.size:
-            return
+            break
         missed = search.step_residuals(samples)
         correction = np.empty_like(missed)
         for number in np.unique(nearest[samples]).tolist():
@@ -191,14 +179,14 @@ def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTr
             correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
         search.apply_correction(samples, correction)
         far = ~(search.change < _FAR)
-        if samples.size == len(nearest) and far.sum() * search.steps.n_runs > _FEW_FAR:
+        if samples.size == len(nearest) and far.sum() * steps.n_runs > _FEW_FAR:
             search.possible &= ~far
-
-
-def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
-    """Take up to eight Newton iterations of samples not yet converged; return their last Jacobians by sample index."""
+    # A chord that led away is no better a start than the trajectory that it began from.
+    astray = search.active_mask & ~(search.rate < 1)
+    search.states[:, astray, 1:] = guess[:, astray, 1:]
+    search.change[~search.done] = np.inf
     last: dict[int, FloatArray] = {}
-    for k in range(_NEWTONS):
+    for k in range(_NEWTONS):  # each sample with its own Jacobian
         if k == _HOPELESS:
             search.possible &= search.change < _SLOW
         samples = np.flatnonzero(search.active_mask)
@@ -208,7 +196,8 @@ def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
         correction = _solved_corrections(np.concatenate(bands), search.step_residuals(samples), shared=False)
         last |= dict(zip(samples.tolist(), bands, strict=True))
         search.apply_correction(samples, correction)
-    return last
+    far = search.done & (_largest_relative_change(search.states - guess, guess) > _FAR)
+    return search, {k: [last[k]] if k in last else [] for k in np.flatnonzero(far)[:_MOST_NEW].tolist()}
 
 
 @dataclass(eq=False)
@@ -256,15 +245,23 @@ class _NewtonState:
         return self.states_at_step_ends(samples, states) - states[:, :, 1:]
 
     def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
-        """Return samples' Jacobians at states (n_states, n, n_steps + 1, n_runs), each as of `_bands_of_jacobian`."""
-        at_end, columns = self.states_at_step_ends(samples, states), []
-        for values in states:
+        """Return samples' Jacobians of the equations of all steps, as bands, (n_unknowns, 2 n_states) each.
+
+        They are those at states (n_states, n, n_steps + 1, n_runs). Column k holds the k-th subdiagonal; the diagonal
+        is 1 throughout, and column 0 is not used. Unknowns are ordered by run, then by step, then by state.
+        """
+        at_end = self.states_at_step_ends(samples, states)
+        n_states, n, n_steps, n_runs = at_end.shape
+        out = np.zeros((n, n_runs, n_steps, n_states, 2 * n_states))
+        for j, values in enumerate(states):
             nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
             before = values.copy()
             values += nudge
-            columns.append((self.states_at_step_ends(samples, states) - at_end) / nudge)
+            slopes = (self.states_at_step_ends(samples, states) - at_end) / nudge
             values[:] = before
-        return _bands_of_jacobian(np.stack(columns, axis=1))
+            for i in range(n_states):
+                out[:, :, :-1, j, n_states + i - j] = -slopes[i, :, 1:].transpose(0, 2, 1)
+        return list(out.reshape(n, -1, 2 * n_states))
 
     def apply_correction(self, samples: IntArray, correction: FloatArray) -> None:
         """Add a correction (n_states, n, n_steps, n_runs) to samples' states, and mark those that have converged."""
@@ -282,21 +279,6 @@ def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArr
     """Return each sample's largest change of a state, relative to that state's largest absolute value, (n_samples,)."""
     size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
     return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
-
-
-def _bands_of_jacobian(slopes: FloatArray) -> list[FloatArray]:
-    """Return each sample's Jacobian of the equations of all steps, as bands, (n_unknowns, 2 n_states).
-
-    Column k holds the k-th subdiagonal; the diagonal is 1 throughout, and column 0 is not used. `slopes` (n_states,
-    n_states, n_samples, n_steps, n_runs) are derivatives of a step's end by its beginning. Unknowns are ordered by run,
-    then by step, then by state.
-    """
-    n_states, _, n_samples, n_steps, n_runs = slopes.shape
-    out = np.zeros((n_samples, n_runs, n_steps, n_states, 2 * n_states))
-    for i in range(n_states):
-        for j in range(n_states):
-            out[:, :, :-1, j, n_states + i - j] = -slopes[i, j, :, 1:].transpose(0, 2, 1)
-    return list(out.reshape(n_samples, -1, 2 * n_states))
 
 
 def _solved_corrections(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:

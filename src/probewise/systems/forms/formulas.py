@@ -214,25 +214,18 @@ def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _Scaled
 
 
 def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
-    own = about.system.simulator
-    columns = _complete_columns(about)
+    reading, time, columns = about.system.simulator.reading, about.table.time, _complete_columns(about)
     shapes = [term for name in columns for term in _terms_of_column(name)]
-    if about.table.has_varying_time and about.table.time is not None:
-        columns[about.table.time] = about.table.time_s
+    if about.table.has_varying_time and time is not None:
+        columns[time] = about.table.time_s
     variables = [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
-    level = _scaled_variable(own.reading, about.predicted, centred=True)
-    known: list[FloatArray] = []
-    for term in [*_terms_of_variables([*variables, level]), *shapes]:
+    level = _scaled_variable(reading, about.predicted, centred=True)
 
-        def change(value: FloatArray, table: RunTable, a: Any, term: _Term = term) -> Any:
-            def look_up(name: str) -> Any:
-                return value if name == own.reading else table.time_s if name == table.time else table.covariates[name]
+    def look_up(value: Any, rows: RunTable, name: str) -> Any:
+        return value if name == reading else rows.time_s if name == rows.time else rows.covariates[name]
 
-            return a * term.evaluate(look_up)
-
-        if _add_if_new(change(about.predicted, about.table, np.ones(())), known):
-            along = _covariates_of_term(about, "reading", term)
-            yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, change, along)
+    terms = [*_terms_of_variables([*variables, level]), *shapes]
+    return _forms_of_terms(about, terms, look_up, (about.predicted, about.table))
 
 
 def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -273,43 +266,43 @@ def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if varies(values)]
     columns = {name: values for name, values in _complete_columns(about).items() if name not in states}
     variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
-    rate = trial_rate(about, state)
-    known: list[FloatArray] = []
-    for term in _terms_of_variables(variables):
-        if term.text == f"sign({state})":
-            continue  # dry friction, which has a name
+    # Dry friction has a name.
+    terms = [term for term in _terms_of_variables(variables) if term.text != f"sign({state})"]
 
-        def change(s: Any, u: Any, a: Any, term: _Term = term) -> Any:
-            return a * term.evaluate(lambda name: s[name] if name in s else u[name])
+    def look_up(s: Any, u: Any, name: str) -> Any:
+        return s[name] if name in s else u[name]
 
-        shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
-        if _add_if_new(shape, known):
-            guess, along = rate / float(np.sqrt(np.mean(shape**2))), _covariates_of_term(about, "rate", term)
-            yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, change, along, guess=guess, state=state)
+    return _forms_of_terms(about, terms, look_up, (states, about.table.covariates), state)
 
 
-def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
-    """Append a term's centred values at the rows to `known` unless infinite, constant or collinear; say if it was."""
-    if not np.isfinite(shape).all():
-        return False
-    centred = shape - shape.mean()
-    size = float(np.linalg.norm(centred))
-    if size <= 1e-9 * float(np.linalg.norm(shape)):
-        return False
-    own = centred / size
-    if any(abs(float(own @ other)) > _SAME for other in known):
-        return False
-    known.append(own)
-    return True
+def _forms_of_terms(
+    about: ReferenceFit, terms: list[_Term], look_up: Callable[..., Any], at_rows: tuple[Any, Any], state: str = ""
+) -> Iterator[Form]:
+    """Yield terms of the reading or the rate of a state, unless infinite, constant or collinear with an earlier one.
 
-
-def _covariates_of_term(about: ReferenceFit, side: str, term: _Term) -> tuple[str, ...]:
-    """Return the covariates along which a term's variables show: "level", "time", a state's or a column's."""
+    `look_up` finds a variable by its name in two values that an act gets, of which `at_rows` are those of the fit.
+    """
     reading, time = about.system.simulator.reading, about.table.time
-    states = [state for state in about.states if side == "rate" or state == reading]
-    known = {str(time): "time", reading: "level"} | {state: f"state:{state}" for state in states}
-    names = dict.fromkeys(variable.name for variable in term.variables)
-    return tuple(known.get(name) or covariate_of_column(name) for name in names)
+    states = [name for name in about.states if state or name == reading]
+    along = {str(time): "time", reading: "level"} | {name: f"state:{name}" for name in states}
+    known: list[FloatArray] = []
+    for term in terms:
+
+        def change(one: Any, other: Any, a: Any, term: _Term = term) -> Any:
+            return a * term.evaluate(lambda own: look_up(one, other, own))
+
+        shape = np.asarray(change(*at_rows, 1.0))
+        if not np.isfinite(shape).all():
+            continue
+        centred = shape - shape.mean()
+        size = float(np.linalg.norm(centred))
+        if size <= 1e-9 * float(np.linalg.norm(shape)) or any(abs(centred @ other) > _SAME * size for other in known):
+            continue
+        known.append(centred / size)
+        guess = trial_rate(about, state) / float(np.sqrt(np.mean(shape**2))) if state else None
+        names = dict.fromkeys(variable.name for variable in term.variables)
+        covariates = tuple(along.get(name) or covariate_of_column(name) for name in names)
+        yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, change, covariates, guess=guess, state=state)
 
 
 def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:

@@ -283,27 +283,41 @@ def modulations_over_rows(about: ReferenceFit) -> dict[str, Modulation]:
     return {**drift, "step": change_point_step_modulation(about), **per_run}
 
 
-def sinusoid_modulation(about: ReferenceFit) -> Modulation:
-    """Return the modulation a sin(2 pi hz t + phase), all three free; hz per unit of time, t from its origin."""
+def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highest: float = 0.0) -> dict[str, Any]:
+    """Return what `ReferenceFit.form` takes of a wave a sin(2 pi hz t + phase), t from its origin.
+
+    `frequencies` are those of its bank, (n_trial,), rising; its own may be as high as `highest`.
+    """
     table, time_unit = about.table, about.time_unit
-    origin, frequencies = origin_of_column(table.time_s), trial_frequencies_in_time(about)
+    prior = frequency_prior(np.append(frequencies, max(highest, float(frequencies[-1]))))
+    return {
+        "parameters": {"a": (POSITIVE, unit), "hz": (prior, f"1/{time_unit}"), "phase": (PHASE, "rad")},
+        "covariates": ("time",),
+        "entries": sine_and_cosine_entries(1.0, frequencies),
+        "kind": WaveEffect,
+        "counted_from": origin_in_words(table.time, origin_of_column(table.time_s), time_unit),
+    }
+
+
+def sinusoid_modulation(about: ReferenceFit) -> Modulation:
+    """Return the modulation by a wave whose frequency the residuals of the fit may suggest."""
+    time_unit, origin, frequencies = (
+        about.time_unit,
+        origin_of_column(about.table.time_s),
+        trial_frequencies_in_time(about),
+    )
     suggested, highest = residual_peaks(about, frequencies)
-    prior = frequency_prior(np.append(frequencies, highest))
     return Modulation(
         lambda theta, rows: np.asarray(
             theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3])
         ),
         lambda what, unit: {
-            "parameters": {"a": (POSITIVE, unit), "hz": (prior, f"1/{time_unit}"), "phase": (PHASE, "rad")},
-            "covariates": ("time",),
             "says": lambda mean, sd: (
                 f"{what} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], unit)} and a period of "
                 f"{period_with_sd(mean[1], sd[1], time_unit)}"
             ),
-            "entries": sine_and_cosine_entries(1.0, frequencies),
-            "kind": WaveEffect,
-            "counted_from": origin_in_words(table.time, origin, time_unit),
             "suggested": suggested,
+            **declared_wave(about, frequencies, unit, highest),
         },
     )
 

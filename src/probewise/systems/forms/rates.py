@@ -11,27 +11,22 @@ import numpy as np
 from probewise._arrays import FloatArray, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
-    PHASE,
     Declared,
     Fixed,
-    WaveEffect,
     acting,
     in_words,
-    sine_and_cosine_entries,
     single_column_bank,
 )
 from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
-    frequency_prior,
+    declared_wave,
     max_n_trial_frequencies,
-    origin_in_words,
     origin_of_column,
     trial_frequencies_in_time,
 )
 from probewise.systems.forms.reference import (
     AMPLITUDE,
-    POSITIVE,
     Form,
     ReferenceFit,
     clipping_between,
@@ -108,19 +103,9 @@ def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Form]:
         of = f"an amplitude of {size} per {per} and a period of {period}"
         return f"the rate of {state} lacks a sinusoidal term with {of}"
 
-    prior = frequency_prior(frequencies)
-    yield from about.form(
-        f"periodic_forcing:{state}",
-        Stage.RATE,
-        {"a": (POSITIVE, f"{state} per {per}"), "hz": (prior, f"1/{per}"), "phase": (PHASE, "rad")},
-        ("time",),
-        act,
-        says,
-        sine_and_cosine_entries(1.0, frequencies),
-        guess=trial_rate(about, state),
-        kind=WaveEffect,
-        counted_from=origin_in_words(about.table.time, origin, per),
-    )
+    own = declared_wave(about, frequencies, f"{state} per {per}")
+    name = f"periodic_forcing:{state}"
+    yield from about.form(name, Stage.RATE, act=act, says=says, guess=trial_rate(about, state), **own)
 
 
 def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import math
+import pkgutil
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -348,8 +348,8 @@ class LightEffect:
     reads: tuple[str, ...] = ()
     is_absorbed_by_ssf: Callable[[Plan], bool] = lambda plan: False
 
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str, str]]:
-        return _attribute, (self.build.__module__, self.build.__name__)
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+        return pkgutil.resolve_name, (f"{self.build.__module__}:{self.build.__name__}",)
 
     def for_extent(self, extent: Extent) -> Effect | None:
         """Bind the effect to a recording, with a prior at its scales; None where the recording cannot show it."""
@@ -430,10 +430,6 @@ class LightEffect:
             change_points=points,
             is_thinned=is_thinned,
         )
-
-
-def _attribute(module: str, name: str) -> Any:
-    return getattr(importlib.import_module(module), name)
 
 
 def _effect_there(kind: LightEffect, of: Extent, scans: tuple[str, ...]) -> Effect:

@@ -482,24 +482,9 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
 
     def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
-
-        def with_halo_appended(own: FloatArray, halo: FloatArray) -> FloatArray:
-            n_gaussians = max(own.shape[2], value.weight.shape[2])
-            shape = (*np.broadcast_shapes(own.shape[:2], halo.shape[:2]), n_gaussians)
-            return np.concatenate([np.broadcast_to(own, shape), np.broadcast_to(halo, (*shape[:2], 1))], axis=2)
-
-        def mixture_mean(mean: FloatArray) -> FloatArray:
-            return np.asarray(np.sum(value.weight * mean, axis=2, keepdims=True))
-
-        return replace(
-            value,
-            weight=with_halo_appended((1 - share) * value.weight, share),
-            u_mm=with_halo_appended(value.u_mm, mixture_mean(value.u_mm)),
-            v_mm=with_halo_appended(value.v_mm, mixture_mean(value.v_mm)),
-            var_u=with_halo_appended(value.var_u, variance),
-            var_v=with_halo_appended(value.var_v, variance),
-            cov_uv=with_halo_appended(value.cov_uv, np.zeros((1, 1, 1))),
-        )
+        u_mm, v_mm = (np.sum(value.weight * mean, axis=2, keepdims=True) for mean in (value.u_mm, value.v_mm))
+        more = Footprint(share, u_mm, v_mm, variance, variance, np.zeros((1, 1, 1)))
+        return _with_more_gaussians(value, (1 - share) * value.weight, more)
 
     return kind.bind(
         of,
@@ -511,6 +496,20 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
             factors=(100,),
         ),
     )
+
+
+def _with_more_gaussians(value: Footprint, weight: FloatArray, more: Footprint) -> Footprint:
+    """Return a footprint, its Gaussians with other weights, and more of them beside these."""
+
+    def joined(own: FloatArray, added: FloatArray) -> FloatArray:
+        shape = np.broadcast_shapes(own.shape[:2], added.shape[:2])
+        sizes = max(own.shape[2], weight.shape[2]), max(added.shape[2], more.weight.shape[2])
+        return np.concatenate(
+            [np.broadcast_to(a, (*shape, n)) for a, n in zip((own, added), sizes, strict=True)], axis=2
+        )
+
+    moments = map(joined, value.moments, more.moments)
+    return Footprint(joined(weight, more.weight), *moments, value.brightness)
 
 
 @light_effect("edge_shadow", Stage.SEEN, "shadows along the edges", ("edge_distance",))
@@ -534,11 +533,7 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
     typical, narrowest_mm, widest_mm = 0.01, 0.01 * of.length_mm, of.length_mm / 3
 
     def act(value: View, theta: FloatArray, plan: Plan) -> View:
-        everywhere = (1, len(plan))
-        x_mm, y_mm = (
-            np.broadcast_to(place, np.broadcast_shapes(place.shape, everywhere))
-            for place in (value.poses.x_mm, value.poses.y_mm)
-        )
+        x_mm, y_mm = (np.broadcast_to(a, (len(a), len(plan))) for a in (value.poses.x_mm, value.poses.y_mm))
         parts = [
             (rows, edge_distance(value.regions[name], x_mm[:, rows], y_mm[:, rows]))
             for name, rows in plan.rows_by_pattern()
@@ -580,22 +575,11 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
     typical, farthest_mm = 0.02, 0.5 * of.length_mm
 
     def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        share = np.clip(theta[:, :1, None], 0.0, 1.0)
-        turn = plan.orientation_rad[None, :, None]
-        dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
-        shapes = {"var_u": value.var_u, "var_v": value.var_v, "cov_uv": value.cov_uv}
-
-        def doubled(first: FloatArray, second: FloatArray) -> FloatArray:
-            shape = np.broadcast_shapes(first.shape, second.shape)
-            return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)
-
-        return replace(
-            value,
-            weight=doubled(value.weight * (1 - share), value.weight * share),
-            u_mm=doubled(value.u_mm, value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy),
-            v_mm=doubled(value.v_mm, value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy),
-            **{name: doubled(own, own) for name, own in shapes.items()},
-        )
+        share, dx, dy = np.clip(theta[:, :1, None], 0.0, 1.0), theta[:, 1:2, None], theta[:, 2:3, None]
+        c, s = np.cos(plan.orientation_rad[None, :, None]), np.sin(plan.orientation_rad[None, :, None])
+        u_mm, v_mm = value.u_mm + c * dx + s * dy, value.v_mm - s * dx + c * dy
+        more = replace(value, weight=value.weight * share, u_mm=u_mm, v_mm=v_mm)
+        return _with_more_gaussians(value, value.weight * (1 - share), more)
 
     angles, reach = 2 * math.pi * np.arange(_ANGLES) / _ANGLES, Uniform(-farthest_mm, farthest_mm)
     far = farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]

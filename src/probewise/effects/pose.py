@@ -40,10 +40,6 @@ _ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of 
 _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
 
 
-def _always(plan: Plan) -> bool:
-    return True
-
-
 def _moved(poses: Poses, dx_mm: FloatArray, dy_mm: FloatArray) -> Poses:
     return replace(poses, x_mm=poses.x_mm + dx_mm, y_mm=poses.y_mm + dy_mm)
 
@@ -76,8 +72,7 @@ def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
     """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        x, y = (theta[:, :1] / 2 * side for side in _side_of_each_axis(plan))
-        return replace(value, x_mm=value.x_mm - x, y_mm=value.y_mm - y)
+        return _moved(value, *(-(theta[:, :1] / 2) * side for side in _side_of_each_axis(plan)))
 
     return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
 
@@ -114,7 +109,11 @@ def position_scale(kind: LightEffect, of: Extent) -> Effect:
 
 
 @light_effect(
-    "orientation_error", Stage.POSE, "a wrong sensor angle in all scans", ("orientation",), is_absorbed_by_ssf=_always
+    "orientation_error",
+    Stage.POSE,
+    "a wrong sensor angle in all scans",
+    ("orientation",),
+    is_absorbed_by_ssf=lambda plan: True,
 )
 def orientation_error(kind: LightEffect, of: Extent) -> Effect:
     """The sensor is turned by deg more than was commanded, in all scans, anticlockwise: its SSF absorbs this."""

@@ -48,11 +48,6 @@ _N_VOUCHING, _MISSED, _HIGHER = 300, 0.2, 2.0
 _WHOLE = np.r_[1:6, -2, -1]  # columns of place and size of the whole footprint and levels
 
 
-def has_uniform_light(prior: SSFPrior) -> bool:
-    """Return whether a Gaussian's light is uniform from 0, as draws about peaks require."""
-    return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class _NearPosterior:
     """A prior near the posterior: a Student-t of place, size and levels about each peak; the rest as in the prior.
@@ -184,8 +179,12 @@ def fit_orders_quickly(
     n_usable = int(problems.recording.usable.sum())
     if n_usable < _LEAST_READINGS:
         return {}, f"searched in full: {n_usable} usable readings, fewer than {_LEAST_READINGS}"
-    if not all(has_uniform_light(problems.prior_of(n)) for n in range(1, max(orders) + 1)):
-        return {}, "searched in full: the prior of a Gaussian's light is not uniform from 0"
+    priors = [problems.prior_of(n) for n in range(1, max(orders) + 1)]
+    if any(prior.unit_mass_mm2 is None or prior.amplitude != Uniform(0.0, 1.0) for prior in priors):
+        return (
+            {},
+            "searched in full: the prior of a Gaussian's light is not uniform from 0",
+        )  # as draws about peaks need
     alone = problems.problem(1)
     found: dict[int, Weighted] = {}
     log_weight_at: dict[int, Callable[[FloatArray], FloatArray]] = {}

@@ -177,7 +177,7 @@ def gain_loss(kind: LightEffect, of: Extent) -> Effect:
             "the first minute of this: the lamp or its battery changes"
         )
 
-    return replace(cast(Effect, gain_drift.build(kind, of)), act=act, says=says)
+    return replace(cast(Effect, gain_drift.build(kind, of)), apply=act, sentence=says)
 
 
 @light_effect("dark_level", Stage.OFFSET, "another dark level than at the calibration", ("level",))

@@ -335,12 +335,19 @@ class RegionsAndPoses:
 
     @cached_property
     def rows_and_regions_by_orientation(self) -> list[tuple[IntArray, Region]]:
-        """As `rows_and_regions`, but split by orientation."""
-        return [
-            (group, region)
-            for rows, region in self.rows_and_regions
-            for group in _split_by_orientation(rows, self.poses.orientation_rad)
-        ]
+        """As `rows_and_regions`, but split by orientation, where that does not depend on the sample.
+
+        Moments of the footprint in the lab frame are then computed once per group instead of once per reading.
+        """
+        turn, out = self.poses.orientation_rad, list[tuple[IntArray, Region]]()
+        for rows, region in self.rows_and_regions:
+            groups = [rows]
+            if len(turn) == 1 < turn.shape[1]:
+                distinct, which = np.unique(turn[0, rows], return_inverse=True)
+                if len(distinct) <= max(8, len(rows) // 8):
+                    groups = [rows[which == k] for k in range(len(distinct))]
+            out += [(group, region) for group in groups]
+        return out
 
 
 def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
@@ -430,16 +437,3 @@ def region_named(regions: Mapping[str, Region], name: str) -> Region:
         return regions[name]
     except KeyError:
         raise ParameterError("pattern", name, how_to_describe_pattern(name, list(regions))) from None
-
-
-def _split_by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:
-    """Split rows into groups that share an orientation, where that does not depend on the sample.
-
-    Moments of the footprint in the lab frame are then computed once per group instead of once per reading.
-    """
-    if orientation_rad.shape[0] > 1 or orientation_rad.shape[1] == 1:
-        return [rows]
-    distinct, which = np.unique(orientation_rad[0, rows], return_inverse=True)
-    if len(distinct) > max(8, len(rows) // 8):
-        return [rows]
-    return [rows[which == k] for k in range(len(distinct))]

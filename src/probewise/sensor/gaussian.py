@@ -218,22 +218,13 @@ def probabilities_beyond_corner_and_sides(
 
 @mean_albedo_under_one_gaussian.register
 def _mean_albedo_over_quadrant(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    corner, direction = region.corner_mm, region.direction
-    share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
-    return _albedo_by_share_inside(region.outside, region.inside, share)
-
-
-def mass_in_quadrant(
-    corner_x: FloatArray, corner_y: FloatArray, dx: FloatArray, dy: FloatArray, gaussian: LabGaussian
-) -> FloatArray:
-    """Return the mass of Gaussians in quadrants, which extend from a corner towards dx, dy, 1 or -1; arrays broadcast.
-
-    The mass is a probability of the bivariate normal, reflected so that the inside lies to the upper right.
-    """
+    """Return the mean albedo over a quadrant: a bivariate normal's mass, the inside reflected to the upper right."""
+    (corner_x, corner_y), (dx, dy) = region.corner_mm.T[:, :, None], region.direction.T[:, :, None]
     sd_x, sd_y = np.sqrt(gaussian.var_x), np.sqrt(gaussian.var_y)
     z1 = dx * (corner_x - gaussian.x_mm - gaussian.dx_mm) / sd_x
     z2 = dy * (corner_y - gaussian.y_mm - gaussian.dy_mm) / sd_y
-    return probabilities_beyond_corner_and_sides(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
+    share, *_ = probabilities_beyond_corner_and_sides(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))
+    return _albedo_by_share_inside(region.outside, region.inside, share)
 
 
 @mean_albedo_under_one_gaussian.register

@@ -151,7 +151,8 @@ def integrate_from_known_trajectories(
     assert states is not None
     motion = law_and_inputs(np.arange(1))[0]
     cost *= evaluations_per_step(motion, steps.method)
-    return dict(zip(motion.law.states, steps.states_at_rows(states), strict=True)), cost
+    at_rows = states[:, :, steps.n_steps_before_position[steps.position_by_row], steps.table.scan]
+    return dict(zip(motion.law.states, at_rows, strict=True)), cost
 
 
 def _solve_all_steps(

@@ -186,7 +186,7 @@ class Steps:
         """
         self.table.require_rising_time()
         by_run = self.table.rows_by_scan()
-        longest = max(len(rows) for rows in by_run)
+        longest = max(map(len, by_run))
         return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
 
     @cached_property
@@ -215,7 +215,7 @@ class Steps:
     @cached_property
     def _n_steps_and_method(self) -> tuple[IntArray, RungeKutta | Rosenbrock]:
         longest = self.gaps.max(axis=1, initial=0.0)
-        n_steps = np.asarray(np.maximum(np.ceil(longest / self.max_step - 1e-9), 1), dtype=np.int64)
+        n_steps = np.maximum(np.ceil(longest / self.max_step - 1e-9), 1).astype(np.int64)
         return (n_steps, RODAS) if self.stiff else cheapest_steps(n_steps)
 
     @property
@@ -244,10 +244,6 @@ class Steps:
         gap = self.gap_of_step
         share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps[gap]
         return np.repeat(share, self.n_runs), np.repeat(1.0 / self.n_steps[gap], self.n_runs)
-
-    def states_at_rows(self, states: FloatArray) -> FloatArray:
-        """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""
-        return np.asarray(states[:, :, self.n_steps_before_position[self.position_by_row], self.table.scan])
 
 
 @lru_cache(maxsize=16)

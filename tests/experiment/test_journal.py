@@ -208,7 +208,7 @@ def test_a_digest_tells_effects_by_name_origin_and_values_whatever_their_classes
     def digest(time_s=0.0, values=(0.02, 60.0), **changed):
         return value_digest(Known(replace(EFFECTS["gain_drift"](Origin(time_s)), **changed), values))
 
-    assert digest() == digest(act=lambda value, theta, plan: value, units=())
+    assert digest() == digest(apply=lambda value, theta, plan: value, units=())
     others = digest(time_s=1.0), digest(values=(0.02, 61.0)), digest(name="gain_jump")
     assert len({digest(), *others}) == 4
 

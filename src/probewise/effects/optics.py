@@ -503,13 +503,12 @@ def _with_more_gaussians(value: Footprint, weight: FloatArray, more: Footprint) 
 
     def joined(own: FloatArray, added: FloatArray) -> FloatArray:
         shape = np.broadcast_shapes(own.shape[:2], added.shape[:2])
-        sizes = max(own.shape[2], weight.shape[2]), max(added.shape[2], more.weight.shape[2])
-        return np.concatenate(
-            [np.broadcast_to(a, (*shape, n)) for a, n in zip((own, added), sizes, strict=True)], axis=2
-        )
+        first = np.broadcast_to(own, (*shape, max(own.shape[2], weight.shape[2])))
+        second = np.broadcast_to(added, (*shape, max(added.shape[2], more.weight.shape[2])))
+        return np.concatenate([first, second], axis=2)
 
-    moments = map(joined, value.moments, more.moments)
-    return Footprint(joined(weight, more.weight), *moments, value.brightness)
+    whole = Footprint(joined(weight, more.weight), *map(joined, value.moments, more.moments))
+    return replace(whole, brightness=value.brightness)
 
 
 @light_effect("edge_shadow", Stage.SEEN, "shadows along the edges", ("edge_distance",))

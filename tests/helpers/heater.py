@@ -58,6 +58,13 @@ SIMULATOR = dataclasses.replace(heater(), fingerprint="abc", source="heater.py")
 ABOUT = ReferenceFit(System.of(SIMULATOR, TABLE), TABLE, np.array([0.5, -0.4, 0.0, 0.2, -0.2]), 0.05)
 
 
+def known_model(simulator, values, known=None, *, sd=0.1, **more):
+    """A model of parameters that are known exactly, by name, those of an effect as "effect.parameter"."""
+    effects = tuple(dict.fromkeys(name.rpartition(".")[0] for name in values if "." in name))
+    samples = np.tile([*values.values()], (500, 1))
+    return FittedSystem(simulator, tuple(values), samples, np.full(500, sd), effects=effects, known=known, **more)
+
+
 def fitted(effects=(), *, seed=0):
     """Samples about a setting, with as many columns as the effects have parameters."""
     forms = bind_forms(ABOUT)

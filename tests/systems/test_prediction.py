@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from heater import ABOUT, SIMULATOR, fitted, runs
+from heater import ABOUT, SIMULATOR, fitted, known_model, runs
 from scipy.stats import norm
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
@@ -105,10 +105,8 @@ def _line_with(effect, **sizes):
     t = np.arange(40.0)
     table = RunTable({"t": t, "x": np.sin(t / 5) + 2, "room": 20 + np.cos(t / 7), "y": 3 * (np.sin(t / 5) + 2)}, "t")
     simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
-    samples = np.tile([3.0, *sizes.values()], (500, 1))
-    names = ("a", *(f"{effect}.{name}" for name in sizes))
-    known = StoredFit(table, table.columns["y"], 0.1)
-    return FittedSystem(simulator, names, samples, np.full(500, 0.1), effects=(effect,), known=known), table
+    values = {"a": 3.0, **{f"{effect}.{name}": size for name, size in sizes.items()}}
+    return known_model(simulator, values, StoredFit(table, table.columns["y"], 0.1)), table
 
 
 @pytest.mark.parametrize("column", [np.full(40, np.nan), np.array(["warm"] * 40)], ids=["empty", "texts"])
@@ -126,11 +124,8 @@ def test_a_column_named_like_a_state_is_not_needed_for_an_effect_on_the_state():
         {"a": 1.0, "b": 0.0}, lambda s, p, u: {"a": -p["k"] * s["a"], "b": p["k"] * s["a"]}, lambda s, p, u: s["b"]
     )
     simulator = Simulator("b", "mol", {"k": (0, 10)}, law=law, time="t")
-    samples, names = np.tile([1.0, 0.2], (500, 1)), ("k", "damping:a.a")
     known = StoredFit(table, 1 - a, 0.1, {"a": a, "b": 1 - a})
-    model = FittedSystem(
-        simulator, names, samples, np.full(500, 0.1), effects=("damping:a",), max_step=0.1, known=known
-    )
+    model = known_model(simulator, {"k": 1.0, "damping:a.a": 0.2}, known, max_step=0.1)
     found = predicted(model, RunTable({"t": t, "b": 1 - a}, "t"))
     np.testing.assert_allclose(found.mean, (1 - np.exp(-1.2 * t)) / 1.2, atol=1e-4)
 
@@ -173,17 +168,8 @@ def _step_without_a_time():
 
 def _model_with_a_step_at_a_row():
     about = _step_without_a_time()
-    simulator, table = about.system.simulator, about.table
-    names = ("a", *(f"offset_step.{name}" for name in bind_forms(about)["offset_step"].prior.names))
-    model = FittedSystem(
-        simulator,
-        names=names,
-        samples=np.tile([1.0, 2.0, _STEP_AT], (500, 1)),
-        noise_sd=np.full(500, 0.1),
-        effects=("offset_step",),
-        known=extract_stored_fit(about),
-    )
-    return model, table
+    values = {"a": 1.0, "offset_step.a": 2.0, "offset_step.at_row": _STEP_AT}
+    return known_model(about.system.simulator, values, extract_stored_fit(about)), about.table
 
 
 def test_a_step_at_a_row_is_there_in_the_recording_and_its_first_rows():
@@ -272,15 +258,7 @@ def test_a_column_with_a_colon_in_its_name_that_an_effect_reads_must_be_there():
     table = RunTable({"x": x[0], "room:c": x[1], "y": x[0] + x[1]})
     simulator = Simulator("y", "V", {"a": (-5, 5)}, simulate=lambda p, u: p["a"] + u["x"])
     about = ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
-    effect = "sensitivity:room:c"
-    model = FittedSystem(
-        simulator,
-        names=("a", f"{effect}.a"),
-        samples=np.tile([0.0, 1.0], (500, 1)),
-        noise_sd=np.full(500, 0.1),
-        effects=(effect,),
-        known=extract_stored_fit(about),
-    )
+    model = known_model(simulator, {"a": 0.0, "sensitivity:room:c.a": 1.0}, extract_stored_fit(about))
     np.testing.assert_allclose(predicted(model, table).mean, x[0] + x[1] - x[1].mean())
     with pytest.raises(ParameterError, match="room:c"):
         predicted(model, {"x": x[0]})
@@ -288,7 +266,7 @@ def test_a_column_with_a_colon_in_its_name_that_an_effect_reads_must_be_there():
 
 def test_a_row_that_no_sample_predicts_is_told():
     simulator = Simulator("y", "V", {"a": (0, 1)}, simulate=lambda p, u: p["a"] + np.log(u["x"]))
-    model = FittedSystem(simulator, names=("a",), samples=np.full((500, 1), 0.5), noise_sd=np.ones(500))
+    model = known_model(simulator, {"a": 0.5})
     with pytest.raises(ParameterError, match=r"simulate is 'no finite reading in 1 of 3 rows, first in row 4'"):
         predicted(model, {"x": [1.0, 2.0, -1.0]})
 
@@ -308,22 +286,19 @@ def test_a_prediction_over_longer_gaps_does_not_run_away_with_the_fastest_sample
 _DECAY = Law({"x": 8.0}, lambda s, p, u: {"x": -p["k"] * s["x"]})
 
 
-def _decaying(effects, known):
+def _decaying(known, **effects):
     """x' = -k x from 8, and an offset; a recording of the first half, from 0 to 1.9 s."""
     simulator = Simulator("x", "K", {"k": (0, 10)}, law=_DECAY, time="t", run="run")
     t = np.arange(0.0, 4.0, 0.1)
     whole = RunTable({"t": t, "x": 8 * np.exp(-0.5 * t), "run": np.full(40, "a")}, "t", "run")
     early = whole.take(t < 1.95)
-    names, samples = ["k", *(f"{name}.a" for name in effects)], [0.5, *(1.0 for _ in effects)]
     stored = StoredFit(early, early.columns["x"], 0.1, {"x": early.columns["x"]}) if known else None
-    draws = np.tile(samples, (500, 1))
-    model = FittedSystem(simulator, names, draws, np.full(500, 0.1), effects=effects, known=stored, max_step=0.1)
-    return model, whole
+    return known_model(simulator, {"k": 0.5, **effects}, stored, max_step=0.1), whole
 
 
 @pytest.mark.parametrize("rows", [slice(20, 40), slice(30, 35), slice(5, 12)], ids=["next", "later", "within"])
 def test_later_rows_of_a_recorded_run_go_on_from_its_recorded_state(rows):
-    model, whole = _decaying(("offset_drift",), known=True)
+    model, whole = _decaying(known=True, **{"offset_drift.a": 1.0})
     part = whole.take(np.arange(40)[rows])
     found = predicted(model, part.with_columns({"humidity": np.ones(len(part))}))
     np.testing.assert_allclose(found.mean, part.columns["x"] + part.time_s, atol=1e-5)
@@ -334,17 +309,14 @@ _RECORDED_ROWS = np.array([0, 1, 2, 3, 5, 6, 8, 9])  # two readings of the run a
 _SIGMA, _RHO, _STEP = 0.4, -0.6, 0.7
 
 
-def _flat(effects, **parameters):
+def _flat(**parameters):
     """A constant level of 3 and noise with a memory, known exactly; ten rows of run a, each a second, two missing."""
     simulator = Simulator("y", "K", {"level": (0, 10)}, lambda p, data: p["level"] + 0 * data["t"], time="t", run="run")
     t, readings = np.arange(10.0), np.full(10, np.nan)
     readings[_RECORDED_ROWS] = 3 + np.random.default_rng(RNG).normal(0, 1, len(_RECORDED_ROWS))
     recorded = RunTable({"t": t, "y": readings, "run": np.full(10, "a")}, "t", "run")
     stored = StoredFit(recorded, np.full(10, 3.0), _SIGMA)
-    samples = np.tile([3.0, *parameters.values()], (500, 1))
-    model = FittedSystem(
-        simulator, ("level", *parameters), samples, np.full(500, _SIGMA), effects=tuple(effects), known=stored
-    )
+    model = known_model(simulator, {"level": 3.0, **parameters}, stored, sd=_SIGMA)
     return model, readings[_RECORDED_ROWS] - 3
 
 
@@ -363,7 +335,7 @@ def _walking(rows):
 @pytest.mark.parametrize("first", [10, 13], ids=["next", "after three seconds without a row"])
 def test_noise_with_a_memory_is_predicted_given_the_recorded_residuals(effect, parameter, value, covariance, first):
     """The exact conditional distribution of jointly normal readings; of a run without recorded rows, the marginal."""
-    model, residuals = _flat([effect], **{f"{effect}.{parameter}": value})
+    model, residuals = _flat(**{f"{effect}.{parameter}": value})
     rows = np.arange(first, first + 6)
     after = predicted(model, {"t": rows.astype(float), "run": ["a"] * 6})
     both = covariance(np.append(_RECORDED_ROWS, rows))
@@ -379,7 +351,7 @@ def test_a_recorded_reading_that_may_be_wide_tells_less_of_a_walk():
     """One reading, narrow or wide: the walk after it has the moments of a mixture of two normal distributions."""
     share, times = 0.3, 8.0
     of = {"outliers.share": share, "outliers.size": times, "random_walk.sd_per_row": _STEP}
-    model, residuals = _flat(["outliers", "random_walk"], **of)
+    model, residuals = _flat(**of)
     one = model.known.table.with_columns({"y": np.append(model.known.table.columns["y"][0], np.full(9, np.nan))})
     model = dataclasses.replace(model, known=dataclasses.replace(model.known, table=one))
     found = predicted(model, {"t": [10.0, 11.0], "run": ["a", "a"]})
@@ -394,7 +366,7 @@ def test_a_recorded_reading_that_may_be_wide_tells_less_of_a_walk():
 
 
 def test_later_rows_are_said_to_start_again_where_the_model_has_no_recorded_rows():
-    model, whole = _decaying((), known=False)
+    model, whole = _decaying(known=False)
     found = predicted(model, whole.take(np.arange(20, 40)))
     np.testing.assert_allclose(found.mean[0], 8.0)
     assert "note: run a: started again at its first row here" in found.summary()

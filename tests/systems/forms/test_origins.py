@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from heater import known_model
 
 from probewise.diagnosis import diagnose_system
 from probewise.effects import name_without_copy_suffix
@@ -120,18 +121,9 @@ def test_what_counts_from_a_far_time_says_so_and_nothing_else_does(how, name):
 
 def test_a_model_keeps_the_origin_of_its_recording_for_other_tables_and_through_its_file():
     about = _about(EPOCH, 0.0, _function)
-    names = ("interference", "offset_drift")
-    forms = bind_forms(about)
-    columns = [*about.system.prior.names, *(f"{n}.{p}" for n in names for p in forms[n].prior.names)]
-    theta = np.array([1.0, 2.0, 0.5, 0.3, 0.4, 0.1])
-    model = FittedSystem(
-        about.system.simulator,
-        names=tuple(columns),
-        samples=np.tile(theta, (500, 1)),
-        noise_sd=np.full(500, 0.01),
-        effects=names,
-        known=extract_stored_fit(about),
-    )
+    values = {"offset": 1.0, "gain": 2.0, "interference.a": 0.5, "interference.hz": 0.3, "interference.phase": 0.4}
+    values |= {"offset_drift.a": 0.1}
+    model = known_model(about.system.simulator, values, extract_stored_fit(about), sd=0.01)
     later = _table(EPOCH + 1e5)  # its own origin would be another one
     since = later.columns["t_s"] - EPOCH
     expected = 1.0 + 2.0 * _DRIVE + 0.5 * np.sin(2 * np.pi * 0.3 * since + 0.4) + 0.1 * since
@@ -170,18 +162,10 @@ def test_a_recording_by_the_epoch_has_the_diagnosis_of_the_same_recording_from_0
             assert found[effects] == pytest.approx(probability, abs=2e-3)
 
 
-def _model(about, *effects):
-    forms = bind_forms(about)
-    parameters = [f"{name}.{p}" for name in effects for p in forms[name].prior.names]
-    theta = np.concatenate([[1.0, 2.0], *(forms[name].bank()[0, 0] for name in effects)])
-    return FittedSystem(
-        about.system.simulator,
-        names=("offset", "gain", *parameters),
-        samples=np.tile(theta, (500, 1)),
-        noise_sd=np.full(500, 0.01),
-        effects=effects,
-        known=extract_stored_fit(about),
-    )
+def _model(about, effect):
+    form = bind_forms(about)[effect]
+    own = {f"{effect}.{name}": value for name, value in zip(form.prior.names, form.bank()[0, 0], strict=True)}
+    return known_model(about.system.simulator, {"offset": 1.0, "gain": 2.0, **own}, extract_stored_fit(about), sd=0.01)
 
 
 @pytest.mark.parametrize(("shift", "far", "effect"), [(EPOCH, 0.0, "offset_drift"), (0.0, FAR, "periodic_error:drive")])

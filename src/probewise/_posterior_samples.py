@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,12 @@ class NamedSamples(ShowsItself):
     noise_sd: FloatArray
     effects: tuple[str, ...]
     absent: Mapping[str, BoolArray]
+
+    def rows_by_parameter(self, *statistics: str) -> list[dict[str, Any]]:
+        """Return a JSON object for each parameter: its name, and these of mean, sd, median and interval95, in order."""
+        ends = {name: list(own) for name, own in self.interval().items()}
+        known = {"mean": self.mean(), "sd": self.sd(), "median": self.median(), "interval95": ends}
+        return [{"name": name, **{each: known[each][name] for each in statistics}} for name in self.names]
 
     def require_sound_samples(self) -> None:
         """Make samples and noise sds read-only copies; raise an error if they do not fit the names and effects.

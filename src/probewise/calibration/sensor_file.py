@@ -266,24 +266,14 @@ class FittedSensor(NamedSamples):
 
     def to_json(self) -> str:
         """Return the sensor as strict JSON, format "sensor/1"."""
-        mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
+        mean, sd, rows = self.mean(), self.sd(), self.rows_by_parameter("mean", "sd", "median", "interval95")
         document = {
             "format": FORMAT,
             "version": self.version,
             "recording": {"fingerprint": self.fingerprint, "source": printable(self.source)},
             "instrumentation": asdict(self.instrumentation),
             "n_gaussians": self.n_gaussians,
-            "parameters": [
-                {
-                    "name": n,
-                    "unit": self.unit_of_parameter(n),
-                    "mean": mean[n],
-                    "sd": sd[n],
-                    "median": median[n],
-                    "interval95": list(interval[n]),
-                }
-                for n in self.names
-            ],
+            "parameters": [{"name": row["name"], "unit": self.unit_of_parameter(row["name"]), **row} for row in rows],
             "ssf": [asdict(quantity) for quantity in self.ssf_quantities()],
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),

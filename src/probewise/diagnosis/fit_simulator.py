@@ -296,15 +296,11 @@ def fit_json(fit: SystemFit) -> dict[str, Any]:
     """Convert a fit to the content of fit.json, format "fit/1"."""
     require_kind("fit", fit, SystemFit, "a SystemFit, as fit_simulator returns it")
     own = fit.fitted
-    interval, median, sd = own.interval(), own.median(), own.sd()
     return {
         "format": "fit/1",
         "simulator": {"source": own.simulator.source, "fingerprint": own.simulator.fingerprint},
         "recording": {"source": own.source, "fingerprint": own.recording, "readings": int(fit.recording.usable.sum())},
-        "parameters": [
-            {"name": name, "median": median[name], "sd": sd[name], "interval95": list(interval[name])}
-            for name in own.names
-        ],
+        "parameters": own.rows_by_parameter("median", "sd", "interval95"),
         "mode": own.mode(),
         "noise": {"unit": own.simulator.unit, "median": float(np.median(own.noise_sd))},
         "log_evidence": {"value" if key == "log_z" else key: value for key, value in asdict(fit.evidence).items()},

@@ -135,7 +135,6 @@ class FittedSystem(NamedSamples):
 
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""
-        mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
         document = {
             "format": FORMAT,
             "version": self.version,
@@ -148,10 +147,7 @@ class FittedSystem(NamedSamples):
                 "stiff": self.stiff,
             },
             "recording": {"fingerprint": self.recording, "source": printable(self.source)},
-            "parameters": [
-                {"name": n, "mean": mean[n], "median": median[n], "sd": sd[n], "interval95": list(interval[n])}
-                for n in self.names
-            ],
+            "parameters": self.rows_by_parameter("mean", "median", "sd", "interval95"),
             "effects": list(self.effects),
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},

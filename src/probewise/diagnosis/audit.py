@@ -688,7 +688,7 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     out |= {"offset_per_run": one_run, "gain_per_run": one_run, "nonlinearity": nothing, "saturation": nothing}
     out |= {"hysteresis": "the readings move one way only"}
     out |= dict.fromkeys(("lag", "delay", "settling", "interference"), timeless)
-    for column in (c for c in table.covariates if c not in (own.reading, own.noise.sd)):
+    for column in own.inputs(table.covariates):
         out |= {
             f"sensitivity:{column}": "the column does not vary",
             f"curve:{column}": "it has fewer than three values",

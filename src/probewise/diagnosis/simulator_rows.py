@@ -311,8 +311,7 @@ class SimulatorApparatus(Apparatus):
         table, own = self.about.table, self.system.simulator
         along = {"time": table.time_s} if table.has_varying_time else {"row": table.row_number}
         out = {**along, "level": predicted}
-        columns = {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
-        out |= {covariate_of_column(name): v for name, v in columns.items()}
+        out |= {covariate_of_column(name): v for name, v in own.inputs(table.covariates).items()}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
         out["previous"] = np.zeros(len(table))
         for rows in table.rows_by_scan():
@@ -348,7 +347,7 @@ class SimulatorApparatus(Apparatus):
 
     def settings_of(self, plan: Plan) -> FloatArray:
         table, own = cast(RunTable, plan), self.system.simulator
-        columns = [v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)]
+        columns = own.inputs(table.covariates).values()
         return np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1))
 
     def candidate_measurements(

@@ -54,7 +54,7 @@ def _labelled_covariates(fit: SystemFit) -> list[tuple[str, FloatArray]]:
     simulator, plan = fit.fitted.simulator, cast(RunTable, fit.recording.plan)
     time = f"{plan.time} ({simulator.time_unit})" if plan.has_varying_time else "row of the table"
     level = f"predicted {simulator.reading} ({unit_after_number(simulator.unit)})"
-    inputs = {name: v for name, v in plan.covariates.items() if name not in (simulator.reading, simulator.noise.sd)}
+    inputs = simulator.inputs(plan.covariates)
     varying = [pair for pair in inputs.items() if varies(pair[1])]
     return [(time, plan.time_s), (level, fit.predicted), *varying[:_MOST_INPUTS]]
 

@@ -350,8 +350,8 @@ def _filled_table_and_unpredictable_mask(
 
 def _interpolated_inputs(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
     """Return, by name, the columns with missing cells, except readings and their sd, interpolated within runs."""
-    columns = {k: v for k, v in table.covariates.items() if k not in (simulator.reading, simulator.noise.sd)}
-    return {name: table.interpolated_within_runs(v) for name, v in columns.items() if not np.isfinite(v).all()}
+    columns = simulator.inputs(table.covariates).items()
+    return {name: table.interpolated_within_runs(v) for name, v in columns if not np.isfinite(v).all()}
 
 
 def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:

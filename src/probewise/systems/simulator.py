@@ -224,6 +224,10 @@ class Simulator:
             require(name not in _TAKEN, "extra", name, allowed)
         object.__setattr__(self, "extra", own)
 
+    def inputs(self, columns: Columns) -> dict[str, NDArray[Any]]:
+        """Return columns by name without the reading and its declared sd."""
+        return {name: values for name, values in columns.items() if name not in (self.reading, self.noise.sd)}
+
 
 def table_for(simulator: Simulator, data: RunTable | Mapping[str, Any]) -> RunTable:
     """Build a simulator's table from columns by name (a dict of arrays, a DataFrame); return a RunTable as it is."""

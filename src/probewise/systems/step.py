@@ -207,11 +207,6 @@ class Steps:
         """Time from each position to the next, (n_places - 1, n_runs), in the unit of time."""
         return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
 
-    @property
-    def typical_gap(self) -> float:
-        """Median time between two rows of a run that are not at the same time; 1 without any."""
-        return float(np.median(self.gaps[self.gaps > 0])) if (self.gaps > 0).any() else 1.0
-
     @cached_property
     def _n_steps_and_method(self) -> tuple[IntArray, RungeKutta | Rosenbrock]:
         longest = self.gaps.max(axis=1, initial=0.0)

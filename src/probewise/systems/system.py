@@ -122,7 +122,7 @@ class System:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or Steps(table).typical_gap, stiff=stiff)
+        system = replace(bare, max_step=simulator.law.max_step_s or table.median_gap, stiff=stiff)
         system.require_working_law(table)
         return system
 
@@ -421,7 +421,7 @@ def with_converged_step(
         cost = _cost_of_integration(found, table)
     except ParameterError as error:
         found, cost = error, math.inf
-    stiff = replace(system, max_step=max(system.max_step, system.steps(table).typical_gap), stiff=True)
+    stiff = replace(system, max_step=max(system.max_step, table.median_gap), stiff=True)
     if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, table):
         try:
             return _halved_until_still(stiff, table, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)

@@ -125,12 +125,11 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
     readings = table.columns.get(simulator.reading)
     if table.has_varying_time or readings is None or readings.dtype != np.float64:
         return 1.0
-    inputs = [values for name, values in table.columns.items() if name not in (simulator.reading, simulator.noise.sd)]
     codes = [  # a number for each cell, the same for cells that are equal but for rounding
         np.where(np.isfinite(values), np.searchsorted(distinct_values(values), values, side="right"), 0)
         if values.dtype == np.float64
         else np.unique(values, return_inverse=True)[1]
-        for values in inputs
+        for values in simulator.inputs(table.columns).values()
     ]
     group = np.unique(np.stack([*codes, np.zeros(len(table), dtype=np.int64)]), axis=1, return_inverse=True)[1].ravel()
     there = np.flatnonzero(np.isfinite(readings))
@@ -331,8 +330,7 @@ class ReferenceFit:
     @cached_property
     def varying_columns(self) -> dict[str, FloatArray]:
         """Columns of numbers that vary, (n_points,), by name, except the reading and its declared sd."""
-        own = self.system.simulator
-        columns = {c: v for c, v in self.table.covariates.items() if c not in (own.reading, own.noise.sd)}
+        columns = self.system.simulator.inputs(self.table.covariates)
         return {name: values for name, values in columns.items() if varies(values)}
 
     @cached_property

@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, SSFPrior, calibrate, default_prior, paper_prior, problem_for
-from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
+from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import EvidenceChange, RoundSummary
 from probewise.recordings import Recording, fingerprint
@@ -103,8 +103,6 @@ def test_what_the_sensor_cannot_have_is_refused_before_the_search(
 
     with pytest.raises(ParameterError, match=message):
         calibrate(recording, prior=prior, quick=quick, rng=np.random.default_rng(1), **asked)
-    with pytest.raises(ShapeError, match="data_sets"):
-        problem_for(recording, default_prior(recording, 1), data_sets=np.zeros(3, dtype=int))
 
 
 @pytest.mark.slow

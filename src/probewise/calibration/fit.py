@@ -13,7 +13,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, own_arithmetic
+from probewise._arrays import FloatArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_whole, require_flag, require_like, require_rng
 from probewise.calibration.fields import (
@@ -113,7 +113,6 @@ def calibrate(
     prior: Callable[[Recording, int], SSFPrior] = default_prior,
     stop: StopRule | None = None,
     refined: bool = True,
-    data_sets: IntArray | None = None,
     executor: Executor | None = None,
 ) -> Calibration:
     """Fit SSFs of several orders to a recording and compare their evidences (paper, section on MoG estimation).
@@ -141,8 +140,6 @@ def calibrate(
         When nested sampling ends; default `RemainingEvidence()`. The paper's rule is `EvidenceChange(1e-8)`.
     refined
         Whether to refine each evidence by importance sampling; the paper's is of nested sampling alone.
-    data_sets
-        Data set of each row, each with its own noise sd, (n_points,) from 0; default: its scan.
     executor
         Runs the orders in parallel; by default they run here, one by one. The result does not depend on it.
 
@@ -157,8 +154,6 @@ def calibrate(
         If `orders` is empty, a pattern of the recording is not described, the recording has no contrast (see
         `scan_geometry`), a name in it cannot be written to a file, a value is out of its range, or `quick` is asked
         with `refined=False`.
-    ShapeError
-        If `data_sets` has not one number per row.
 
     Warns
     -----
@@ -175,7 +170,7 @@ def calibrate(
         require_like("executor", executor, ("submit",), "an Executor of concurrent.futures, or None")
     require_flag("quick", quick)
     require(not quick or refined, "refined", refined, "True with quick=True, or leave quick out")
-    problems = ProblemsByOrder(recording, prior, data_sets)
+    problems = ProblemsByOrder(recording, prior)
     search = partial(search_prior_of_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
     quickly: dict[int, OrderPosterior] = {}

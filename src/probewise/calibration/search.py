@@ -9,9 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from probewise._arrays import IntArray
 from probewise.calibration.priors import SSFPrior
-from probewise.errors import ShapeError, require
+from probewise.errors import require
 from probewise.inference import SensorProblem, student_t_of
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 from probewise.nested.importance import MOST_K
@@ -26,35 +25,22 @@ _N_DRAWS = 8000
 _DISAGREE = 4.0
 
 
-def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
-    """Make the inference problem of one order: a chain over known patterns, Student-t with one sigma per data set.
+def problem_for(recording: Recording, prior: SSFPrior) -> SensorProblem:
+    """Make the inference problem of one order: a chain over known patterns, Student-t with one sigma per scan.
 
     Quadrature over curved edges errs by 1e-4 of I_max - I_min, below a tenth of the least noise sd of the prior.
-
-    Parameters
-    ----------
-    recording
-        The readings.
-    prior
-        Prior of the order's parameters.
-    data_sets
-        Data set of each row, (n_points,) from 0, else ShapeError; default: its scan.
     """
     plan = recording.plan
-    groups = plan.scan if data_sets is None else np.asarray(data_sets)
-    if groups.shape != (len(plan),):
-        raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
     chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
-    return SensorProblem(prior, chain, student_t_of(recording, groups), recording)
+    return SensorProblem(prior, chain, student_t_of(recording, plan.scan), recording)
 
 
 @dataclass(frozen=True, eq=False)
 class ProblemsByOrder:
-    """A recording, the prior of each order, and which readings share a noise sd (see `problem_for`)."""
+    """A recording and the prior of each order."""
 
     recording: Recording
     prior: Callable[[Recording, int], SSFPrior]
-    data_sets: IntArray | None = None
 
     def prior_of(self, n_gaussians: int) -> SSFPrior:
         """Return the prior of an order; ParameterError if it is no `SSFPrior`."""
@@ -64,7 +50,7 @@ class ProblemsByOrder:
 
     def problem(self, n_gaussians: int) -> SensorProblem:
         """Return the inference problem of an order."""
-        return problem_for(self.recording, self.prior_of(n_gaussians), data_sets=self.data_sets)
+        return problem_for(self.recording, self.prior_of(n_gaussians))
 
 
 @dataclass(frozen=True, eq=False)

@@ -251,16 +251,14 @@ def _reached_slice(centres: FloatArray, mean: float, sd: float) -> slice:
     return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
 
 
-def merged_mean_mixture(
-    footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1
-) -> FixedMixture:
+def merged_mean_mixture(footprint: Footprint, *, n_gaussians: int = 1) -> FixedMixture:
     """Merge the mean of sampled mixtures, arrays (n_samples, 1, n), into one mixture of at most `n_gaussians`.
 
-    `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture. Similar
-    Gaussians of it are merged by the law of total covariance, so mean and covariance of the mean field are exact.
+    The mean over the samples is a large mixture. Similar Gaussians of it are merged by the law of total covariance, so
+    mean and covariance of the mean field are exact.
     """
     require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
-    w, u, v, var_u, var_v, cov = _gaussians_of_mean(footprint, weights)
+    w, u, v, var_u, var_v, cov = _gaussians_of_mean(footprint, None)
     w = w / w.sum()
     means, covs = np.stack([u, v], axis=-1), np.stack([var_u, cov, cov, var_v], axis=-1)
     sd_u, sd_v = np.sqrt(var_u), np.sqrt(var_v)

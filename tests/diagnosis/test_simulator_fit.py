@@ -10,7 +10,7 @@ from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import _notes_on_integration, recording_from_table
 from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
-from probewise.systems.calls import IntegrationTally
+from probewise.systems.all_steps import Integrations
 
 
 def _rates(s, p, u):
@@ -73,7 +73,7 @@ def test_the_step_serves_all_time_constants_that_the_readings_allow(stiff):
     for tau in (0.011, 0.05, 0.2):  # with a tenth of a second they differ by less than the noise
         predicted = system.chain(table, ()).predict(np.array([[tau, 3.0]]), table)[0]
         np.testing.assert_allclose(predicted, _readings(tau, 3.0), atol=0.2 * SD)
-    assert not system.tally.too_stiff
+    assert not system.integrations.too_stiff
 
 
 def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
@@ -90,13 +90,13 @@ def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
     table, recording, _, found, sd = stiff
     monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)
     first = System.of(_simulator(), table)
-    assert not first.tally.too_stiff
-    assert with_step_for_likely_parameters(first, table, recording, found, sd).tally.too_stiff
+    assert not first.integrations.too_stiff
+    assert with_step_for_likely_parameters(first, table, recording, found, sd).integrations.too_stiff
 
 
 @pytest.mark.parametrize("sets_step", [True, False])
 def test_a_search_that_was_cut_short_advises_a_larger_step_only_where_one_was_set(sets_step):
-    (note,) = _notes_on_integration(IntegrationTally(cut_short=True), 1000, sets_step=sets_step)
+    (note,) = _notes_on_integration(Integrations(cut_short=True), 1000, sets_step=sets_step)
     assert "after 1,000 evaluations" in note
     assert ("max_step_s" in note) is sets_step
 

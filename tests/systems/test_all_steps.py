@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.systems import Law, RunTable
-from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
+from probewise.systems.all_steps import Integrations, integrate_from_known_trajectories
 from probewise.systems.integrate import integrate_states
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.step import steps_for_table
@@ -51,7 +51,7 @@ class _Case:
     def __init__(self, effect=_plain, law=LAW, table=None):
         self.table, self.effect, self.law = _table() if table is None else table, effect, law
         self.columns = {k: v for k, v in self.table.columns.items() if k not in ("y", "run")}
-        self.memory = TrajectoryCache()
+        self.memory = Integrations()
 
     def problem(self, theta):
         def of_some(samples):
@@ -77,7 +77,7 @@ def test_all_steps_at_once_lead_where_stepping_leads(effect, apart):
     case, rng = _Case(effect), np.random.default_rng(2)
     case.near(MIDDLE[None, :])
     theta = MIDDLE * (1 + apart * rng.normal(size=(6, 3)))
-    found, _ = case.near(theta)
+    found = case.near(theta)
     for state, expected in case.stepped(theta).items():
         np.testing.assert_allclose(found[state], expected, atol=1e-9)
 
@@ -86,12 +86,13 @@ def test_near_a_known_trajectory_a_derivative_costs_a_fraction_of_stepping():
     """Forward differences with a step of 1e-5: to the rounding of either way, 1e-9."""
     case = _Case()
     case.near(MIDDLE[None, :])
+    case.memory.n_evaluations = 0
     theta = MIDDLE + np.concatenate([np.zeros((1, 3)), 1e-5 * np.eye(3)])
-    found, cost = case.near(theta)
+    found = case.near(theta)
     slopes, expected = (np.diff(v["phi"], axis=0) / 1e-5 for v in (found, case.stepped(theta)))
     np.testing.assert_allclose(slopes, expected, atol=1e-5)
     steps = steps_for_table(case.table, 0.02)
-    assert cost < 0.2 * len(steps.gap_of_step) * len(steps.method.b)
+    assert case.memory.n_evaluations < 0.2 * len(steps.gap_of_step) * len(steps.method.b)
 
 
 @pytest.mark.parametrize("effect", [_plain, _rubbed, _stopped, _forced])
@@ -108,17 +109,15 @@ def test_the_cost_is_how_often_the_rates_are_evaluated(effect, max_step):
     case = _Case(effect, law=replace(LAW, rates=rates))
     theta = MIDDLE * (1 + 0.1 * np.random.default_rng(2).normal(size=(6, 3)))
     steps = steps_for_table(case.table, max_step)
-    _, cost = integrate_from_known_trajectories(
-        case.problem(theta), steps, case.memory, effects="effects", theta=theta, n_own=3
-    )
-    assert cost == pytest.approx(n_calls, rel=0.5 if effect is _rubbed else 0.01)
+    integrate_from_known_trajectories(case.problem(theta), steps, case.memory, effects="effects", theta=theta, n_own=3)
+    assert case.memory.n_evaluations == pytest.approx(n_calls, rel=0.5 if effect is _rubbed else 0.01)
 
 
 def test_a_sample_that_diverges_is_as_infinite_as_in_steps():
     case = _Case(law=Law({"phi": "phi0", "omega": 0.0}, lambda s, p, u: {"phi": s["phi"] ** 2, "omega": 0 * u["push"]}))
     case.near(MIDDLE[None, :] * 0.1)
     theta = np.array([[0.7, 0.3, 0.08], [0.7, 0.3, 900.0]])
-    found, _ = case.near(theta)
+    found = case.near(theta)
     expected = case.stepped(theta)["phi"]
     assert not np.isfinite(expected[1]).all()
     np.testing.assert_array_equal(np.isfinite(found["phi"]), np.isfinite(expected))
@@ -152,7 +151,7 @@ def test_a_column_that_a_law_reads_later_only_is_there():
     found = case.stepped(theta)["phi"]
     assert np.isfinite(found).all()
     for _ in range(2):
-        again, _ = case.near(theta)
+        again = case.near(theta)
         np.testing.assert_allclose(again["phi"], found, rtol=1e-8, atol=1e-10)
 
 

@@ -134,7 +134,7 @@ def test_a_law_that_raises_for_some_parameters_is_counted_and_the_others_are_int
     found = system.chain(table, ()).predict(np.array([[0.8], [1.5]]), table)
     np.testing.assert_allclose(found[0], np.exp(-0.8 * X), rtol=1e-5)
     assert np.isnan(found[1]).all()
-    assert system.tally.n_failed == 1
+    assert system.integrations.n_failed == 1
 
 
 @pytest.mark.parametrize("vectorized", [False, True])

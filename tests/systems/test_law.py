@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from probewise.errors import ParameterError
 from probewise.systems import Law, Noise, RunTable, Simulator, System
-from probewise.systems.all_steps import TrajectoryCache
+from probewise.systems.all_steps import Integrations
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.inputs import delayed_held_column
 from probewise.systems.integrate import integrate_states
@@ -325,14 +325,14 @@ def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold, about_of, fo
 def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold, about_of, forms_of):
     about, setting = about_of[hold], np.array(CASES[name][0])
     settings = setting * (1 + 0.02 * np.random.default_rng(1).normal(size=(5, len(setting))))
-    refusing = TrajectoryCache(n_refused=99)  # it is stepped
-    stepped = replace(about, system=replace(about.system, trajectories=refusing))
+    refusing = Integrations(n_refused=99)  # it is stepped
+    stepped = replace(about, system=replace(about.system, integrations=refusing))
     expected = _predicted(stepped, forms_of[hold][name], settings)
-    own = replace(about, system=replace(about.system, trajectories=TrajectoryCache()))
+    own = replace(about, system=replace(about.system, integrations=Integrations()))
     own.system.chain(TABLE, ()).predict(own.theta, TABLE)
     for _ in range(2):
         np.testing.assert_allclose(_predicted(own, forms_of[hold][name], settings), expected, atol=1e-9)
-    assert own.system.trajectories.n_refused == 0
+    assert own.system.integrations.n_refused == 0
     assert not refusing.known
 
 

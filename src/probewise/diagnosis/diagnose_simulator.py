@@ -31,7 +31,7 @@ from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, masks_of_readings_at_ends
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.calls import IntegrationTally
+from probewise.systems.all_steps import Integrations
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.binding import sorting_column
 from probewise.systems.forms.reference import note_on_row_order
@@ -348,11 +348,11 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         return ()
     white = diagnosis.noise.model == "white"
     out = [*notes_on_declared_noise(apparatus.system.simulator, diagnosis.repaired.noise_sd)] if white else []
-    caller, tally = apparatus.system.caller, apparatus.system.tally
+    caller, done = apparatus.system.caller, apparatus.system.integrations
     if caller is None:
         law = apparatus.system.simulator.law
         sets_step = law is not None and law.max_step_s is not None
-        return (*out, *_notes_on_integration(tally, apparatus.evaluations_of_a_search, sets_step=sets_step))
+        return (*out, *_notes_on_integration(done, apparatus.evaluations_of_a_search, sets_step=sets_step))
     if caller.cut_short:
         out.append(
             f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls some promising combinations of "
@@ -370,21 +370,21 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _notes_on_integration(tally: IntegrationTally, most: int, *, sets_step: bool) -> Iterator[str]:
-    if tally.cut_short:
+def _notes_on_integration(done: Integrations, most: int, *, sets_step: bool) -> Iterator[str]:
+    if done.cut_short:
         way_out = "a larger max_step_s, shorter runs" if sets_step else "shorter runs"
         yield (
             f"integrating the law takes long: after {most:,} evaluations of its rates some promising combinations of "
             f"effects were not fitted; with {way_out} or fewer rows the search is complete"
         )
-    if tally.too_stiff:
+    if done.too_stiff:
         yield (
             "the law is stiff: parameters that may fit the readings would need more integration steps than are taken, "
             "and count as impossible; their intervals may be too narrow; set a shorter max_step_s, or write simulate "
             "with an integrator of your own"
         )
-    if tally.n_failed:
-        yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"
+    if done.n_failed:
+        yield f"rates raised an error for {done.n_failed:,} parameter vectors, which count as impossible"
 
 
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved

@@ -278,7 +278,7 @@ def with_step_for_likely_parameters(
 
     A shared parameter is followed from its best value to where the step fails, with the others refitted, as long as
     the log posterior density is within 5 nats of the best. The step becomes as short as the parameters on the way need.
-    If this takes more than 4,096 steps beyond one per row, it stays longer, and `system.tally.too_stiff` is set.
+    If this takes more than 4,096 steps beyond one per row, it stays longer, and `system.integrations.too_stiff` is set.
     A system without a law is returned as it is. `sd` is that of a reading.
     """
     if system.simulator.law is None:
@@ -313,7 +313,7 @@ def with_step_for_likely_parameters(
             try:
                 finer = with_converged_step(system, table, system.theta(further[None, :]), tolerance=tolerance)
             except ParameterError:
-                system.tally.too_stiff = True
+                system.integrations.too_stiff = True
                 break
             z, density = refitted(finer, further, others)
             if density > best - _LIKELY:

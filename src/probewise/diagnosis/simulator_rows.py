@@ -261,15 +261,15 @@ class SimulatorApparatus(Apparatus):
     def refit_budget_share_spent(self) -> float:
         caller = self.system.caller
         if caller is None:
-            return self.system.tally.n_evaluations / self.evaluations_of_a_search
+            return self.system.integrations.n_evaluations / self.evaluations_of_a_search
         # A simulate that knows no runs is called for one recording after the other.
         n_each = len(self.system.runs) if self.system.simulator.run is None else 1
         return 0.0 if caller.broadcasts else caller.n_calls / (n_each * CALLS_OF_A_SEARCH)
 
     def is_refit_budget_spent(self, share: float = 1.0) -> bool:
         over = self.refit_budget_share_spent() >= share
-        tally = self.system.caller or self.system.tally
-        tally.cut_short |= over
+        counts = self.system.caller or self.system.integrations
+        counts.cut_short |= over
         return over
 
     def prior_odds(self, effects: Mapping[str, Effect]) -> PriorOdds:

@@ -63,14 +63,20 @@ class KnownTrajectory:
 
 
 @dataclass(eq=False)
-class TrajectoryCache:
-    """Cache of solved trajectories: those of the steps and effects that were added to last come last.
+class Integrations:
+    """Memory of a law's integrations: counts, and solved trajectories, those of the last steps and effects last.
 
-    `n_refused` counts how often in a row the law raised an error for all steps together, and none step by step.
+    An evaluation is one of the rates of all samples and runs together. `n_failed` samples raised an error; `n_refused`
+    counts how often in a row the law raised one for all steps together, and none step by step. `cut_short` if work was
+    skipped; `too_stiff` if parameters that may fit the readings would need more integration steps than are taken.
     """
 
-    known: list[KnownTrajectory] = field(default_factory=list)
+    known: list[KnownTrajectory] = field(default_factory=list, repr=False)
+    n_evaluations: int = 0
+    n_failed: int = 0
     n_refused: int = 0
+    cut_short: bool = False
+    too_stiff: bool = False
 
     def known_and_nearest_indices(
         self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
@@ -101,27 +107,24 @@ class TrajectoryCache:
 def integrate_from_known_trajectories(
     law_and_inputs: LawAndInputs,
     steps: Steps,
-    memory: TrajectoryCache,
+    memory: Integrations,
     *,
     effects: Hashable,
     theta: FloatArray,
     n_own: int,
-) -> tuple[dict[str, FloatArray], int]:
-    """Integrate a law for samples, theta (n_samples, n_params); return their states at the rows and the cost.
+) -> dict[str, FloatArray]:
+    """Integrate a law for samples, theta (n_samples, n_params); return states at the rows, (n_samples, n_points) each.
 
     Up to 300 samples times runs are solved for all steps at once, from the trajectories in `memory` nearest to them;
-    the others, and those for which that does not converge, step by step. More trajectories are added to the memory.
-    `effects` is what distinguishes the law with its effects from the same law with others; the first `n_own` parameters
-    are the system's.
-
-    Returns every state at every row, by name, (n_samples, n_points), and the cost, in evaluations of the rates of all
-    samples together.
+    the others, and those for which that does not converge, step by step. More trajectories are added to the memory, and
+    the evaluations that this takes. `effects` is what distinguishes the law with its effects from the same law with
+    others; the first `n_own` parameters are the system's.
     """
     n_samples = len(theta)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
         motion, parameters, columns = law_and_inputs(np.arange(n_samples))
-        states_by_name = integrate_states(motion, steps, parameters, columns)
-        return states_by_name, n_parts_of_steps(motion, steps) * evaluations_per_step(motion, steps.method)
+        memory.n_evaluations += n_parts_of_steps(motion, steps) * evaluations_per_step(motion, steps.method)
+        return integrate_states(motion, steps, parameters, columns)
     states, left, cost = None, np.arange(n_samples), 0
     known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
     refused = False
@@ -150,9 +153,9 @@ def integrate_from_known_trajectories(
         memory.add([KnownTrajectory(steps, effects, theta[left[k]], there[:, k]) for k in finite])
     assert states is not None
     motion = law_and_inputs(np.arange(1))[0]
-    cost *= evaluations_per_step(motion, steps.method)
+    memory.n_evaluations += cost * evaluations_per_step(motion, steps.method)
     at_rows = states[:, :, steps.n_steps_before_position[steps.position_by_row], steps.table.scan]
-    return dict(zip(motion.law.states, at_rows, strict=True)), cost
+    return dict(zip(motion.law.states, at_rows, strict=True))
 
 
 def _solve_all_steps(

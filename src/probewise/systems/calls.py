@@ -80,20 +80,6 @@ MOST_CALLS = 10_000
 
 
 @dataclass(eq=False)
-class IntegrationTally:
-    """Counts of a law's evaluations and of samples at which it raises an error; `cut_short` if work was skipped.
-
-    An evaluation is one of the rates of all samples and runs together. `too_stiff`: parameters that may fit the
-    readings would need more integration steps than are taken.
-    """
-
-    n_failed: int = 0
-    n_evaluations: int = 0
-    cut_short: bool = False
-    too_stiff: bool = False
-
-
-@dataclass(eq=False)
 class Caller:
     """Caller of a user's `simulate` for many samples; it counts the calls, and the samples that fail.
 

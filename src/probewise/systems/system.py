@@ -19,8 +19,8 @@ from probewise.priors import Marginal, Product
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
-from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories
-from probewise.systems.calls import Caller, IntegrationTally, take_samples, user_function_error
+from probewise.systems.all_steps import Integrations, integrate_from_known_trajectories
+from probewise.systems.calls import Caller, take_samples, user_function_error
 from probewise.systems.integrate import evaluations_per_step, integrate_states
 from probewise.systems.law import LawWithEffects, readings_of_states
 from probewise.systems.simulator import Columns, Simulator, Values
@@ -49,8 +49,8 @@ class System:
         Caller of `simulate`, if there is no law.
     first
         Standard-normal coordinates of an earlier fit, (n_params,), from which fits start.
-    tally, trajectories
-        Counts of a law's evaluations and failures, and cache of its trajectories, from which nearby ones are solved.
+    integrations
+        Counts of a law's evaluations and failures, and its trajectories, from which nearby ones are solved.
     limited
         Whether predictions are limited to the declared range of the instrument (`limited_to_range`).
     slack
@@ -64,8 +64,7 @@ class System:
     stiff: bool = False
     caller: Caller | None = None
     first: FloatArray | None = None
-    tally: IntegrationTally = field(default_factory=IntegrationTally)
-    trajectories: TrajectoryCache = field(default_factory=TrajectoryCache, repr=False)
+    integrations: Integrations = field(default_factory=Integrations)
     limited: bool = True
     slack: float = 0.0
 
@@ -347,21 +346,20 @@ class SystemChain:
             return motion, take_samples(parameters, samples), take_samples(of_rates, samples)
 
         try:
-            states, cost = integrate_from_known_trajectories(
+            states = integrate_from_known_trajectories(
                 law_and_inputs_of_samples,
                 system.steps(plan),
-                system.trajectories,
+                system.integrations,
                 effects=(system.runs, self.effects),
                 theta=theta,
                 n_own=system.n_params,
             )
-            system.tally.n_evaluations += cost
             return readings_of_states(law, states, parameters, columns)
         except ProbewiseError:
             raise
         except Exception:
             if len(theta) == 1:
-                system.tally.n_failed += 1
+                system.integrations.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
         return np.concatenate([self.simulated_view(theta[k : k + 1], plan) for k in range(len(theta))])
 

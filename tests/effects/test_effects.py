@@ -403,13 +403,13 @@ def test_the_moments_of_a_step_lie_between_the_readings():
 def test_gates_open_what_each_variant_acts_on(name):
     """Route one: everywhere, and the gate; route two: each variant by itself."""
     effect = EFFECTS[name].for_extent(EXTENT).with_fewer_variants()
-    gates = effect.variant_masks(PLAN)
+    always, opened = effect.variant_masks(PLAN)
     plain = base().predict(np.zeros((1, 0)), PLAN)
-    everywhere = base().with_effects(effect).predict(gates.always, PLAN) - plain
-    for k in (0, 7, len(gates.opened) - 1):
+    everywhere = base().with_effects(effect).predict(always, PLAN) - plain
+    for k in (0, 7, len(opened) - 1):
         variant = effect.variants()[k]
         own = base().with_effects(variant).predict(variant.bank()[0], PLAN) - plain
-        np.testing.assert_allclose(everywhere * gates.opened[k], own, atol=1e-12)
+        np.testing.assert_allclose(everywhere * opened[k], own, atol=1e-12)
 
 
 def test_a_reflection_is_the_same_scene_seen_from_beside():

@@ -283,8 +283,9 @@ def templates_of_effect(found: Fit, effect: Effect, usable: IntArray, *, most: i
         choice, entries = choice[kept], [entries[k] for k in kept]
     gates = effect.variant_masks(found.model.plan)
     if gates is not None:
-        (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
-        columns = [everywhere * gates.opened[k][usable, None] for k in choice]
+        always, opened = gates
+        (everywhere,) = _predicted_changes(found, effect, always[None, :, :], usable)
+        columns = [everywhere * opened[k][usable, None] for k in choice]
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []

@@ -59,16 +59,9 @@ Say: TypeAlias = Callable[[FloatArray, FloatArray], str]
 """Function of the parameters' mean and sd, (n_params,) each; returns a sentence."""
 
 
-@dataclass(frozen=True, eq=False)
-class VariantMasks:
-    """Masks of variants that differ only in the readings they act on: one prediction serves all of them.
-
-    `always` is a bank entry that acts on all readings, (n_columns, n_params); `opened`
-    (n_variants, n_points) marks the readings that each variant acts on.
-    """
-
-    always: FloatArray
-    opened: BoolArray
+VariantMasks: TypeAlias = tuple[FloatArray, BoolArray]
+"""Of variants that differ only in the readings they act on, which one prediction serves: a bank entry that acts on all
+readings, (n_columns, n_params), and masks of the readings that each variant acts on, (n_variants, n_points)."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +280,7 @@ class StepEffect(Effect):
         always, along = self.entries[0].copy(), self.change_points.variable_at_rows(plan)
         always[:, -middles.shape[1] :] = -np.inf
         end, begin = middles[:, :1], middles[:, -1:]
-        return VariantMasks(always, (along > begin) & ((along < end) | (end <= begin)))
+        return always, (along > begin) & ((along < end) | (end <= begin))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         low, high = np.transpose(self.change_points.intervals)

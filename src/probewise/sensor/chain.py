@@ -210,8 +210,8 @@ class Chain:
         if geometries is None:
             seen = response(layout, footprint, n_nodes=self.n_nodes)
         else:
-            alone = self._layout_under_poses(theta[geometries.first].repeat(footprint.weight.shape[2], axis=0), plan)
-            seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
+            alone = self._layout_under_poses(theta[geometries[0]].repeat(footprint.weight.shape[2], axis=0), plan)
+            seen = _response_of_each_geometry(alone, footprint, *geometries, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
@@ -221,8 +221,11 @@ class Chain:
         found: Poses = self._stage_applier(theta, plan)(Stage.POSE, told)
         return found
 
-    def _hypotheses_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _HypothesesByGeometry | None:
-        """Group hypotheses that differ only in the weights of their Gaussians; None where grouping saves nothing."""
+    def _hypotheses_by_geometry(self, theta: FloatArray, footprint: Footprint) -> tuple[IntArray, IntArray] | None:
+        """Group hypotheses that differ only in the weights of their Gaussians; None where grouping saves nothing.
+
+        Returns the index of each group's first hypothesis, (n_geometries,), and each one's group, (n_samples,).
+        """
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
         if few or footprint.weight.shape[1] > 1:
             return None
@@ -239,7 +242,7 @@ class Chain:
         first = np.unique(which, return_index=True)[1]
         # An effect may place a Gaussian by the weights of others, as a halo about their common centre.
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
-        return None if len(first) < len(theta) and any(moved) else _HypothesesByGeometry(first, which)
+        return None if len(first) < len(theta) and any(moved) else (first, which)
 
     def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> RegionsAndPoses:
         """Return the regions and the poses over them; cached for the last plan if no parameter moves scene or poses."""
@@ -384,37 +387,25 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _HypothesesByGeometry:
-    """Groups of hypotheses that differ only in the weights of their Gaussians, in which the response is linear.
+def _response_of_each_geometry(
+    layout: RegionsAndPoses, footprint: Footprint, first: IntArray, which: IntArray, *, n_nodes: int
+) -> FloatArray:
+    """Integrate as `response` does, but each Gaussian of each geometry only once: the response is linear in weights.
 
-    `first` is the index of each group's first hypothesis, (n_geometries,); `which` each one's group, (n_samples,).
+    `layout` is that of each geometry, repeated n_gaussians times; `footprint` that of all hypotheses, with weights that
+    are the same at every reading. Returns R of every hypothesis, (n_samples, n_points).
     """
+    n_samples, n_gaussians = len(which), footprint.weight.shape[2]
 
-    first: IntArray
-    which: IntArray
+    def one_row_per_gaussian(array: FloatArray) -> FloatArray:
+        """Make each Gaussian a row: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
+        own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[first]
+        return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
 
-    def response(self, layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int) -> FloatArray:
-        """Integrate as `response` does, but each Gaussian of each geometry only once.
-
-        Returns R of every hypothesis, (n_samples, n_points).
-
-        `layout`: layout of each geometry, repeated n_gaussians times; `footprint`: footprints of all hypotheses, with
-        weights that are the same at every reading; `n_nodes`: nodes of the quadrature over curved edges.
-        """
-        n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
-
-        def one_row_per_gaussian(array: FloatArray) -> FloatArray:
-            """Make each Gaussian a row: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
-            own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[self.first]
-            return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
-
-        one_each = Footprint(
-            np.ones((len(self.first) * n_gaussians, 1, 1)), *map(one_row_per_gaussian, footprint.moments)
-        )
-        parts = response(layout, one_each, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
-        weight = np.broadcast_to(footprint.weight[:, 0], (n_samples, n_gaussians))
-        return np.stack([own @ parts[at] for own, at in zip(weight, self.which, strict=True)])
+    one_each = Footprint(np.ones((len(first) * n_gaussians, 1, 1)), *map(one_row_per_gaussian, footprint.moments))
+    parts = response(layout, one_each, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
+    weight = np.broadcast_to(footprint.weight[:, 0], (n_samples, n_gaussians))
+    return np.stack([own @ parts[at] for own, at in zip(weight, which, strict=True)])
 
 
 def _discrete_response(layout: RegionsAndPoses, ssf: DiscreteSSF) -> FloatArray:

@@ -66,21 +66,6 @@ def test_an_effect_of_some_patterns_is_so_after_the_file_too(sensor: FittedSenso
     assert FittedSensor.from_json(json.dumps(document)).patterns == {}
 
 
-def test_a_jump_of_the_gain_is_read_under_the_name_it_had_before(sensor: FittedSensor) -> None:
-    jumped = replace(
-        sensor,
-        names=(*sensor.names, "gain_jump.frac", "gain_jump.at_s"),
-        samples=np.concatenate([sensor.samples, np.tile([0.02, 3.0], (len(sensor.samples), 1))], axis=1),
-        effects=("gain_jump",),
-        source="gain_step.csv",
-    )
-    text = jumped.to_json()
-    before = text.replace('"gain_jump', '"gain_step')
-    assert before != text
-    back = FittedSensor.from_json(before)
-    assert (back.effects, back.names, back.source) == (jumped.effects, jumped.names, jumped.source)
-
-
 def test_the_file_is_strict_json_with_the_promised_content(sensor: FittedSensor) -> None:
     document = json.loads(_full(sensor).to_json(), parse_constant=lambda c: pytest.fail(c))
     assert document["format"] == "sensor/1"

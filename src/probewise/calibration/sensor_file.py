@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 import os
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -47,8 +46,6 @@ _ALLOWED = "a sensor.json as `probewise calibrate` writes"
 # Effects of single scans or mountings: they explain the recording but do not apply to new scans.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
 _FOR_A_FREE_FORM = 4  # Gaussians that approximate a free-form SSF where a mixture is required
-# The light sensor's own `gain_step`, until 0.1, before any simulator had an effect of that name.
-_GAIN_STEP = re.compile(r'"gain_step(?="|\.frac"|\.at_s")')
 # Effects that may be restricted to some patterns.
 _BOUND_TO_PATTERNS = frozenset({edge_shadow.name})
 
@@ -317,7 +314,7 @@ class FittedSensor(NamedSamples):
         FileError
             If the text is damaged, incomplete, or of another format or version.
         """
-        document = parse_json_file_text(path, _GAIN_STEP.sub('"gain_jump', text), _ALLOWED)
+        document = parse_json_file_text(path, text, _ALLOWED)
         found = document.get("format") if isinstance(document, dict) else None
         if found != FORMAT:
             raise FileError(

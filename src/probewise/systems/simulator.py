@@ -244,7 +244,7 @@ def read_table_for(simulator: Simulator, path: str | os.PathLike[str]) -> RunTab
     return read_run_table(path, time=own.time, run=own.run, reading=own.reading, time_unit=own.time_unit)
 
 
-def parse_prior(what: str, given: object) -> Marginal:
+def parse_prior(what: str, given: Any) -> Marginal:
     """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
 
     Raises ParameterError if it is none of these, or has no mass; `what` is its name there.
@@ -252,12 +252,10 @@ def parse_prior(what: str, given: object) -> Marginal:
     allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
     if isinstance(given, Marginal):
         return given
-    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
-        raise ParameterError(what, given, allowed)
+    require(isinstance(given, Sequence) and not isinstance(given, str) and given, what, given, allowed)
     kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}
     kind, numbers = (given[0], given[1:]) if isinstance(given[0], str) else ("uniform", given)
-    if kind not in kinds or len(numbers) != 2 or not all(_is_number(n) for n in numbers):
-        raise ParameterError(what, given, allowed)
+    require(kind in kinds and len(numbers) == 2 and all(map(_is_number, numbers)), what, given, allowed)
     try:
         return kinds[kind](float(numbers[0]), float(numbers[1]))
     except ParameterError as error:

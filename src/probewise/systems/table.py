@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import os
@@ -72,18 +73,18 @@ class RunTable:
         if not hasattr(self.columns, "items"):
             allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
             raise ParameterError("table", self.columns, allowed)
-        columns: dict[str, NDArray[Any]] = {}
+        columns, notes = dict[str, NDArray[Any]](), [*self.notes]
         for name, given in self.columns.items():
             values: Any = given
             require(name not in columns, "columns", f"{name} twice", "each column once")  # as a data frame may have two
             if name == self.time and name != self.run:
                 values, note = times_to_numbers(name, values, self.time_unit)
-                if note:
-                    object.__setattr__(self, "notes", (*self.notes, note))
+                notes += [note] if note else []
             columns[name] = _checked_column(name, values, are_names=name == self.run)
             if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
-                note = f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
-                object.__setattr__(self, "notes", (*self.notes, note))
+                notes.append(
+                    f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
+                )
         require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
         for name, values in columns.items():
@@ -91,6 +92,7 @@ class RunTable:
                 raise ShapeError(f"column {name!r} has shape {values.shape}; allowed: ({n_points},), as the others")
         require(n_points > 0, "table", "without a row", "one row or more")
         object.__setattr__(self, "columns", columns)
+        object.__setattr__(self, "notes", tuple(notes))
         for what, column in (("time", self.time), ("run", self.run)):
             require(column is None or column in columns, what, column, f"a column of the table: {', '.join(columns)}")
         if self.time is not None:
@@ -320,17 +322,13 @@ def read_run_table(
     if not len(table):
         raise FileError(path, "there is no row below the header", "one row for each reading")
     table.require_columns(*own)
-    columns: dict[str, NDArray[Any]] = {}
-    for name in table.columns:
-        if name == run:
-            columns[name] = np.array(table.columns[name])
-        elif name == time:
+    columns: dict[str, NDArray[Any]] = {name: np.array(cells) for name, cells in table.columns.items()}
+    for name in [name for name in columns if name != run]:
+        if name == time:
             columns[name] = table.column_of_numbers(name)
         else:
-            try:
+            with contextlib.suppress(FileError):
                 columns[name] = table.column_of_numbers(name, missing=True, largest=None)
-            except FileError:
-                columns[name] = np.array(table.columns[name])
     return RunTable(columns, time, run, time_unit=time_unit, notes=table.notes, first_line=table.rows[0])
 
 

@@ -345,10 +345,8 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
         u = (rows.time_s - middle) / half
         return a * np.sin(2 * np.pi * hz * half * (u + 0.5 * sweep * u**2) + phase)
 
-    settings = []
-    for hz in frequencies:
-        n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
-        settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
+    n_sweeps = 2 * np.maximum(np.ceil(_SWEEPS * half * frequencies), 1).astype(np.int64)
+    settings = [(hz, sweep) for hz, n in zip(frequencies, n_sweeps, strict=True) for sweep in np.linspace(-1, 1, n)]
     turned = f"2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase"
     yield from _proposal(
         about,

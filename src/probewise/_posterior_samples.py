@@ -31,7 +31,8 @@ class NamedSamples(ShowsItself):
     def rows_by_parameter(self, *statistics: str) -> list[dict[str, Any]]:
         """Return a JSON object for each parameter: its name, and these of mean, sd, median and interval95, in order."""
         ends = {name: list(own) for name, own in self.interval().items()}
-        known = {"mean": self.mean(), "sd": self.sd(), "median": self.median(), "interval95": ends}
+        known: dict[str, Mapping[str, Any]] = {"mean": self.mean(), "sd": self.sd(), "median": self.median()}
+        known["interval95"] = ends
         return [{"name": name, **{each: known[each][name] for each in statistics}} for name in self.names]
 
     def require_sound_samples(self) -> None:

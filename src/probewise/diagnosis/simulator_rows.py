@@ -348,7 +348,7 @@ class SimulatorApparatus(Apparatus):
     def settings_of(self, plan: Plan) -> FloatArray:
         table, own = cast(RunTable, plan), self.system.simulator
         columns = own.inputs(table.covariates).values()
-        return np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1))
+        return np.asarray(np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1)))
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None

@@ -150,8 +150,8 @@ def predict_system(
     require_rng(rng)
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = replace(cast(RunTable, recording.plan), first_row=_number_of_first_row(fitted, recording))
-    recorded = _recorded_rows_before(fitted, own)
-    whole, before = _with_recorded_rows_before(fitted, own, recorded), len(recorded)
+    whole, recorded = _with_recorded_rows_before(fitted, own)
+    before = len(recorded)
     system = replace(
         System.of(fitted.simulator, whole.with_columns(_interpolated_inputs(fitted.simulator, whole))),
         max_step=fitted.max_step,
@@ -202,31 +202,23 @@ def predict_system(
     return SystemPrediction(own, recording.readings, mean=mean, sd=sd, log_density=scores, notes=notes, **counts)
 
 
-def _recorded_rows_before(fitted: FittedSystem, table: RunTable) -> IntArray:
-    """Return the numbers of the recorded rows of a table's runs before their first rows in it, by time, in order."""
-    if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
-        return np.zeros(0, dtype=np.int64)
-    recorded = fitted.known.table
-    first = _first_times(table)
-    begins = np.array([first.get(name, -np.inf) for name in recorded.scan_names])
-    return np.flatnonzero(recorded.time_s < begins[recorded.scan])
-
-
-def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable, rows: IntArray) -> RunTable:
-    """Return a table with these recorded rows put first.
+def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> tuple[RunTable, IntArray]:
+    """Put the recorded rows of a table's runs before their first rows in it first; also return their numbers, by time.
 
     So a state, or an effect that looks back, goes on from where the recording left it. A column that the recording
     lacks is missing in these rows.
     """
-    if fitted.known is None or not rows.size:
-        return table
-    recorded, columns = fitted.known.table, {}
+    if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
+        return table, np.zeros(0, dtype=np.int64)
+    recorded, first, columns = fitted.known.table, _first_times(table), {}
+    begins = np.array([first.get(name, -np.inf) for name in recorded.scan_names])
+    rows = np.flatnonzero(recorded.time_s < begins[recorded.scan])
     for name, values in table.columns.items():
         earlier = recorded.columns.get(name)
         if earlier is None or earlier.dtype.kind != values.dtype.kind:
             earlier = np.full(len(recorded), np.nan if values.dtype == np.float64 else "")
         columns[name] = np.concatenate([earlier[rows], values])
-    return replace(table, columns=columns, first_line=table.first_line - len(rows), notes=())
+    return replace(table, columns=columns, first_line=table.first_line - len(rows), notes=()), rows
 
 
 def _recorded_before(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -74,36 +74,12 @@ def predict(
     recorded = np.full(len(plan), np.nan) if readings is None else floats(readings, "readings")
     if recorded.shape != (len(plan),):
         raise ShapeError(f"readings have shape {recorded.shape}; allowed: ({len(plan)},), one per row of the plan")
-    if plan.instrumentation.unit != sensor.instrumentation.unit:
-        warnings.warn(
-            f"the plan's readings are in {plan.instrumentation.unit!r}, "
-            f"the sensor was calibrated in {sensor.instrumentation.unit!r}; predictions are in the sensor's",
-            DoubtfulResultWarning,
-            stacklevel=2,
-        )
-    doubt = _doubt_of_height_in_words(sensor, plan)
-    if doubt:
+    for doubt in _doubts(sensor, plan):
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     scored = Recording(plan, recorded).usable
     step = sensor.instrumentation.step if plan.instrumentation.step is None else plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
     there = chain.plan_at_calibrated_height(plan)  # once, so that the chain lays out the scene once for all blocks
-    for effect in sensor.effects_on_new_scans:
-        kind = EFFECTS[effect.name]
-        for column in {*kind.reads} - {*plan.covariates}:
-            warnings.warn(
-                f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
-                DoubtfulResultWarning,
-                stacklevel=2,
-            )
-        from_s = sensor.origins.get(effect.name, Origin()).time_s
-        if kind.counts == "time" and (plan.time_s < from_s).all():
-            warnings.warn(
-                f"the plan's times, up to {plan.time_s.max():.12g} s, lie before {from_s:.12g} s, "
-                f"from which {effect.name} counts: is it another clock?",
-                DoubtfulResultWarning,
-                stacklevel=2,
-            )
     theta = sensor.samples_for_new_scans
     n_samples, n_points = len(theta), len(plan)
     per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))
@@ -117,13 +93,26 @@ def predict(
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)
 
 
-def _doubt_of_height_in_words(sensor: FittedSensor, plan: Plan) -> str:
-    """Say why the readings may be predicted for other heights than the plan's; "" if they are not."""
-    if plan.instrumentation.height_mm is not None:
-        return ""
-    calibrated_mm, column = sensor.instrumentation.height_mm, plan.covariates.get("height_mm", np.empty(0))
-    commanded_mm = column[np.isfinite(column)]
-    said = "the plan has a column height_mm, but its description gives no height_mm of the sensor"
-    # Where all are the height of the calibration, or may be, nothing is lost.
-    elsewhere = commanded_mm != (commanded_mm[:1] if calibrated_mm is None else calibrated_mm)
-    return f"{said}: predicted as at the height of the calibration" if elsewhere.any() else ""
+def _doubts(sensor: FittedSensor, plan: Plan) -> Iterator[str]:
+    """Yield what makes predictions of a plan doubtful: another unit, heights, a missing column, another clock."""
+    if plan.instrumentation.unit != sensor.instrumentation.unit:
+        yield (
+            f"the plan's readings are in {plan.instrumentation.unit!r}, "
+            f"the sensor was calibrated in {sensor.instrumentation.unit!r}; predictions are in the sensor's"
+        )
+    if plan.instrumentation.height_mm is None:
+        calibrated_mm, column = sensor.instrumentation.height_mm, plan.covariates.get("height_mm", np.empty(0))
+        commanded_mm = column[np.isfinite(column)]
+        said = "the plan has a column height_mm, but its description gives no height_mm of the sensor"
+        # Where all are the height of the calibration, or may be, nothing is lost.
+        if (commanded_mm != (commanded_mm[:1] if calibrated_mm is None else calibrated_mm)).any():
+            yield f"{said}: predicted as at the height of the calibration"
+    for effect in sensor.effects_on_new_scans:
+        kind, from_s = EFFECTS[effect.name], sensor.origins.get(effect.name, Origin()).time_s
+        for lacking in {*kind.reads} - {*plan.covariates}:
+            yield f"the plan has no column {lacking}, which {effect.name} reads: predicted as for its reference value"
+        if kind.counts == "time" and (plan.time_s < from_s).all():
+            yield (
+                f"the plan's times, up to {plan.time_s.max():.12g} s, lie before {from_s:.12g} s, "
+                f"from which {effect.name} counts: is it another clock?"
+            )

@@ -19,7 +19,7 @@ from probewise._posterior_samples import NamedSamples, interval_table_lines
 from probewise._version import __version__
 from probewise.effects import EFFECTS, name_without_copy_suffix
 from probewise.errors import FileError, ParameterError, message_of, printable, require
-from probewise.recordings import parse_strict_json, write_text_atomically
+from probewise.recordings import parse_json_file_text, write_text_atomically
 from probewise.recordings.io import read_text
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import Stage
@@ -175,10 +175,7 @@ class FittedSystem(NamedSamples):
             If the text is damaged, has another format, belongs to another simulator, or counts effects from old
             origins.
         """
-        try:
-            document = parse_strict_json(text)
-        except (ValueError, RecursionError) as error:
-            raise FileError(path, f"no strict JSON ({error})", _WHAT) from error
+        document = parse_json_file_text(str(path), text, _WHAT)
         found = document.get("format") if isinstance(document, dict) else None
         if found == "sensor/1":
             raise FileError(path, "the model of a light sensor", f"{_WHAT}; for a sensor leave --simulator out")

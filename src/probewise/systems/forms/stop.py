@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class MeterStop:
     reading: str = "the reading"
     unit: str = ""
 
-    @property
+    @cached_property
     def effect(self) -> NoiseEffect:
         """The stop as an effect, whose level is certain to within rounding."""
         near = 1e-9 * (1 + abs(self.level))

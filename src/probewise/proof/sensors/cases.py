@@ -18,10 +18,8 @@ from probewise.proof.sensors.effects import (
     SINGLES,
     CleanSetup,
     CovariateRegion,
-    EffectSizer,
     NormAfterRefit,
     amplitude_of_size,
-    region_of_effect,
 )
 from probewise.proof.sensors.sensors import (
     NOISE_LEVELS,
@@ -112,14 +110,9 @@ class HiddenEffect:
         return self.name in INSIDE
 
     @property
-    def residual_covariates(self) -> tuple[str, ...]:
+    def covariates(self) -> tuple[str, ...]:
         """Names of the covariates along which the effect's residual is visible."""
-        return SAMPLERS[self.name].residual_covariates
-
-    @property
-    def parameters(self) -> Mapping[str, object]:
-        """Parameters of the effect, name to value."""
-        return self.effect.parameters
+        return SAMPLERS[self.name].covariates
 
 
 ALIASES: tuple[tuple[str, str], ...] = (
@@ -195,10 +188,10 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     for attempt in range(_ATTEMPTS * len(plans)):
         if attempt % _ATTEMPTS == 0:
             plan_name = plans[attempt // _ATTEMPTS]
-            setup = CleanSetup(draw_plan_with_displaced_patterns(plan_name, rng=plan_rng), sensor)
-            sizer = EffectSizer(setup, norm_after_refit)
+            plan = draw_plan_with_displaced_patterns(plan_name, rng=plan_rng)
+            setup = CleanSetup(plan, sensor, norm_after_refit)
         try:
-            hidden, cosine, alias = _draw_effects(stratum, n_earlier, sizer, rng)
+            hidden, cosine, alias = _draw_effects(stratum, n_earlier, setup, rng)
             break
         except NotConvergedError as error:
             failure = error
@@ -207,8 +200,8 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     if any(each.effect.disturbs for each in hidden):
         model = "white"  # only one noise fault at a time
     step = 1.0 if model == "quantised" else None
-    told = replace(setup.plan.instrumentation, step=step, description="Simulated readings of a challenge")
-    plan = replace(setup.plan, instrumentation=told)
+    told = replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")
+    plan = replace(plan, instrumentation=told)
     concealing = replace(sensor, concealed=tuple(each.effect for each in hidden))
     world = with_noise_model(concealing, model, duration_s=setup.duration_s)
     return Case(
@@ -237,7 +230,7 @@ def held_out_recordings(case: Case) -> dict[str, Recording]:
 
 
 def _draw_effects(
-    stratum: Stratum, n_earlier: int, sizer: EffectSizer, rng: np.random.Generator
+    stratum: Stratum, n_earlier: int, setup: CleanSetup, rng: np.random.Generator
 ) -> tuple[tuple[HiddenEffect, ...], float | None, str | None]:
     """Draw the effects of a stratum once; return them, the cosine of a pair or with an alias, and that alias's name.
 
@@ -245,7 +238,7 @@ def _draw_effects(
     """
 
     def draw_effect(name: str) -> HiddenEffect:
-        return draw_effect_of_size(name, stratum.size, sizer, rng)
+        return draw_effect_of_size(name, stratum.size, setup, rng)
 
     match stratum.kind:
         case "clean":
@@ -256,13 +249,13 @@ def _draw_effects(
             return (draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),), None, None
         case "pair":
             first, second = (draw_effect(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
-            cosine = sizer.cosine(first.effect, second.effect)
+            cosine = setup.cosine(first.effect, second.effect)
             if abs(cosine) >= _MOST_COSINE:
                 raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
             return (first, second), cosine, None
         case "alias":
             hidden, other = (draw_effect(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
-            cosine = sizer.cosine(hidden.effect, other.effect)
+            cosine = setup.cosine(hidden.effect, other.effect)
             if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
             return (hidden,), cosine, other.name
@@ -270,14 +263,12 @@ def _draw_effects(
             return (draw_effect(stratum.kind),), None, None
 
 
-def draw_effect_of_size(name: str, wanted: float, sizer: EffectSizer, rng: np.random.Generator) -> HiddenEffect:
+def draw_effect_of_size(name: str, wanted: float, setup: CleanSetup, rng: np.random.Generator) -> HiddenEffect:
     """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
     sampler = SAMPLERS[name]
-    of_amplitude = sampler.draw(sizer.setup, rng)
-    amplitude = sampler.first
+    of_amplitude = sampler.draw(setup, rng)
+    amplitude, limit = sampler.first, sampler.limit
     if sampler.scalable:
-        amplitude = amplitude_of_size(
-            lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
-        )
+        amplitude = amplitude_of_size(lambda a: setup.size(of_amplitude(a)), wanted, first=amplitude, limit=limit)
     effect = of_amplitude(amplitude)
-    return HiddenEffect(effect, sizer.size(effect), region_of_effect(effect, sizer))
+    return HiddenEffect(effect, setup.size(effect), setup.region(effect))

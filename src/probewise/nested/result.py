@@ -28,8 +28,7 @@ from probewise.nested.evidence import birth_rows, log_volumes
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
 _FORMAT = "nested-result/4"
-_FLOATS = ("theta", "log_likelihood", "label", "log_weight", "log_birth", "birth_label")
-_COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
+_READ_ONLY: Mapping[object, Callable[[Any], NDArray[Any]]] = {"FloatArray": read_only_floats, "IntArray": frozen_int}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +50,9 @@ class Samples(ShowsItself):
     n_calls: int
 
     def __post_init__(self) -> None:
-        for name in ("theta", "log_likelihood", "log_weight"):
-            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+        for field in fields(self):
+            if field.type in _READ_ONLY:
+                object.__setattr__(self, field.name, _READ_ONLY[field.type](getattr(self, field.name)))
 
     @property
     @own_arithmetic
@@ -212,12 +212,6 @@ class NestedResult(Samples):
     agreement: Agreement | None = None
     check: Check | None = None
 
-    def __post_init__(self) -> None:
-        for name in _FLOATS:
-            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
-        for name in _COUNTS:
-            object.__setattr__(self, name, frozen_int(getattr(self, name)))
-
     @property
     def n_dead(self) -> int:
         """Number of weighted samples."""
@@ -320,7 +314,7 @@ class NestedResult(Samples):
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically; FileError if it cannot be written."""
         path = checked_path("path", path)
-        arrays = {name: np.asarray(getattr(self, name)) for name in (*_FLOATS, *_COUNTS)}
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self) if f.type in _READ_ONLY}
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         head["check"] = None if self.check is None else asdict(self.check)

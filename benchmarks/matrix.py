@@ -169,8 +169,6 @@ def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
     noise = noise_of_size(name, 12.0, free[seen[0]], seen[1], drawn.kind.sd, rng=rng)
     readings = noise.draw(free, drawn.table, rng)
     return SystemCase(
-        0,
-        0,
         stratum=Stratum("single", 20.0),
         drawn=drawn,
         effects=tuple(effects),

@@ -17,7 +17,7 @@ from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     MOST_LOST,
-    HeldOutSamples,
+    HeldOut,
     Weighted,
     draw_and_weigh,
     fit_wide_and_narrow_proposals,
@@ -221,14 +221,14 @@ def effective_lineages(found: Posterior) -> float:
 
 def _split_off_held_out(
     found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
-) -> tuple[FloatArray, HeldOutSamples]:
+) -> tuple[FloatArray, HeldOut]:
     """Split samples at random, two to one, into those for fitting a density, by weight, and held-out ones."""
     lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
     rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
-    held = HeldOutSamples(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
+    held = x, space.leave(x)[1] + found.log_likelihood[rows], _HELD_OUT * n_lineages
     return _resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -49,19 +50,14 @@ class NullRefit:
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:
         """Return the null model's fit to `changed`, as if the model fitted `clean` exactly."""
-        null = self.null_fit(clean)
-        return _white_noise_fit(null.model, self.without_null_residuals(clean, changed), null.z)
+        return self.rivalry(clean, changed).found
 
-    def with_one_more_gaussian(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
-        """Return as `refit`, but with one Gaussian more in the SSF than `found`, the result of `refit`."""
-        fits = _fits_with_one_more_gaussian(found, self.without_null_residuals(clean, changed), Extent.of(clean))
-        return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
-
-    def without_null_residuals(self, clean: Recording, changed: Recording) -> Recording:
-        """Return `changed` minus the null model's residuals on `clean`."""
-        readings = changed.readings.copy()
-        readings[clean.usable] -= self.null_fit(clean).residuals
-        return Recording(changed.plan, readings)
+    def rivalry(self, clean: Recording, changed: Recording) -> _Rivalry:
+        """Return that fit with the readings to which it is made: `changed` minus the null's residuals on `clean`."""
+        null, readings = self.null_fit(clean), changed.readings.copy()
+        readings[clean.usable] -= null.residuals
+        without = Recording(changed.plan, readings)
+        return _Rivalry(_white_noise_fit(null.model, without, null.z), without)
 
     def null_fit(self, clean: Recording) -> Fit:
         """Return the null model's fit to the clean readings, cached for the last recording."""
@@ -111,7 +107,10 @@ class _Rivalry:
     def __init__(self, found: Fit, readings: Recording) -> None:
         self.found, self.readings = found, readings
         self._usable = np.flatnonzero(readings.usable)
-        self._problem = Linearised.of(found, white_noise(len(self._usable)))
+
+    @cached_property
+    def _problem(self) -> Linearised:
+        return Linearised.of(self.found, white_noise(len(self._usable)))
 
     def entries(self, effect: Effect) -> tuple[EffectTemplates, IntArray, float]:
         """Return the template bank of an effect, its entries from the best to the worst, and the cosine of the best."""
@@ -153,7 +152,7 @@ def cosines_with_vocabulary(
     fit and together with the null model, explains: from a full refit if the linearised rho is above 0.8. If "halo" or
     "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF, which is no missing physics.
     """
-    rivalry = _Rivalry(refit.refit(clean, changed), refit.without_null_residuals(clean, changed))
+    rivalry = refit.rivalry(clean, changed)
     out: dict[str, float] = {}
     for name, kind in vocabulary.items():
         effect = kind.for_extent(Extent.of(clean))
@@ -165,7 +164,8 @@ def cosines_with_vocabulary(
             rho = rivalry.cosine(by)
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
-        out["ssf_order"] = rivalry.cosine(refit.with_one_more_gaussian(rivalry.found, clean, changed))
+        more = _fits_with_one_more_gaussian(rivalry.found, rivalry.readings, Extent.of(clean))
+        out["ssf_order"] = rivalry.cosine(min(more, key=lambda f: float(np.linalg.norm(f.residuals))))
     return out
 
 
@@ -179,7 +179,7 @@ def residual_norms_with_one_named(
     effect; divided by the noise sd, it is the size of the other effect given this one. It may be much smaller than the
     other's size alone: a saturation can hide a stain.
     """
-    rivalry = _Rivalry(refit.refit(clean, both), refit.without_null_residuals(clean, both))
+    rivalry = refit.rivalry(clean, both)
     out = {}
     for name in names:
         effect = VOCABULARY[name].for_extent(Extent.of(clean))

@@ -46,7 +46,7 @@ def _case(drawn, effects):
     """A case without noise."""
     free = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
     noise = noise_of_size("white", 12.0, free, drawn.table, drawn.kind.sd, rng=np.random.default_rng(0))
-    return SystemCase(1, 0, Stratum("single"), drawn, tuple(effects), noise, "", (), free, free)
+    return SystemCase(Stratum("single"), drawn, tuple(effects), noise, "", (), free, free)
 
 
 @pytest.mark.parametrize("wanted", [6.0, 20.0])

@@ -131,14 +131,12 @@ _ATTEMPTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One case of a challenge.
+    """One case of a challenge: a recording to diagnose, and the simulated sensor with its concealed effects.
 
-    `recording`: the recording to diagnose; `world`: the simulated sensor with its concealed effects; `test_plans`:
-    plans of the held-out readings, by name: "angle", "pattern", "direction" (`held_out_plans`); `test_seed`: seed
-    sequence of their noise; `ssf`, `noise_level`, `noise_model`, `plan`: names in SSFS, NOISE_LEVELS, OTHER_NOISE or
-    "white", and PLANS; `hidden`: concealed effects, in the order of the vocabulary; `alias`: in the stratum of aliases,
-    the name of an effect, not in the recording, that is aliased with the concealed one; `cosine` of the two, or of a
-    pair, after the refit; None: neither.
+    `test_plans`: plans of the held-out readings by name (`held_out_plans`), `test_seed`: of their noise; `ssf`,
+    `noise_level`, `noise_model`, `plan`: names in SSFS, NOISE_LEVELS, OTHER_NOISE or "white", and PLANS; `hidden`:
+    concealed effects, in the order of the vocabulary; `alias`: in the stratum of aliases, the name of an effect that is
+    aliased with the concealed one; `cosine` of the two, or of a pair, after the refit; None: neither.
     """
 
     recording: Recording
@@ -169,13 +167,10 @@ class Case:
 
 
 def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Case:
-    """Draw case `number` of a challenge; it depends on the seed and the number alone.
+    """Draw case `number` of a challenge; it depends on the secret seed and the number, from 0, alone.
 
-    `seed`: the secret seed of the challenge; `number`: number of the case, from 0: determines its stratum
-    (`stratum_of`) and, with the seed, everything else; `norm_after_refit`: function of two noise-free recordings,
-    without and with an effect: norm of the effect after a full refit of the null model, in reading units. Raises
-    NotConvergedError if none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an alias's
-    loss < 3.
+    Raises NotConvergedError if none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an
+    alias's loss < 3.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
@@ -184,7 +179,6 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
     plans = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    failure = NotConvergedError("no plan to try")
     for attempt in range(_ATTEMPTS * len(plans)):
         if attempt % _ATTEMPTS == 0:
             plan_name = plans[attempt // _ATTEMPTS]
@@ -193,10 +187,9 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
         try:
             hidden, cosine, alias = _draw_effects(stratum, n_earlier, setup, rng)
             break
-        except NotConvergedError as error:
-            failure = error
-    else:
-        raise failure
+        except NotConvergedError:
+            if attempt == _ATTEMPTS * len(plans) - 1:
+                raise
     if any(each.effect.disturbs for each in hidden):
         model = "white"  # only one noise fault at a time
     step = 1.0 if model == "quantised" else None

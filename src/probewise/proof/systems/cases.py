@@ -154,14 +154,11 @@ class SystemEffect:
 class SystemCase:
     """One case of a challenge on systems.
 
-    `seed`, `number`, `stratum`: identification of the case; `effects`: its concealed effects; `noise_text`: the line on
-    noise in the simulator file; may be empty; `labels`: names of the runs, as in the table; `noise_free`, `readings`:
-    readings with the effects, without and with noise, at all rows, (n_points,); `cosine`: cosine of a pair after the
-    refit; None: no pair.
+    `effects`: the concealed ones; `noise_text`: the line on noise in the simulator file; may be empty; `labels`: names
+    of the runs, as in the table; `noise_free`, `readings`: readings with the effects, without and with noise, at all
+    rows, (n_points,); `cosine`: of a pair after the refit; None: no pair.
     """
 
-    seed: int
-    number: int
     stratum: Stratum
     drawn: DrawnSystem
     effects: tuple[SystemEffect, ...]
@@ -193,7 +190,6 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
     stratum, n_earlier = system_stratum_of(number)
     drawing, noising = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
     shuffled = [*np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES), *ADDED_FAMILIES]
-    failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
         family = str(shuffled[(n_earlier + (attempt // 8)) % len(shuffled)])
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
@@ -202,12 +198,10 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
             everywhere = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
             if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.true_system.readings).max():
                 raise NotConvergedError("the held-out runs diverge")
-        except NotConvergedError as error:
-            failure = error
-            continue
-        break
-    else:
-        raise failure
+            break
+        except NotConvergedError:
+            if attempt == _ATTEMPTS - 1:
+                raise
     kind = drawn.kind
     name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
@@ -225,8 +219,6 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
     stated = ", ".join(f'"{key}": {value:g}' for key, value in said.items())
     plain = bool(noising.random() < 0.5)
     return SystemCase(
-        seed,
-        number,
         stratum=stratum,
         drawn=drawn,
         effects=effects,
@@ -255,7 +247,11 @@ def _draw_effects(
         if stratum.kind == "pair":
             families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
         own = [[f for f in forms if family_of(f) == name] for name in families]
-    chosen = [_draw_form(of, name, rng) for of, name in zip(own, families, strict=True)]
+    chosen = []
+    for of, name in zip(own, families, strict=True):
+        if not of:
+            raise NotConvergedError(f"this system has no target for {name}")
+        chosen.append(of[int(rng.integers(len(of)))])
     effects = tuple(draw_effect_of_size(form, stratum.size, drawn, after_refit, rng) for form in chosen)
     left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e.form_with_parameters])) for e in effects]
     cosine = None
@@ -267,13 +263,6 @@ def _draw_effects(
         replace(effect, covariates=_residual_covariates(effect.form, residuals, drawn.true_system))
         for effect, residuals in zip(effects, left, strict=True)
     ), cosine
-
-
-def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
-    """Draw one of these forms; if there is none, raise NotConvergedError with the effect's `name` in the message."""
-    if not forms:
-        raise NotConvergedError(f"this system has no target for {name}")
-    return forms[int(rng.integers(len(forms)))]
 
 
 def draw_effect_of_size(

@@ -58,9 +58,9 @@ from probewise.proof.refits import NullRefit, SystemRefit
 from probewise.proof.sensors.cases import Stratum
 from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
 from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
-from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
+from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, draw_system, write_system_case
 from probewise.proof.systems.cases import draw_effect_of_size as conceal_in_system
-from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, Form, family_of, forms_of
+from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, Form, SystemEffect, family_of, forms_of
 from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
 from probewise.proof.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Plan, paper_plan, two_way_plan, write_recording, write_text_atomically
@@ -160,8 +160,8 @@ def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
                 effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, SystemRefit(), rng)]
             elif forms:  # the parameters take it up, whatever its size
                 amplitude = min(20 * forms[0].first, forms[0].limit)
-                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)), 0.0)]
-            free = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
+                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)))]
+            free = drawn.simulate_all_rows(effects)
             if np.abs(free).max() < 1e3 * np.abs(drawn.true_system.readings).max():
                 break
     name = {"quantisation": "quantised"}.get(what, what if what in OTHER_NOISE else "white")

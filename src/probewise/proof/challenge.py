@@ -40,13 +40,8 @@ from probewise.proof.refits import (
 from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup, CovariateRegion
-from probewise.proof.systems.cases import (
-    SystemCase,
-    SystemEffect,
-    draw_system_case,
-    system_stratum_of,
-    write_system_case,
-)
+from probewise.proof.systems.cases import SystemCase, draw_system_case, system_stratum_of, write_system_case
+from probewise.proof.systems.forms import SystemEffect
 from probewise.proof.tables import HONEST_NATS, NOISE, names_in_label
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
@@ -388,10 +383,11 @@ def _right_predictions(
     predicts. An effect's values for the held-out runs, which nobody can know, are the mean of the others.
     """
     drawn, known = case.drawn, []
-    for form, values in case.forms_with_parameters():
-        of_runs = [v for name, v in values.items() if name.startswith("values[")]
+    for effect in case.effects:
+        of_runs = [v for name, v in effect.values.items() if name.startswith("values[")]
         unseen = [f"values[{k}]" for k in (drawn.table.n_runs - 2, drawn.table.n_runs - 1)] if of_runs else []
-        known.append((form, {**values, **dict.fromkeys(unseen, float(np.mean(of_runs[:-2])) if of_runs else 0.0)}))
+        mean = float(np.mean(of_runs[:-2])) if of_runs else 0.0
+        known.append(replace(effect, values={**effect.values, **dict.fromkeys(unseen, mean)}))
     change = drawn.simulate_all_rows(known) - drawn.simulate_all_rows([])
     seen, rows, sd = drawn.diagnosed_row_numbers, drawn.held_out_row_numbers, drawn.kind.sd
     found = refit.refit(drawn, (case.readings - change)[seen])

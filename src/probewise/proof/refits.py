@@ -20,7 +20,8 @@ from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, 
 from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
 from probewise.effects import AGAIN, VOCABULARY, Effect, Extent, LightEffect
 from probewise.errors import NotConvergedError
-from probewise.proof.systems.cases import DrawnSystem, SystemCase, SystemEffect
+from probewise.proof.systems.cases import DrawnSystem, SystemCase
+from probewise.proof.systems.forms import SystemEffect
 from probewise.proof.systems.kinds import SystemKind, SystemTable
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -283,7 +284,7 @@ def rivals_with_nats(refit: SystemRefit, case: SystemCase, effect: SystemEffect)
     forms = refit.forms(found)
     for other in case.effects:
         if other is not effect and other.name in forms:  # it is known from readings with it alone
-            alone = drawn.simulate_diagnosed_rows([other.form_with_parameters])
+            alone = drawn.simulate_diagnosed_rows([other])
             with_other = _best_fit(refit.refit(drawn, alone), refit.recording(alone), [forms[other.name]])
             found = refit.refit(drawn, readings, beside=with_other)
     rivalry = _Rivalry(found, refit.recording(readings))

@@ -21,9 +21,8 @@ from probewise.proof.systems.forms import (
     FAMILIES,
     OUT_OF_VOCABULARY,
     Form,
-    FormWithParameters,
-    Numbers,
     SimulatedSystem,
+    SystemEffect,
     family_of,
     forms_of,
     forms_out_of_vocabulary,
@@ -101,11 +100,11 @@ class DrawnSystem:
         per_run = {name: values[table.run] for name, values in self.by_run.items()}
         return {name: per_run[name] if name in per_run else self.shared[name] for name in self.kind.parameters}
 
-    def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
+    def simulate_all_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
         return self._simulate(self.table, effects)
 
-    def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
+    def simulate_diagnosed_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at the rows that are not held out, (n_points,).
 
         Raises NotConvergedError if a reading is not finite.
@@ -115,7 +114,7 @@ class DrawnSystem:
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
 
-    def _simulate(self, table: SystemTable, effects: Sequence[FormWithParameters]) -> FloatArray:
+    def _simulate(self, table: SystemTable, effects: Sequence[SystemEffect]) -> FloatArray:
         with np.errstate(all="ignore"):
             return simulate_noise_free(self.kind, table, self._parameters(table), effects).readings
 
@@ -123,31 +122,6 @@ class DrawnSystem:
 AfterRefit: TypeAlias = Callable[[DrawnSystem, FloatArray], FloatArray]
 """Residuals, in noise sds, (n_points,), of noise-free readings of the rows that are not held out after a refit of the
 model without effects. Its own error, the residuals without effects, must not be counted. NotConvergedError: no fit."""
-
-
-@dataclass(frozen=True, eq=False)
-class SystemEffect:
-    """A concealed effect: form, parameters, size lambda, and the covariates along which it shows."""
-
-    form: Form
-    values: Numbers
-    size_lambda: float
-    covariates: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """The effect's name, with its target."""
-        return self.form.vocabulary_name
-
-    @property
-    def in_vocabulary(self) -> bool:
-        """Whether the effect is one that a diagnosis can name."""
-        return not self.form.outside
-
-    @property
-    def form_with_parameters(self) -> FormWithParameters:
-        """The pair of the form and its parameters by name."""
-        return self.form, self.values
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +142,6 @@ class SystemCase:
     noise_free: FloatArray
     readings: FloatArray
     cosine: float | None = None
-
-    def forms_with_parameters(self) -> list[FormWithParameters]:
-        """Return every concealed effect's form with its parameters."""
-        return [effect.form_with_parameters for effect in self.effects]
 
 
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
@@ -195,7 +165,7 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
         try:
             effects, cosine = _draw_effects(stratum, n_earlier, family, drawn, after_refit, drawing)
-            everywhere = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
+            everywhere = drawn.simulate_all_rows(effects)
             if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.true_system.readings).max():
                 raise NotConvergedError("the held-out runs diverge")
             break
@@ -253,7 +223,7 @@ def _draw_effects(
             raise NotConvergedError(f"this system has no target for {name}")
         chosen.append(of[int(rng.integers(len(of)))])
     effects = tuple(draw_effect_of_size(form, stratum.size, drawn, after_refit, rng) for form in chosen)
-    left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e.form_with_parameters])) for e in effects]
+    left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e])) for e in effects]
     cosine = None
     if len(effects) == 2:
         cosine = float(left[0] @ left[1] / np.sqrt((left[0] @ left[0]) * (left[1] @ left[1])))
@@ -277,7 +247,7 @@ def draw_effect_of_size(
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
     def readings_at(amplitude: float) -> FloatArray:
-        return drawn.simulate_diagnosed_rows([(form, form.of_amplitude(sign * amplitude, more))])
+        return drawn.simulate_diagnosed_rows([SystemEffect(form, form.of_amplitude(sign * amplitude, more))])
 
     def size_at(amplitude: float) -> float:
         return float(np.linalg.norm(after_refit(drawn, readings_at(amplitude))))

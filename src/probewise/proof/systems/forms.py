@@ -80,8 +80,24 @@ class Form:
         return self.name.removesuffix(" (floor)")
 
 
-FormWithParameters: TypeAlias = tuple[Form, Numbers]
-"""A form with its parameters."""
+@dataclass(frozen=True, eq=False)
+class SystemEffect:
+    """An effect of a system: form, parameters, size lambda, and the covariates along which it shows."""
+
+    form: Form
+    values: Numbers
+    size_lambda: float = 0.0
+    covariates: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The effect's name, with its target."""
+        return self.form.vocabulary_name
+
+    @property
+    def in_vocabulary(self) -> bool:
+        """Whether the effect is one that a diagnosis can name."""
+        return not self.form.outside
 
 
 @dataclass(frozen=True, eq=False)

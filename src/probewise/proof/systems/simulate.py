@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.proof.systems.forms import Form, FormWithParameters, Instants, SimulatedSystem
+from probewise.proof.systems.forms import Form, Instants, SimulatedSystem, SystemEffect
 from probewise.proof.systems.kinds import Law, SystemKind, SystemTable
 
 _RTOL, _ATOL = 1e-8, 1e-10
@@ -29,31 +29,30 @@ _HAIR = 1e-8  # share of a gap by which an interval keeps away from discontinuit
 
 
 def simulate_noise_free(
-    kind: SystemKind, rows: SystemTable, parameters: Mapping[str, Any], effects: Sequence[FormWithParameters] = ()
+    kind: SystemKind, rows: SystemTable, parameters: Mapping[str, Any], effects: Sequence[SystemEffect] = ()
 ) -> SimulatedSystem:
     """Simulate a system without noise.
 
-    `rows`: the table of the rows to simulate; `parameters`: by name, a number or (n_points,) each; `effects`: forms,
-    each with its parameters by name.
+    `rows`: the table of the rows to simulate; `parameters`: by name, a number or (n_points,) each.
     """
     law, columns, inner = kind.law, dict(rows.columns), []
-    for form, numbers in effects:
-        if form.side == "input" and not (form.late and law is not None):
-            columns = form.act(columns, rows, numbers)
-        elif form.side != "reading":
-            inner.append((form, numbers))
+    for effect in effects:
+        if effect.form.side == "input" and not (effect.form.late and law is not None):
+            columns = effect.form.act(columns, rows, effect.values)
+        elif effect.form.side != "reading":
+            inner.append(effect)
     states: Mapping[str, FloatArray] = {}
     if law is not None:
         states = _Integration(law, kind, rows, parameters, columns, inner).solve()
         readings = law.read(states, parameters, columns)
     else:
         p, now = dict(parameters), Instants.at_rows(rows)
-        for form, numbers in inner:
-            p[form.target] = p[form.target] + form.act(now, numbers)
+        for effect in inner:
+            p[effect.form.target] = p[effect.form.target] + effect.form.act(now, effect.values)
         readings = kind.formula(p, columns)
     readings = np.array(np.broadcast_to(readings, len(rows)), dtype=np.float64)
-    for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
-        readings = form.act(readings, rows, numbers)
+    for effect in sorted((e for e in effects if e.form.side == "reading"), key=lambda e: e.form.order):
+        readings = effect.form.act(readings, rows, effect.values)
     return SimulatedSystem(kind, rows, parameters, readings, states)
 
 
@@ -69,7 +68,7 @@ class _Integration:
     table: SystemTable
     parameters: Mapping[str, Any]
     columns: Mapping[str, FloatArray]
-    effects: Sequence[FormWithParameters]
+    effects: Sequence[SystemEffect]
 
     @cached_property
     def time(self) -> FloatArray:
@@ -86,12 +85,13 @@ class _Integration:
     @cached_property
     def delays(self) -> dict[str, float]:
         """Delay of each column that is delayed, by name."""
-        return {form.late: numbers["tau_s"] for form, numbers in self.effects if form.late}
+        return {e.form.late: e.values["tau_s"] for e in self.effects if e.form.late}
 
     @cached_property
     def hard(self) -> list[tuple[Form, float]]:
         """Forms of dry friction and bounds, each with its strength or level."""
-        return [(f, float(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
+        hard = (e for e in self.effects if e.form.sticks or e.form.stops)
+        return [(e.form, float(e.values["a" if e.form.sticks else "level"])) for e in hard]
 
     def solve(self) -> dict[str, FloatArray]:
         """Return every state by name at every row, (n_points,)."""
@@ -122,7 +122,7 @@ class _Integration:
         """Return a function from a share of the gap after position k to the parameters by name and `Instants` there."""
         first, here, there = (self.rows_by_position_and_run[at, runs] for at in (0, k, k + 1))
         printed, run = self.table.t, self.table.run[here]
-        uses = (column for form, _ in self.effects for column in form.uses)
+        uses = (column for e in self.effects for column in e.form.uses)
         ends = {}
         for name in dict.fromkeys((*self.kind.drives, *uses)):
             if name not in self.delays:
@@ -130,7 +130,7 @@ class _Integration:
                 holds = name in self.kind.drives and not self.law.linear
                 ends[name] = (values[here], 0.0 if holds else values[there] - values[here])
         base = {name: v[here] if np.ndim(v) else v for name, v in self.parameters.items()}
-        varying = [(form, numbers) for form, numbers in self.effects if form.side == "parameter"]
+        varying = [(e.form, e.values) for e in self.effects if e.form.side == "parameter"]
 
         def at(share: float) -> tuple[dict[str, Any], Instants]:
             u: dict[str, Any] = {name: low + share * rise for name, (low, rise) in ends.items()}
@@ -160,16 +160,16 @@ class _Integration:
     def _rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
         """Return the rate of each state by name, with the effects on rates except dry friction and bounds."""
         out = self.law.rates(s, p, now.u)
-        for form, numbers in self.effects:
-            if form.side == "rate" and not (form.sticks or form.stops):
-                out[form.target] = out[form.target] + form.act(s, now, numbers)
+        for e in self.effects:
+            if e.form.side == "rate" and not (e.form.sticks or e.form.stops):
+                out[e.form.target] = out[e.form.target] + e.form.act(s, now, e.values)
         return out
 
     def _intervals(self, k: int) -> Iterator[tuple[float, float]]:
         """Yield the intervals, as shares of the gap after position k, between the discontinuities of any run."""
         here, there = self.rows_by_position_and_run[k], self.rows_by_position_and_run[k + 1]
         begin, gap = self.table.t[here], self.table.t[there] - self.table.t[here]
-        moments = [np.ravel(form.breaks(numbers)) for form, numbers in self.effects if form.breaks is not None]
+        moments = [np.ravel(e.form.breaks(e.values)) for e in self.effects if e.form.breaks is not None]
         moments += [self.table.t + tau for tau in self.delays.values()]
         inside: FloatArray = np.zeros(0)
         if moments:

@@ -168,9 +168,8 @@ def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) ->
     """Fit two proposals to samples, (n_samples, n_params): the best wide form, then the best narrow form.
 
     Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's width or less.
-    Either with or without clusters. Of each form the variant with the greatest held-out likelihood (fit to one half,
-    score on the other) is fitted to all samples. The caller decides between the two by weighted draws: the likelihood
-    favours a close fit, the weights a wide one. Fewer than 80 samples give one wide kernel only.
+    Of each form the variant, with or without clusters, with the greatest held-out likelihood is fitted to all samples.
+    That favours a close fit, weights of draws a wide one. Fewer than 80 samples give one wide kernel only.
     """
     x = x[rng.permutation(len(x))]
     half = len(x) // 2

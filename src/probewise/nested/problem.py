@@ -393,15 +393,12 @@ def make_problem(
         that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
         `probewise.priors`, pairs (low, high) for uniform ones, or frozen continuous ones of scipy.stats. A function
         suffices for `run`; `refine`, `update` and `diversify` need the prior's density or inverse.
-    names
-        Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default.
-    vectorized
-        Whether the functions take many points at once, (n_samples, n_params), and return one result per point: much
-        faster with NumPy.
-    pass_dict
-        Whether the likelihood takes a dict of parameters by name instead of an array.
-    periodic
-        Names of parameters whose range is periodic.
+    names, periodic
+        Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default; and
+        of those whose range is periodic.
+    vectorized, pass_dict
+        Whether the functions take many points at once, (n_samples, n_params), and return one result per point, much
+        faster with NumPy; whether the likelihood takes a dict of parameters by name instead of an array.
 
     ParameterError if an argument has the wrong type, or names and prior do not match.
     """

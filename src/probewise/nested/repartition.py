@@ -3,8 +3,7 @@
 Evidence and posterior depend only on the product of prior and likelihood, so any density may replace the prior if the
 likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835). From a density near the
 posterior there are few nats of compression, which lowers the cost and the error of a run. Live points climb to regions
-that the density undersamples, where importance sampling would depend on a few weights. A distant part of the posterior
-without any sample stays unseen.
+that the density undersamples; a distant part of the posterior without any sample stays unseen.
 """
 
 from __future__ import annotations

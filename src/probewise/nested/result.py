@@ -120,8 +120,8 @@ class Samples(ShowsItself):
 class Agreement:
     """A test whether independent runs of one problem agree within their errors.
 
-    `log_z` and `log_z_error` of each run; `chi_square`: sum of the squared deviations from their weighted mean, in
-    units of each run's error; `p_value`: probability of a chi-square at least as large if the errors are right.
+    `chi_square`: sum of the squared deviations of the runs' `log_z` from their weighted mean, in units of each
+    `log_z_error`; `p_value`: probability of a chi-square at least as large if the errors are right.
     """
 
     log_z: tuple[float, ...]
@@ -142,10 +142,9 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Check:
-    """A second, independent estimate of the evidence; see `probewise.nested.check`.
+    """A second, independent estimate of the evidence by a method, the `route`; see `probewise.nested.check`.
 
-    `route` is the method, in words; `log_z`, `log_z_error` are its estimate; `distance` is the run's log Z minus this
-    one, in units of the combined error; `n_calls` the likelihood evaluations used.
+    `distance` is the run's log Z minus this one, in units of the combined error.
     """
 
     route: str
@@ -350,8 +349,7 @@ def archive_bytes(head: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]
 def read_archive(path: Path, form: str, wanted: str, *, cure: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read the JSON object, without its "format", and the arrays of a file of `archive_bytes`.
 
-    `wanted` is, for messages, what it should be. FileError if it is missing or no such file, or its format is not
-    `form` (`cure`: the way out).
+    FileError if it is missing or not what is `wanted`, or its format is not `form` (`cure`: the way out).
     """
     try:
         # Opened here, since np.load leaves a damaged file open.

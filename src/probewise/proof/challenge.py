@@ -119,13 +119,11 @@ def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
 def log_densities_of_scans(
     case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Return the log predictive density of each held-out scan under up to four models, in nats, summed over readings.
+    """Return the log predictive density of each held-out scan, by its name, under up to four models, by name, in nats.
 
     "null" and "repaired" are the diagnosis's models without effects and with those found. "right", if all concealed
     effects are in the vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the
     same readings. "true" is an upper limit (exact for white noise): it knows the noise-free readings and the noise sd.
-
-    Returns values by name of the scan ("angle", "pattern", "direction"), then of the model.
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
@@ -341,13 +339,10 @@ _N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the densi
 def log_densities_of_runs(
     case: SystemCase, diagnosis: Diagnosis, later: RunTable, refit: SystemRefit, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Return the log predictive density of each held-out run under up to four models, in nats, summed over readings.
+    """Return as `log_densities_of_scans` for the held-out runs "inside" the range of the recorded ones and "beyond" it.
 
-    "null" and "repaired" are the diagnosis's models without effects and with those found. "right" knows the concealed
-    effects: absent without effects or if the fit fails. "true" knows the noise-free reading.
-
-    Returns values by run, "inside" the range of the recorded runs and "beyond" it, then by model; not finite ones are
-    left out.
+    "right" knows the concealed effects: absent without effects or if the fit fails. "true" knows the noise-free
+    reading. What is not finite is left out.
     """
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
@@ -401,12 +396,10 @@ def _right_predictions(
 def predict_runs(
     samples: ModelSamples, about: ReferenceFit, table: RunTable, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict new runs: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
+    """Predict the new runs of a table: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
 
     Parameters per run are drawn from their prior, and an effect's values per run as `predict_system` draws them.
-
-    `samples`: posterior samples of the model; `about`: the reference fit of the diagnosis, from which its effects have
-    their scales; `table`: the new runs; `rng`: random generator, for the choice of samples and for the values per run.
+    `about`: the reference fit of the diagnosis, from which its effects have their scales.
     """
     chain = cast(SystemChain, samples.chain)
     system = chain.system.with_added_runs(table)

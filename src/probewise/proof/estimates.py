@@ -32,9 +32,13 @@ class Estimate:
     high: float
     n: int = 0
 
+    @property
+    def half_width(self) -> float:
+        """Half the length of the interval."""
+        return 0.5 * (self.high - self.low)
+
     def __str__(self) -> str:
-        half = 0.5 * (self.high - self.low)
-        return f"{self.value:.3g} ± {half:.2g}"
+        return f"{self.value:.3g} ± {self.half_width:.2g}"
 
 
 _NOTHING = Estimate(math.nan, math.nan, math.nan, 0)

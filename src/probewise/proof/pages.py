@@ -148,7 +148,7 @@ def study_sentence(table: Mapping[SearchConfiguration, Summary]) -> str:
     row, found = next(iter(table.items()))
     share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
     return (
-        f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, _half_width(found.mean))} readings "
+        f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, found.mean.half_width)} readings "
         f"on average, median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
     )
 
@@ -214,18 +214,14 @@ def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
         estimates = [getattr(found, name) for name in _COLUMNS]
         values = [value for e in estimates for value in (e.value, e.low, e.high)]
         values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
-        rows.append([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])
+        rows.append([row.name, found.n_runs, *map(_csv_cell, values)])
     return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
 
 
 def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
     """Write an estimate, times a scale, with its error; without, if that is 0 or unknown."""
-    value, half = scale * estimate.value, scale * _half_width(estimate)
+    value, half = scale * estimate.value, scale * estimate.half_width
     return value_with_error(value, half) if half > 0 else number_text(value, 1)
-
-
-def _half_width(estimate: Estimate) -> float:
-    return 0.5 * (estimate.high - estimate.low)
 
 
 def concealed_page(results: Mapping[ConcealedTrial, Result], *, command: str) -> CampaignPage:

@@ -147,11 +147,10 @@ def cosines_with_vocabulary(
 ) -> dict[str, float]:
     """Return the cosine of an effect's residuals, after a refit of the null model, with every named effect on the mean.
 
-    `refit`: the null model's refit; `clean`, `changed`: noise-free readings without and with the effect; `vocabulary`:
-    the effects to compare with, by name; those that cannot act in this plan or act on the noise are left out. Returns
-    cosine rho by name: the square root of the share of the residual sum of squares that the named effect, at its best
-    fit and together with the null model, explains: from a full refit if the linearised rho is above 0.8. If "halo" or
-    "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF, which is no missing physics.
+    `clean`, `changed`: noise-free readings without and with the effect. Effects that cannot act in this plan or act on
+    the noise are left out. The cosine rho is the square root of the share of the residual sum of squares that the named
+    effect, at its best fit and together with the null model, explains: from a full refit if the linearised rho is above
+    0.8. If "halo" or "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF.
     """
     rivalry = refit.rivalry(clean, changed)
     out: dict[str, float] = {}
@@ -173,12 +172,10 @@ def cosines_with_vocabulary(
 def residual_norms_with_one_named(
     refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
 ) -> dict[str, float]:
-    """Return the norm of two effects' residuals after a fit of the null model and one of them, in reading units.
+    """Return the norm of two effects' residuals after a fit of the null model and one of them, by its name.
 
-    `refit`: the null model's refit; `clean`, `both`: noise-free readings without any effect and with both; `names`:
-    effects fitted together with the null model, one at a time. Returns norm of the residuals by name of the fitted
-    effect; divided by the noise sd, it is the size of the other effect given this one. It may be much smaller than the
-    other's size alone: a saturation can hide a stain.
+    `clean`, `both`: noise-free readings without any effect and with both. Divided by the noise sd, the norm is the size
+    of the other effect given this one. It may be much smaller than its size alone: a saturation can hide a stain.
     """
     rivalry = refit.rivalry(clean, both)
     out = {}

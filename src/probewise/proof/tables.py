@@ -249,10 +249,8 @@ def confusion_counts(
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
     """Count answers by truth, over cases of kind "clean", "single" and "outside".
 
-    An answer that is an alias of the truth counts as the truth. Only names that occur have a row or a column. `label`
-    maps a name to that of its row and column, e.g. to merge several.
-
-    Returns truths, in the order of the vocabulary; answers; counts, (n_truths, n_answers).
+    An answer that is an alias of the truth counts as the truth. `label` maps a name to that of its row and column, e.g.
+    to merge several. Returns the truths and answers that occur, and counts, (n_truths, n_answers).
     """
     counts: Counter[tuple[str, str]] = Counter()
     for result in _of(results, "clean", "single", "outside"):

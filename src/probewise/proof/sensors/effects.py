@@ -358,12 +358,10 @@ def amplitude_of_size(
     """Return an amplitude greater than 0 at which `size` has the requested value.
 
     Size grows roughly as a power of the amplitude: steps follow a straight line in log-log coordinates, first by
-    extrapolation, then by interpolation, with bisection where interpolation gains too little.
-
-    `size`: function from amplitude to size; `wanted`: requested size, greater than 0; `first`: first amplitude tried;
-    `tolerance`: relative error of the size at which the search ends; `acceptable`: relative error accepted when the
-    search ends otherwise; `max_calls`: largest number of calls of `size`. Raises NotConvergedError if even the limit is
-    too small, or no amplitude has an acceptable size; `partial` holds (amplitude, size) of the nearest.
+    extrapolation, then by interpolation, with bisection where interpolation gains too little. `first`: first amplitude
+    tried; `tolerance`: relative error of the size at which the search ends; `acceptable`: accepted when it ends
+    otherwise. Raises NotConvergedError if even the limit is too small, or no amplitude has an acceptable size;
+    `partial` holds (amplitude, size) of the nearest.
     """
     low: tuple[float, float] | None = None  # log amplitude and log(size / wanted), size too small
     high: tuple[float, float] | None = None  # the same, size too large

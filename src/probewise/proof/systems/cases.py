@@ -120,8 +120,7 @@ class DrawnSystem:
 
 
 AfterRefit: TypeAlias = Callable[[DrawnSystem, FloatArray], FloatArray]
-"""Residuals, in noise sds, (n_points,), of noise-free readings of the rows that are not held out after a refit of the
-model without effects. Its own error, the residuals without effects, must not be counted. NotConvergedError: no fit."""
+"""Residuals of noise-free readings, (n_points,), in sds, after a refit, whose own error must not be counted."""
 
 
 @dataclass(frozen=True, eq=False)

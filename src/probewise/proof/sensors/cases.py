@@ -89,30 +89,18 @@ def stratum_in_wheel(
 
 @dataclass(frozen=True)
 class HiddenEffect:
-    """One concealed effect.
+    """One concealed effect, with its parameters.
 
-    `effect`: the effect with its parameters; `size_lambda`: norm of its change after a refit of the null model, in
-    noise sds; `region`: region where it acts; None: not a local effect.
+    `size_lambda`: norm of its change after a refit of the null model, in noise sds; `covariates`: those along which its
+    residual is visible; `region`: where it acts; None: not a local effect.
     """
 
+    name: str
     effect: Concealed
     size_lambda: float
-    region: CovariateRegion | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the effect."""
-        return self.effect.name
-
-    @property
-    def in_vocabulary(self) -> bool:
-        """Whether the effect is in the vocabulary of a diagnosis."""
-        return self.name in INSIDE
-
-    @property
-    def covariates(self) -> tuple[str, ...]:
-        """Names of the covariates along which the effect's residual is visible."""
-        return SAMPLERS[self.name].covariates
+    in_vocabulary: bool
+    covariates: tuple[str, ...]
+    region: CovariateRegion | None
 
 
 ALIASES: tuple[tuple[str, str], ...] = (
@@ -264,4 +252,6 @@ def draw_effect_of_size(name: str, wanted: float, setup: CleanSetup, rng: np.ran
     if sampler.scalable:
         amplitude = amplitude_of_size(lambda a: setup.size(of_amplitude(a)), wanted, first=amplitude, limit=limit)
     effect = of_amplitude(amplitude)
-    return HiddenEffect(effect, setup.size(effect), setup.region(effect))
+    return HiddenEffect(
+        name, effect, setup.size(effect), name in INSIDE, sampler.covariates, region=setup.region(effect)
+    )

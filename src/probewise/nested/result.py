@@ -28,6 +28,7 @@ from probewise.nested.evidence import birth_rows, log_volumes
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
 _FORMAT = "nested-result/4"
+# How an array is kept, by the annotation of its field.
 _READ_ONLY: Mapping[object, Callable[[Any], NDArray[Any]]] = {"FloatArray": read_only_floats, "IntArray": frozen_int}
 
 

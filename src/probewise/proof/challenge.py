@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tempfile
 import time
@@ -359,7 +358,7 @@ def log_densities_of_runs(
             *predict_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings
         )
     if case.effects:
-        with contextlib.suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
+        with suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
             scores["right"] = _log_mean_density(*_right_predictions(case, refit, rng=fitting), readings)
     run = case.drawn.table.run[rows]
     names = {case.drawn.table.n_runs - 2: "inside", case.drawn.table.n_runs - 1: "beyond"}

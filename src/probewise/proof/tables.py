@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -32,18 +31,16 @@ HONEST_NATS = 3.0
 
 _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
 
-COUNTERPARTS: Mapping[str, str] = MappingProxyType(
-    {
-        "bent_rail": "bent_rails",
-        "twisted_rail": "bent_rails",
-        "place_step": "missing_tooth",
-        "stick_slip": "stick_slip",
-        "slipped_paper": "arm_knock",
-        "ghost": "reflection",
-        "cross_talk": "polarisation",
-        "after_glow": "overshoot",
-    }
-)
+COUNTERPARTS: Mapping[str, str] = {
+    "bent_rail": "bent_rails",
+    "twisted_rail": "bent_rails",
+    "place_step": "missing_tooth",
+    "stick_slip": "stick_slip",
+    "slipped_paper": "arm_knock",
+    "ghost": "reflection",
+    "cross_talk": "polarisation",
+    "after_glow": "overshoot",
+}
 """The rare effect of a diagnosis that acts as a concealed effect out of vocabulary does."""
 
 
@@ -675,18 +672,15 @@ def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | N
     return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
 
 
-def _all_gains(results: Iterable[Result], best: str) -> list[tuple[float, float]]:
-    return [g for g in (gains_on_held_out_runs(r, best) for r in results) if g is not None]
-
-
 def _held_out_runs(done: list[Result]) -> Iterator[ScoreRow]:
-    named = _all_gains(_of(done, "single", "pair"), "right")
-    shares = np.array([repaired / right for repaired, right in named if right >= _LEAST_NATS])
+    named = (gains_on_held_out_runs(r, "right") for r in _of(done, "single", "pair"))
+    shares = np.array([gains[0] / gains[1] for gains in named if gains is not None and gains[1] >= _LEAST_NATS])
     found = estimated_statistic(shares, lambda values: float(np.median(values)))
     yield ScoreRow("held-out runs: median share of the right model's gain", found, 0.95)
-    every, clean = _all_gains(done, "true"), _all_gains(_of(done, "clean"), "true")
-    yield _share("held-out worse than the null by over 3 nats", [bool(g < -3.0) for g, _ in every])
-    yield _share("  of those without an effect on the mean", [bool(g < -3.0) for g, _ in clean])
+    clean = "held-out worse than the null by over 3 nats", "  of those without an effect on the mean"
+    for name, cases in zip(clean, (done, _of(done, "clean")), strict=True):
+        each = (gains_on_held_out_runs(r, "true") for r in cases)
+        yield _share(name, [bool(gains[0] < -3.0) for gains in each if gains is not None])
 
 
 def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:

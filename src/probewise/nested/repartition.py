@@ -58,7 +58,7 @@ class _PriorNearPosterior:
         self.center = np.stack([group.mean(axis=0) for group in x])
         self.root = np.stack([covariance_root_of_points(group, _WIDENING) for group in x])
         self.inverse_root: FloatArray = np.linalg.inv(self.root)
-        self._log_dets: FloatArray = np.linalg.slogdet(self.root)[1]
+        self._log_dets: FloatArray = np.asarray(np.linalg.slogdet(self.root)[1], dtype=np.float64)
 
     @property
     def coordinates(self) -> _PriorNearPosterior:

@@ -57,7 +57,7 @@ class _PriorNearPosterior:
         self.share: FloatArray = np.array([len(group) for group in x]) / sum(map(len, x))
         self.center = np.stack([group.mean(axis=0) for group in x])
         self.root = np.stack([covariance_root_of_points(group, _WIDENING) for group in x])
-        self.inverse_root: FloatArray = np.linalg.inv(self.root)
+        self.inverse_root: FloatArray = np.asarray(np.linalg.inv(self.root), dtype=np.float64)
         self._log_dets: FloatArray = np.asarray(np.linalg.slogdet(self.root)[1], dtype=np.float64)
 
     @property

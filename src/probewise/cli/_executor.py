@@ -21,10 +21,10 @@ from probewise.errors import DoubtfulResultWarning, LinkError
 if TYPE_CHECKING:
     from concurrent.futures import Executor, ProcessPoolExecutor
 
-    from probewise.proof.campaign import Campaign, Keyed, Result
+    from probewise.proof.campaign import Campaign, Result
     from probewise.proof.pages import CampaignPage
 
-K = TypeVar("K", bound="Keyed")
+K = TypeVar("K")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

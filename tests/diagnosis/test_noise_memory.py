@@ -134,7 +134,7 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
     for case in range(8):
         law = replace(_law(share, times, step), lost=lost if case % 2 else np.zeros(N, dtype=bool))
         residuals = 0.3 * _draw(law, rng)
-        known = with_known_wide_readings(law, residuals)
+        known = with_known_wide_readings([law], residuals)[0]
         whitened = known(residuals)[:, None]
         sigma = known.likeliest_sigma(whitened)
         log_density = -float(known.minus_log_likelihood(whitened, sigma)[0]) - 0.5 * known.n_kept * math.log(
@@ -147,7 +147,7 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
 
 @pytest.mark.parametrize("far", [1e200, np.inf, np.nan])
 def test_predictions_that_ran_away_are_no_error(far):
-    law = with_known_wide_readings(_law(0.05, 10.0, 0.5), np.full(N, far))
+    law = with_known_wide_readings([_law(0.05, 10.0, 0.5)], np.full(N, far))[0]
     assert law.whitened_density.is_normal
 
 
@@ -157,7 +157,7 @@ def test_a_held_out_reading_is_wide_or_narrow_by_prior_not_by_what_it_reads():
     law = _law(0.05, 20.0, 0.6)
     residuals = np.cumsum(0.6 * rng.normal(size=N)) + law.sd * rng.normal(size=N)
     residuals[5] += 30.0
-    known = with_known_wide_readings(law, residuals)
+    known = with_known_wide_readings([law], residuals)[0]
     out = np.arange(N) == 5
     slopes = np.zeros((N, 1))
     own = predictive_log_densities(known, out, residuals, slopes, np.zeros(1), np.eye(1), 1.0)

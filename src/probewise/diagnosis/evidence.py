@@ -188,7 +188,9 @@ class Linearised:
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, beside: FloatArray | None = None) -> Linearised:
         """Linearise a fit under noise `law`; `beside` are slopes (n_points, k) by additional coordinates of 0."""
-        law, slopes, z = law.without_readings_beyond_end(found.residuals), found.slopes, found.z
+        # A censored reading that is predicted beyond the end tells nothing, whatever small change is added.
+        beyond = law.is_censored & (found.residuals == 0)
+        law, slopes, z = replace(law, lost=law.lost | beyond) if beyond.any() else law, found.slopes, found.z
         if beside is not None:
             slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
         n_points, p = slopes.shape

@@ -15,7 +15,6 @@ from probewise.diagnosis.search.hypotheses import (
     Evidences,
     Refits,
     _amplitudes_in_residual,
-    is_significantly_better,
     posterior_of,
 )
 from probewise.diagnosis.search.search import search_with_formulas
@@ -56,7 +55,7 @@ def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
     assert weighed.evidence[()].log_z > state.null.evidence[()].log_z + 20
     idle = state.refits.refit_with_effect(state.null, state.effects["input_offset:force"])[0]
     assert idle.evidence.keys() == state.null.evidence.keys()
-    assert not is_significantly_better(idle, state.null)
+    assert not idle.is_significantly_better(state.null)
     assert idle.log_z <= state.null.log_z + 0.02
 
 

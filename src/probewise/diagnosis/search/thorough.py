@@ -174,7 +174,9 @@ def _weigh_by_nested_sampling(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     once = HypothesisProblem(candidate.found.model, searched.prepared.recording, evidence, candidate.found.z)
     # Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
-    log_factor = candidate.log_prior_factor - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
+    log_factor = (
+        candidate.log_share + candidate.log_detectable - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
+    )
     n_live = max(n_live, nested.LIVE_PER_PARAM * once.model.n_params)
     run = partial(
         nested.run,

@@ -490,6 +490,17 @@ def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
     return RoundedNormal(first, second, laws[0].sd_beside_rounding) if laws[0].flat else Tail(first, second)
 
 
+def whiten_under_each(laws: Sequence[NoiseLaw], columns: FloatArray) -> FloatArray:
+    """Whiten columns (n_points, n_columns) under each of several distributions, (n_laws, n_points, n_columns)."""
+    if any(law.lost.any() or not law.walk.size for law in laws):
+        return np.stack([law(columns) for law in laws])
+    # All walks are solved in one call: between their blocks the bands are 0.
+    roots = np.concatenate([law._difference_covariance_root for law in laws], axis=1)
+    steps = np.tile(np.diff(columns, axis=0, prepend=0.0), (len(laws), 1))
+    solved, _ = dtbtrs(roots, np.asfortranarray(steps), uplo="L", overwrite_b=1)
+    return np.ascontiguousarray(solved).reshape(len(laws), *columns.shape)
+
+
 def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
     """Return white noise of `n_points` readings; `least` is the smallest conditional sd, as in `NoiseLaw`."""
     return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_), least=least)
@@ -801,9 +812,8 @@ class NoiseModel:
 
     def _lost_readings(self, share: float, value: float, far: BoolArray) -> tuple[BoolArray, float]:
         """Return the mask of the readings lost to a value, (n_usable,), and their log probability."""
-        span = float(np.ptp(self._readings))
+        span, resolution = self._span_and_resolution
         lost = far & (np.abs(self._readings - value) <= 1e-9 * span + 1e-14 * abs(value))
-        resolution = self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
         n_lost, cells = int(lost.sum()), max(span / resolution, 1.0)
         # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
         log_extra = n_lost * math.log(share / resolution)
@@ -826,6 +836,11 @@ class NoiseModel:
     @cached_property
     def _rounding_step(self) -> float:
         return lattice_step(self._readings)
+
+    @cached_property
+    def _span_and_resolution(self) -> tuple[float, float]:
+        """Span of the readings, and to what a lost reading's value is known."""
+        return float(np.ptp(self._readings)), self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
     def _rows_before(self) -> tuple[IntArray, IntArray, IntArray]:

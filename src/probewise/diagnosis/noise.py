@@ -219,18 +219,6 @@ def _log_fisher_information(half: float | FloatArray) -> FloatArray:
     return np.asarray(np.interp(log_half, _LOG_HALVES, _tabulated_log_information()) - beyond)
 
 
-def _no_numbers() -> FloatArray:
-    return np.zeros(0)
-
-
-def _no_rows() -> IntArray:
-    return np.zeros(0, dtype=np.int64)
-
-
-def _no_mask() -> BoolArray:
-    return np.zeros(0, dtype=np.bool_)
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseLaw:
     """The joint distribution of all readings' noise, up to its overall sd; all arrays are (n_points,).
@@ -261,10 +249,10 @@ class NoiseLaw:
     flat: float = 0.0
     sigma: float = 1.0
     least: float = 0.0
-    walk: FloatArray = field(default_factory=_no_numbers)
-    before: IntArray = field(default_factory=_no_rows)
-    wide: FloatArray = field(default_factory=_no_numbers)
-    censored: BoolArray = field(default_factory=_no_mask)
+    walk: FloatArray = field(default_factory=lambda: np.zeros(0))
+    before: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    wide: FloatArray = field(default_factory=lambda: np.zeros(0))
+    censored: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     @cached_property
     def kept(self) -> FloatArray:
@@ -435,7 +423,7 @@ class NoiseLaw:
         plain = replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
         if not self.wide.size:
             return plain
-        return replace(plain, sd=self.sd * np.sqrt(self.relative_precision), wide=_no_numbers())
+        return replace(plain, sd=self.sd * np.sqrt(self.relative_precision), wide=np.zeros(0))
 
     @property
     def relative_precision(self) -> FloatArray:
@@ -515,7 +503,7 @@ def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> Noi
     return replace(
         white_noise(int(usable.sum()), least=max(least, sd_of_numbers(recording))),
         sd=recording.relative_sd[usable],
-        censored=censored[usable] if censored.any() else _no_mask(),
+        censored=censored[usable & censored.any()],
     )
 
 
@@ -768,7 +756,11 @@ class NoiseModel:
         for effect, own in effects_with_columns(self.effects):
             noise = effect.apply(noise, settings[:, own], self.recording.plan)
         far = np.abs(residuals) > _FAR * sd
-        laws = tuple(self._law_at_node(noise, k, far) for k in range(len(settings)))
+        names = "rho", "walk", "wide_share", "wide_times", "lost_share", "lost_value"
+        each = (np.broadcast_to(getattr(noise, name)[:, 0], len(settings)).tolist() for name in names)
+        sds = noise.sd if noise.sd.shape[1] == 1 else noise.sd[:, self.recording.usable]
+        sds = np.broadcast_to(sds, (len(settings), len(far)))
+        laws = tuple(self._law(far, *values) for values in zip(sds, *each, strict=True))
         if not (laws and laws[0].walk.size and laws[0].share):
             return laws
         left, at_once = self._readings - predicted, max(_AT_ONCE // len(predicted), 1)
@@ -783,13 +775,17 @@ class NoiseModel:
         sd = max(float(np.median(np.abs(free))) / MAD_OF_NORMAL, self._rounding_step / math.sqrt(12))
         return residuals, sd or 1.0
 
-    def _law_at_node(self, noise: NoiseParameters, node: int, far: BoolArray) -> NoiseLaw:
-        def at_node(values: FloatArray) -> FloatArray:
-            return np.asarray(values[min(node, len(values) - 1)])
-
-        names = "rho", "walk", "wide_share", "wide_times", "lost_share", "lost_value"
-        rho, step, share, times, lost_share, value = (float(at_node(getattr(noise, name))[0]) for name in names)
-        sd = at_node(noise.sd)
+    def _law(
+        self,
+        far: BoolArray,
+        sd: FloatArray,
+        rho: float,
+        step: float,
+        share: float,
+        times: float,
+        lost_share: float,
+        value: float,
+    ) -> NoiseLaw:
         lost, log_extra = self._lost_readings(lost_share, value, far) if lost_share > 0 else (np.zeros_like(far), 0.0)
         carry, (n_rows, above, before) = np.zeros(len(far)), self._rows_before
         if rho:
@@ -798,16 +794,16 @@ class NoiseModel:
             alone = (n_rows == 0) | unknown | (above >= 0) & unknown[above]
             carry = np.where(alone, 0.0, rho ** np.maximum(n_rows, 1))
         return NoiseLaw(
-            np.full(len(far), sd[0]) if len(sd) == 1 else sd[self.recording.usable],
+            sd,
             carry,
             lost,
             share,
             times,
             log_extra,
             least=self._floor,
-            walk=step**2 * self._n_rows_since_previous if step else _no_numbers(),
-            before=before if rho else _no_rows(),
-            censored=self._censored if self._censored.any() else _no_mask(),
+            walk=step**2 * self._n_rows_since_previous if step else np.zeros(0),
+            before=before if rho else before[:0],
+            censored=self._censored[: len(far) * self._censored.any()],
         )
 
     def _lost_readings(self, share: float, value: float, far: BoolArray) -> tuple[BoolArray, float]:
@@ -847,7 +843,7 @@ class NoiseModel:
         """Numbers of rows and of the reading before each in its scan, and that for `NoiseLaw`, empty if next above."""
         above = previous_usable(self.recording)
         interleaved = np.any((above >= 0) & (above != np.arange(len(above)) - 1))
-        before = np.maximum(above, 0) if interleaved else _no_rows()
+        before = np.maximum(above, 0) if interleaved else above[:0]
         return n_rows_since_previous_usable(self.recording), above, before
 
     @cached_property

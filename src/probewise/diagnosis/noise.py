@@ -731,15 +731,35 @@ class NoiseModel:
 
         `predicted` are predictions of the usable rows, (n_usable,). With `rounding`, each node is a noise sd.
         """
+        return self._nodes_about(predicted) if self._depends_on_fit else self._nodes_about_every_fit
+
+    @cached_property
+    def _nodes_about_every_fit(self) -> NoiseNodes:
+        return self._nodes_about(self._readings)
+
+    @cached_property
+    def _depends_on_fit(self) -> bool:
+        """Whether what a fit predicts changes the nodes or the distributions there."""
+        if self.rounding or any(e.nodes_about is not None and e.name not in self.likely for e in self.effects):
+            return True
+        settings, _ = self._grid(self._readings)
+        noise = self._parameters(settings, np.full((1, len(self.recording)), np.nan))
+        return bool(np.isnan(noise.sd).any() or noise.lost_share.any() or (noise.walk.any() and noise.wide_share.any()))
+
+    def _grid(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the settings of the parameters at all nodes about a fit, and their log weights."""
         residuals, sd = self._residuals_and_rough_sd(predicted)
         rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._readings)
-        whitened = residuals / sd
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for effect in self.effects:
-            bank, log_each = self.likely.get(effect.name) or effect.weighed_nodes(whitened, rows)
+            bank, log_each = self.likely.get(effect.name) or effect.weighed_nodes(residuals / sd, rows)
             every = [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))]
             settings = np.concatenate(every, axis=1)
             log_weights = (log_weights[:, None] + log_each).ravel()
+        return settings, log_weights
+
+    def _nodes_about(self, predicted: FloatArray) -> NoiseNodes:
+        settings, log_weights = self._grid(predicted)
         laws = self.laws_at(settings, predicted)
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
@@ -760,9 +780,7 @@ class NoiseModel:
         residuals, sd = self._residuals_and_rough_sd(predicted)
         span, seen = float(np.ptp(predicted)) or 1.0, np.zeros((1, len(self.recording)))
         seen[0, self.recording.usable] = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
-        noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=seen)
-        for effect, own in effects_with_columns(self.effects):
-            noise = effect.apply(noise, settings[:, own], self.recording.plan)
+        noise = self._parameters(settings, seen)
         far = np.abs(residuals) > _FAR * sd
         names = "rho", "walk", "wide_share", "wide_times", "lost_share", "lost_value"
         each = (np.broadcast_to(getattr(noise, name)[:, 0], len(settings)).tolist() for name in names)
@@ -774,6 +792,12 @@ class NoiseModel:
         left, at_once = self._readings - predicted, max(_AT_ONCE // len(predicted), 1)
         parts = [laws[k : k + at_once] for k in range(0, len(laws), at_once)]
         return tuple(law for part in parts for law in with_known_wide_readings(part, left))
+
+    def _parameters(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
+        noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=seen)
+        for effect, own in effects_with_columns(self.effects):
+            noise = effect.apply(noise, settings[:, own], self.recording.plan)
+        return noise
 
     def _residuals_and_rough_sd(self, predicted: FloatArray) -> tuple[FloatArray, float]:
         """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""

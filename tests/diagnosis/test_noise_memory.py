@@ -12,7 +12,13 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.held_out import predictive_log_densities
-from probewise.diagnosis.noise import NoiseLaw, innovations_given_rest, walk_given_readings, with_known_wide_readings
+from probewise.diagnosis.noise import (
+    NoiseLaw,
+    innovations_given_rest,
+    walk_given_readings,
+    whiten_under_each,
+    with_known_wide_readings,
+)
 
 _N = 40
 
@@ -143,6 +149,24 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
         wanted, wide = _by_enumeration(law, residuals, float(sigma[0]))
         assert log_density - known.half_log_det() + known.log_extra == pytest.approx(wanted, abs=0.06)
         np.testing.assert_allclose(known.wide, wide, atol=0.05)
+
+
+def test_many_distributions_are_worked_out_together_as_each_alone():
+    """Those of a tail beside a walk, which settle after different numbers of rounds, and whitening by each."""
+    rng = np.random.default_rng(6)
+    sd, lost = rng.uniform(0.5, 2.0, _N), np.arange(_N) == 4
+    walked = np.cumsum(rng.normal(size=_N)) + sd * rng.normal(size=_N) * np.where(np.arange(_N) % 9 == 0, 15.0, 1.0)
+    laws = [_law(share, times, step, sd) for share in (0.01, 0.2) for times in (3.0, 30.0) for step in (0.1, 1.0)]
+    laws += [replace(law, lost=lost) for law in laws]
+    together = with_known_wide_readings(laws, walked)
+    for law, own in zip(laws, together, strict=True):
+        (alone,) = with_known_wide_readings([law], walked)
+        np.testing.assert_array_equal(own.wide, alone.wide)
+        np.testing.assert_array_equal(own.sd, alone.sd)
+        assert own.log_extra == alone.log_extra
+    columns = rng.normal(size=(_N, 3))
+    for some in (together[:8], together, [law for law, _ in _laws().values()]):
+        np.testing.assert_array_equal(whiten_under_each(some, columns), [law(columns) for law in some])
 
 
 @pytest.mark.parametrize("far", [1e200, np.inf, np.nan])

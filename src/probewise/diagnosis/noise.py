@@ -257,7 +257,7 @@ class NoiseLaw:
     @cached_property
     def kept(self) -> FloatArray:
         """1 where a reading is not lost, else 0, (n_points,)."""
-        return 1.0 - self.lost
+        return np.where(self.lost, 0.0, 1.0)
 
     @property
     def is_censored(self) -> BoolArray:

@@ -536,7 +536,7 @@ def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[
 
     All of one or two; of more, the best, and the next too if bound to scans and of a twentieth of the best's weight.
     """
-    ranked = np.argsort(-weights).tolist()
+    ranked: list[int] = np.argsort(-weights).tolist()
     if len(weights) <= _FEW_VARIANTS:
         return ranked
     # Two scans of opposite direction are aliased to first order; a refit shows which one was turned.

@@ -323,22 +323,25 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
         state.sensors[sensor.n_gaussians] = sensor
         return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), recording.plan), starts, law))
 
-    extent = Extent.of(recording)
-    first = default_sensor(extent, 1) if null is None else null
-    starts = starts_of_one_gaussian(first) if null is None else null.starts
-    last = fit_and_keep(first, starts, white_noise_of_recording(recording, least=noises.least_sd))
-    if n_forms > 1:
-        free, z = with_free_form(first), last.found.z
-        start = np.pad(z, (0, free.n_params - len(z)))[None, :]  # the weights begin at 0
-        best = max(fit_and_keep(free, start, refits.likeliest_law(last)).log_z, last.log_z)
-        for n in range(2, max_order + 2):
-            # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
-            if n > 2 and last.log_z < best - ALIASED_NATS:
-                break
-            wanted = default_sensor(extent, n)
-            starts = starts_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
-            last = fit_and_keep(wanted, starts, refits.likeliest_law(last))
-            best = max(best, last.log_z)
+    law = white_noise_of_recording(recording, least=noises.least_sd)
+    if null is not None:
+        fit_and_keep(null, null.starts, law)
+    else:
+        extent = Extent.of(recording)
+        one = default_sensor(extent, 1)
+        last = fit_and_keep(one, starts_of_one_gaussian(one), law)
+        if max_order > 1:
+            free, z = with_free_form(one), last.found.z
+            start = np.pad(z, (0, free.n_params - len(z)))[None, :]  # the weights begin at 0
+            best = max(fit_and_keep(free, start, refits.likeliest_law(last)).log_z, last.log_z)
+            for n in range(2, max_order + 2):
+                # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
+                if n > 2 and last.log_z < best - ALIASED_NATS:
+                    break
+                wanted = default_sensor(extent, n)
+                starts = starts_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
+                last = fit_and_keep(wanted, starts, refits.likeliest_law(last))
+                best = max(best, last.log_z)
     if noises.add_significant_pairs(state.null.found, state.null.evidence):
         state.progress("weighing pairs of noises")
         for candidate in state.nulls:
@@ -523,8 +526,8 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     Of a difference of two columns, neither column alone need explain anything.
     """
     settled = state.refitted_combinations | state.undetected
-    best = _largest_scores_about_null(state)
-    scores = {names: value for names, value in best.items() if len(names) == 2 and names not in settled}
+    best = _largest_scores_about_null(state).items()
+    scores: dict[Names, float] = {names: value for names, value in best if len(names) == 2 and names not in settled}
     # All against what was best before: equal pairs are refitted, or none.
     for names in promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS):
         state.refit_stepwise(names)

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import solveh_banded
-from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs
+from scipy.linalg.lapack import dpbtrf, dpttrf, dpttrs, dtbtrs
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
@@ -359,7 +358,10 @@ class NoiseLaw:
         bands[0] = gained + variance
         bands[0, 1:] += variance[:-1]
         bands[1, :-1] = -variance[:-1]
-        return _banded_root(bands)
+        root, failed = dpbtrf(bands, lower=1)  # scipy's own wrapper takes longer than the factor of a hundred rows
+        if failed:
+            raise np.linalg.LinAlgError("the covariance of a random walk is not definite")
+        return np.asarray(root)
 
     def half_log_det(self) -> float:
         """Return half the log determinant of the relative covariance."""
@@ -559,9 +561,7 @@ def walk_given_readings(law: NoiseLaw, residuals: FloatArray) -> FloatArray:
     """Return the expected random walk in residuals, given all of them, (n_points,); 0 without a walk."""
     if not law.walk.size:
         return np.zeros(len(residuals))
-    weight, bands = law.kept / law.sd**2, _precision_bands_of_walk(law)
-    bands[0] += weight
-    return np.asarray(solveh_banded(bands, weight * residuals, lower=True, check_finite=False))
+    return _smoothed_and_variance(_precision_bands_of_walk(law), law.kept / law.sd**2, residuals)[0]
 
 
 def _precision_bands_of_walk(law: NoiseLaw) -> FloatArray:
@@ -601,8 +601,8 @@ def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) ->
         apart, beside = (residuals - smoothed) / unshared, variance / unshared  # from the walk as the others tell it
         last = sigma
         if k:
-            squares = weight * (residuals - smoothed) * residuals
-            sigma = np.sqrt(np.maximum([np.mean(a[b]) for a, b in zip(squares, kept, strict=True)], 0.0))
+            squares = np.sum(weight * (residuals - smoothed) * residuals, axis=1)
+            sigma = np.sqrt(np.maximum(squares, 0.0) / kept.sum(axis=1))
         else:  # whatever some outlying readings are
             sizes = np.abs(apart / np.sqrt(beside + own))
             sigma = np.array([np.median(a[b]) for a, b in zip(sizes, kept, strict=True)]) / MAD_OF_NORMAL
@@ -641,22 +641,14 @@ def _smoothed_and_variance(
 
     `steps` are the bands of the walk's precision, (2, n_points); `weight` the precisions of the readings, (n_points,).
     """
-    bands = steps.copy()
-    bands[0] += weight
-    root = _banded_root(bands)
+    diagonal, below = steps[0] + weight, steps[1, :-1]
     # The inverse's diagonal from the pivots of elimination forwards and backwards.
-    backwards = np.stack([bands[0, ::-1], np.append(bands[1, -2::-1], 0.0)])
-    pivots = _banded_root(backwards)[0, ::-1] ** 2
-    smoothed, _ = dpbtrs(root, weight * residuals, lower=1)
-    return np.asarray(smoothed), np.asarray(1 / (root[0] ** 2 + pivots - bands[0]))
-
-
-def _banded_root(bands: FloatArray) -> FloatArray:
-    """Return the Cholesky factor of a matrix of bandwidth one, its diagonal and the one below, (2, n), as given."""
-    root, failed = dpbtrf(bands, lower=1)  # scipy's own wrapper takes longer than the factor of a hundred rows
+    forwards, lower, failed = dpttrf(diagonal, below)
+    backwards, _, _ = dpttrf(diagonal[::-1], below[::-1])
     if failed:
-        raise np.linalg.LinAlgError("a covariance of the noise is not definite")
-    return np.asarray(root)
+        raise np.linalg.LinAlgError("the precision of a random walk is not definite")
+    smoothed, _ = dpttrs(forwards, lower, weight * residuals)
+    return np.asarray(smoothed), np.asarray(1 / (forwards + backwards[::-1] - diagonal))
 
 
 def _log_normal_density(apart: FloatArray, variance: FloatArray) -> FloatArray:

@@ -326,12 +326,11 @@ class NoiseLaw:
             return self._whiten_with_walk(columns)
         y = columns * (self.kept / self._whitening_sd)[:, None]
         if np.any(self.carry):
-            carry, told = self.carry[:, None], np.zeros_like(y)
+            carry = self.carry[:, None]
             if self.before.size:
-                told = carry * y[self.before]
+                y -= carry * y[self.before]
             else:  # a view: an indexed copy of thousands of columns takes longer than the rest
-                np.multiply(carry[1:], y[:-1], out=told[1:])
-            y = np.subtract(y, told, out=told)
+                y[1:] -= carry[1:] * y[:-1]
             y /= np.sqrt(1 - carry**2)
         return y
 

@@ -176,8 +176,8 @@ _STRETCH = 6  # readings
 _SEED = 0  # the same rows of the same recording, whatever the seed of its diagnosis
 
 
-def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArray:
-    """Choose rows spread over the recording with about `most` usable readings; all rows if there are no more.
+def rows_to_diagnose(recording: Recording) -> IntArray:
+    """Choose rows spread over the recording with about 2,400 usable readings; all rows if there are no more.
 
     Whole scans are chosen, to preserve correlations between readings; or, if these would be fewer than eight, stretches
     of six successive rows. Both are spread evenly but not regularly, so that what repeats itself is seen at all phases.
@@ -185,9 +185,9 @@ def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArra
     Returns row numbers, ascending.
     """
     n_usable, scan, n_scans = int(recording.usable.sum()), recording.plan.scan, len(recording.plan.scan_names)
-    if n_usable <= most:
+    if n_usable <= MOST_READINGS:
         return np.arange(len(recording))
-    share = most / n_usable
+    share = MOST_READINGS / n_usable
     n_kept = math.floor(n_scans * share)
     if n_kept >= _FEWEST_SCANS:
         # One of each n_scans / n_kept, with the first and the last: scans that go there and back must not all go there.

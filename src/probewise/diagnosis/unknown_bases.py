@@ -117,9 +117,9 @@ def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: 
     products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
     if products.size == 0 or not formulas.templates:
         return bases
-    own, held = OrthonormalBlocks.of(problem, [bases[k] for k in products]), np.zeros(len(products), dtype=np.bool_)
-    for group in formulas.groups:
-        held |= _are_held(own.u, OrthonormalBlocks.of(problem, formulas.templates[group]))
+    own = OrthonormalBlocks.of(problem, [bases[k] for k in products]).u
+    blocks = (OrthonormalBlocks.of(problem, formulas.templates[group]) for group in formulas.groups)
+    held = np.any([_are_held(own, each) for each in blocks], axis=0)
     return bases.take_entries(np.delete(np.arange(len(bases.labels)), products[held]))
 
 

@@ -20,7 +20,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.effects.noise_distribution import FittedReadings, log_gaussian_mass_between
-from probewise.inference import sd_floor, sd_of_numbers
+from probewise.inference import sd_of_numbers
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
@@ -914,12 +914,6 @@ def _sd_nodes_with_rounding(
     log_weights = np.log(np.gradient(x))
     likely = height > height.max() - _UNLIKELY
     return np.exp(x[likely]), log_weights[likely]
-
-
-def least_sd_given_rounding(recording: Recording) -> float:
-    """Return the least sd of a normal density of the readings: the usual floor, and at least 0.6 of a rounding step."""
-    # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
-    return max(sd_floor(recording), HIDDEN * lattice_step(recording.readings[recording.usable]))
 
 
 def rough_sd(recording: Recording) -> float:

@@ -26,7 +26,7 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, least_sd_given_rounding, rough_sd
+from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, rough_sd
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
@@ -48,15 +48,14 @@ from probewise.effects.noise import (
     random_walk,
 )
 from probewise.errors import NotConvergedError
+from probewise.inference import sd_floor
 from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
 # Nats that are expected between two hypotheses, below which readings do not tell them apart: the contract's odds of 20
-# to 1. What has no name was believed half again as often as it was true, 371 times for 250, nearly always where one
-# name had made as much of the readings to within these three nats. As far behind the best, a noise model, SSF order or
-# proposal does not say what to refit next; at a cost: what looked worse by three nats before a refit was seen to be
-# better by eight after it.
+# to 1. As far behind the best, a noise model, SSF order or proposal does not say what to refit next; at a cost: a refit
+# can make what looked worse by three nats better by eight.
 ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
@@ -225,8 +224,9 @@ class NoiseModels:
     models: dict[Names, NoiseModel] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.least_sd = least_sd_given_rounding(self.recording)
         self._step = lattice_step(self.recording.readings[self.recording.usable])
+        # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
+        self.least_sd = max(sd_floor(self.recording), HIDDEN * self._step)
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
         known = {name: effect.known for name, effect in self.effects.items() if effect.known is not None}

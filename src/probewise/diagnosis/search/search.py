@@ -89,13 +89,11 @@ _REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 _PAIRED = 60
 _MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
 # Share of a template that a null leaves, below which a large effect may show in another way than to first order. The
-# width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off, and screening missed it
-# (495 concealed recordings of seed 9203); the threshold was not varied.
+# width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off.
 _FAINT = 0.35
 _ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no refit shows more
-# Leading combinations, of which each effect is left out in turn. A missing tooth of lambda 20 stood at a wrong place,
-# beside an effect that it made superfluous, and was never tried alone; of 31 pairs named wrong eight had never had a
-# fair fit, built from the part beside which the other looked worse, say, or fifth in a beam of three (now eight).
+# Leading combinations, of which each effect is left out in turn: one that was found first may stand at a wrong place
+# beside another that it makes superfluous, and the right pair may be built from the part that looked worse.
 _ELIMINATED = 3
 _SWAPPED = 2  # combinations that lead beside what is left, with what was left out or another
 _MOST_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders

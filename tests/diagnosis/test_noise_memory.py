@@ -165,7 +165,8 @@ def test_many_distributions_are_worked_out_together_as_each_alone():
         np.testing.assert_array_equal(own.sd, alone.sd)
         assert own.log_extra == alone.log_extra
     columns = rng.normal(size=(_N, 3))
-    for some in (together[:8], together, [law for law, _ in _laws().values()]):
+    ar = [_laws()[name][0] for name in ("ar", "white")]
+    for some in (together[:8], together, ar, [_laws()["ar in two runs"][0], ar[1]]):
         np.testing.assert_array_equal(whiten_under_each(some, columns), [law(columns) for law in some])
 
 

@@ -107,7 +107,7 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
-    turned = whiten_under_each(laws, joined)
+    turned = np.ascontiguousarray(whiten_under_each(laws, joined))
     gram = turned.transpose(0, 2, 1) @ turned
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
     steps, least = np.zeros_like(jr), np.array([law.sigma_floor**2 for law in laws])

@@ -320,32 +320,7 @@ class NoiseLaw:
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns, shape (n_points,) or (n_points, n_columns); rows of lost readings become 0."""
-        if columns.ndim == 1:
-            return self(columns[:, None])[:, 0]
-        if self.walk.size:
-            return self._whiten_with_walk(columns)
-        y = columns * (self.kept / self._whitening_sd)[:, None]
-        if np.any(self.carry):
-            carry = self.carry[:, None]
-            if self.before.size:
-                y -= carry * y[self.before]
-            else:  # a view: an indexed copy of thousands of columns takes longer than the rest
-                y[1:] -= carry[1:] * y[:-1]
-            y /= np.sqrt(1 - carry**2)
-        return y
-
-    def _whiten_with_walk(self, columns: FloatArray) -> FloatArray:
-        """Whiten differences of successive readings, which correlate only with their neighbours."""
-        kept = ~self.lost
-        own = columns if kept.all() else columns[kept]
-        steps = np.array(own, dtype=np.float64, order="F")
-        steps[1:] -= own[:-1]
-        solved, _ = dtbtrs(self._difference_covariance_root, steps, uplo="L", overwrite_b=1)
-        if own is columns:
-            return np.asarray(solved)
-        out = np.zeros(columns.shape)
-        out[kept] = solved
-        return out
+        return self(columns[:, None])[:, 0] if columns.ndim == 1 else whiten_under_each([self], columns)[0]
 
     @cached_property
     def _difference_covariance_root(self) -> FloatArray:
@@ -480,14 +455,37 @@ def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
 
 
 def whiten_under_each(laws: Sequence[NoiseLaw], columns: FloatArray) -> FloatArray:
-    """Whiten columns (n_points, n_columns) under each of several distributions, (n_laws, n_points, n_columns)."""
-    if any(law.lost.any() or not law.walk.size for law in laws):
-        return np.stack([law(columns) for law in laws])
-    # All walks are solved in one call: between their blocks the bands are 0.
-    roots = np.concatenate([law._difference_covariance_root for law in laws], axis=1)
-    steps = np.tile(np.diff(columns, axis=0, prepend=0.0), (len(laws), 1))
-    solved, _ = dtbtrs(roots, np.asfortranarray(steps), uplo="L", overwrite_b=1)
-    return np.ascontiguousarray(solved).reshape(len(laws), *columns.shape)
+    """Whiten columns (n_points, n_columns) under each of some distributions, (n_laws, n_points, n_columns).
+
+    All of them have a random walk, or none has one. Rows of lost readings become 0.
+    """
+    kept = np.stack([law.kept for law in laws])
+    if laws[0].walk.size:
+        there = kept > 0
+        own = columns if len(laws) == 1 else np.tile(columns, (len(laws), 1))
+        own = own if there.all() else own[there.ravel()]
+        # Differences of successive readings correlate only with their neighbours. Those under all distributions are
+        # solved in one call: between their blocks the bands are 0.
+        steps, first = np.array(own, dtype=np.float64, order="F"), np.cumsum(there.sum(axis=1))[:-1]
+        steps[1:] -= own[:-1]
+        steps[first] = own[first]
+        roots = np.concatenate([law._difference_covariance_root for law in laws], axis=1)
+        solved, _ = dtbtrs(roots, steps, uplo="L", overwrite_b=1)
+        if there.all():
+            return np.reshape(solved, (len(laws), *columns.shape))
+        out = np.zeros((len(laws), *columns.shape))
+        out[there] = solved
+        return out
+    y = columns * (kept / np.stack([law._whitening_sd for law in laws]))[:, :, None]
+    carry = np.stack([law.carry for law in laws])[:, :, None]
+    if np.any(carry):
+        before = max((law.before for law in laws), key=len)
+        if before.size:
+            y -= carry * y[:, before]
+        else:  # a view: an indexed copy of thousands of columns takes longer than the rest
+            y[:, 1:] -= carry[:, 1:] * y[:, :-1]
+        y /= np.sqrt(1 - carry**2)
+    return np.asarray(y)
 
 
 def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:

@@ -274,7 +274,7 @@ def with_step_for_likely_parameters(
     A shared parameter is followed from its best value to where the step fails, with the others refitted, as long as
     the log posterior density is within 5 nats of the best. The step becomes as short as the parameters on the way need.
     If this takes more than 4,096 steps beyond one per row, it stays longer, and `system.tally.too_stiff` is set.
-    `sd` is that of a reading.
+    A system without a law is returned as it is. `sd` is that of a reading.
     """
     if system.simulator.law is None:
         return system

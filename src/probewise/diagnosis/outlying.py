@@ -104,7 +104,7 @@ def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) ->
     residual, slopes = law(found.residuals), law(found.slopes)
     if not (np.isfinite(residual).all() and np.isfinite(slopes).all()):
         return np.zeros(0, dtype=np.int64)
-    out, kept = list[int](), law.kept > 0
+    out, kept = list[int](), ~law.lost
     with np.errstate(all="ignore"):
         for _ in range(int(MOST_OUTLYING * kept.sum())):
             basis, singular, _ = np.linalg.svd(slopes[kept] / max(found.sd, LEAST_SCALE), full_matrices=False)
@@ -243,11 +243,11 @@ def note_on_improbable_rows(found: Fit, recording: Recording) -> tuple[str, ...]
     if not at.size:
         return ()
     squares = (found.residuals / law.sd) ** 2
+    share = _percent(float(squares[at].sum() / squares.sum()))
     carry, bend = ("carries", "bends") if len(at) == 1 else ("carry", "bend")
     return (
-        f"{rows_in_words(recording, usable[at])} {carry} {_percent(float(squares[at].sum() / squares.sum()))} of the "
-        f"squared residuals and {bend} the fit; correct or empty cells that hold no reading; probewise diagnose tells "
-        "outlying readings from effects",
+        f"{rows_in_words(recording, usable[at])} {carry} {share} of the squared residuals and {bend} the fit; correct "
+        "or empty cells that hold no reading; probewise diagnose tells outlying readings from effects",
     )
 
 

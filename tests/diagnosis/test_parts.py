@@ -19,7 +19,7 @@ from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, log_bayes_factors_of_pairs, templates_of_effect
-from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_and_combination
+from probewise.diagnosis.verdict import Hypothesis, Judged, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
 from probewise.effects.reference import candidate_scan_groups
@@ -457,4 +457,4 @@ def test_verdicts_follow_the_probabilities(probability, verdict, combination):
 
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():
     found = hypotheses(clean=0.02, backlash=0.7, backlash__lag=0.26, glint=0.02)
-    assert credible_labels(found) == ("backlash", "backlash+lag")
+    assert Judged("named", ("backlash",), 0.0, found).credible == ("backlash", "backlash+lag")

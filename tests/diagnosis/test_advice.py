@@ -69,7 +69,7 @@ def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
 def test_a_prediction_that_ran_away_tells_nothing_and_gives_no_warning():
     """A cubic term in a rate ran away at a candidate: NumPy's warning reached the terminal."""
     known = predictives(0, 1.0)[0]
-    wild = replace(known, factor=np.full((4, 2), 1e200))
+    wild = known._replace(factor=np.full((4, 2), 1e200))
     assert np.isnan(mutual_information_lower_bound([known, wild], np.full(2, 0.5)))
 
 

@@ -1,10 +1,9 @@
 """Aliased effects, the readings that would separate them, and the next readings.
 
-The next are chosen by their mutual information with the true hypothesis. The index of the true hypothesis and the
-readings have a mutual information; between hypotheses whose predictions are normal it has a lower bound in closed form,
-from the Bhattacharyya distance of each two (Kolchinsky & Tracey 2017, "Estimating mixture entropy with pairwise
-distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2). Scans are added greedily by information per minute, as
-long as there is information to gain.
+The next are chosen by their mutual information with the index of the true hypothesis. Between hypotheses whose
+predictions are normal it has a lower bound in closed form, from the Bhattacharyya distance of each two (Kolchinsky &
+Tracey 2017, "Estimating mixture entropy with pairwise distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2).
+Scans are added greedily by information per minute, as long as there is information to gain.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
@@ -162,9 +161,8 @@ def pairs_with_separating_scans(
     That is the scan that adds three nats between the two in the fewest readings, at most 102, or else the one that adds
     most, if more than half a nat. All parameters are refitted to old and new readings, and the other effect with them;
     of the two cases, that the one acts or the other, the harder one counts. The effect that acts has lambda 8 in the
-    old readings. A pair that no scan separates is unchanged.
-
-    `entries`: the entry of each effect's bank that is taken for it, by name.
+    old readings. A pair that no scan separates is unchanged. `entries` has the one of each effect's bank that stands
+    for it, by name.
     """
     plan = found.model.plan
     scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
@@ -279,7 +277,7 @@ class Rival:
     probability: float
     of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
-    def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
+    def predict(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
         mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
         shared, own = slopes.copy(), np.zeros((len(slopes), 0))
@@ -291,26 +289,21 @@ class Rival:
         return PredictiveNormal(mean / sd, np.concatenate([shared @ self.root, own], axis=1) / sd)
 
 
-@dataclass(frozen=True, eq=False)
-class PredictiveNormal:
+class PredictiveNormal(NamedTuple):
     """Normal predictive distribution in noise sds: mean (n_points,), covariance of the readings I + factor factor^T."""
 
     mean: FloatArray
     factor: FloatArray
 
-    def take_readings(self, rows: IntArray) -> PredictiveNormal:
-        """Return the predictive distribution of the readings with these row numbers."""
-        return PredictiveNormal(self.mean[rows], self.factor[rows])
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the readings, (n_points, n_points).
+    def covariance_and_log_det(self) -> tuple[FloatArray, float]:
+        """Return the covariance of the readings, (n_points, n_points), and the log of its determinant.
 
         The noise counts as at least 1e-6 of the largest sd: that of readings that are exact is lost to rounding.
         """
         of_factor = self.factor @ self.factor.T
         noise_2 = max(1.0, _LEAST_NOISE_2 * float(of_factor.diagonal().max(initial=0.0)))
-        return np.asarray(noise_2 * np.eye(len(self.mean)) + of_factor)
+        covariance = noise_2 * np.eye(len(self.mean)) + of_factor
+        return covariance, float(np.linalg.slogdet(covariance)[1])
 
 
 @np.errstate(all="ignore")  # of predictions that ran away
@@ -329,7 +322,10 @@ def measurement_separating_rivals(
     if not offered:
         return None
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
-    predictives = [rival.predictive_distribution(everywhere, sd) for rival in rivals]
+    predictives = [rival.predict(everywhere, sd) for rival in rivals]
+
+    def of_readings(taken: IntArray) -> list[PredictiveNormal]:
+        return [PredictiveNormal(mean[taken], factor[taken]) for mean, factor in predictives]
 
     chosen: list[int] = []
     taken: IntArray = np.zeros(0, dtype=np.int64)
@@ -339,8 +335,7 @@ def measurement_separating_rivals(
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
-                taken_together = [predictive.take_readings(together) for predictive in predictives]
-                gains[k] = mutual_information_lower_bound(taken_together, weights) - told
+                gains[k] = mutual_information_lower_bound(of_readings(together), weights) - told
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
@@ -352,7 +347,7 @@ def measurement_separating_rivals(
     if not chosen:
         return None
     scans = [offered[k] for k in chosen]
-    nats = _expected_log_bayes_factors([predictive.take_readings(taken) for predictive in predictives])
+    nats = _expected_log_bayes_factors(of_readings(taken))
     return NextMeasurement(
         apparatus.plan_of_sequence(scans, plan),
         "; then ".join(scan.description for scan in scans),
@@ -414,8 +409,7 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
 
     `weights`: probabilities (n_hypotheses,), which sum to one.
     """
-    covariances = [predictive.covariance for predictive in predictives]
-    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
+    covariances, log_dets = zip(*(each.covariance_and_log_det() for each in predictives), strict=True)
     distances = np.zeros((len(predictives), len(predictives)))
     for a, b in itertools.combinations(range(len(predictives)), 2):
         middle, apart = (covariances[a] + covariances[b]) / 2, predictives[a].mean - predictives[b].mean
@@ -428,9 +422,8 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
 
 def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> FloatArray:
     """Return the expected log Bayes factor of each hypothesis, if true, over each other, (n, n), in nats."""
-    covariances = [predictive.covariance for predictive in predictives]
+    covariances, log_dets = zip(*(each.covariance_and_log_det() for each in predictives), strict=True)
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
-    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
     out = np.zeros((len(predictives), len(predictives)))
     for a, b in itertools.permutations(range(len(predictives)), 2):
         apart = predictives[a].mean - predictives[b].mean

@@ -4,7 +4,7 @@ Readings are linear in an amplitude, but the coordinate of an amplitude with a h
 its value about 0: a normal distribution of the coordinate there becomes one of values that is far too wide. Values with
 one scale in common lie on arcs in their coordinates. Both priors are mixtures of normal distributions. Given the
 components, the values are jointly normal; given the values, the components are independent. They are drawn in turn
-(Gibbs sampling, `LinearAmplitudes`).
+(Gibbs sampling, `draws_of_linear_amplitudes`).
 
 Fix one component of an amplitude and the value of another parameter of the effect, such as a time constant, and replace
 the simulation by its tangent (`LinearView`): all other parameters are then approximately jointly normal, and their
@@ -17,14 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, Model, difference_points_and_steps, with_prior
+from probewise.diagnosis.fit import DIFFERENCE, FARTHEST, Fit, difference_points_and_steps, with_prior
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.effects import Effect, HeavyTailedPrior
 from probewise.priors import Prior, Product, SharedScalePrior
@@ -40,14 +39,14 @@ _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly 
 
 
 @dataclass(frozen=True, eq=False)
-class AmplitudeGroup:
+class _AmplitudeGroup:
     """Amplitudes with one component of the mixture in common: one alone, or values with one scale.
 
     `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here; `sds`
     (n_components,): sds of the components, in typical sizes.
     """
 
-    at: tuple[int, ...]
+    at: list[int]
     prior: Prior
     typical: float
     sds: FloatArray
@@ -61,148 +60,103 @@ class AmplitudeGroup:
         unit = self.prior.to_unit_cube(values * self.typical)
         return np.asarray(np.clip(ndtri(unit), -FARTHEST, FARTHEST))
 
-    def values_by_coordinates(self, z: FloatArray) -> FloatArray:
-        """Return the derivatives of the values by the coordinates at z (n,), (n, n)."""
-        steps = _STEP * np.eye(len(z))
-        return np.asarray((self.values(z + steps) - self.values(z - steps)).T / (2 * _STEP))
 
-
-@dataclass(frozen=True, eq=False)
-class LinearAmplitudes:
-    """The linearised posterior of a fit of whose amplitudes some are wide in their coordinate.
-
-    The unknowns x (n_params,) are the values of these amplitudes, in typical sizes, and the coordinates of all else.
-    `x`: those of the fit; `curvature` (n_params, n_params) and `downhill` (n_params,) are those of minus the log
-    likelihood by x, the latter at x = 0.
-    """
-
-    groups: tuple[AmplitudeGroup, ...]
-    x: FloatArray
-    curvature: FloatArray
-    downhill: FloatArray
-
-    @classmethod
-    def of(cls, found: Fit, slopes: FloatArray, residual: FloatArray) -> Self | None:
-        """Find the amplitudes of a fit that are wide in their coordinate; None if there is none.
-
-        `slopes`, `residual`: whitened slopes (n_points, n_params) and residuals (n_points,), in noise sds.
-        """
-        z_sd = np.sqrt(np.diag(np.linalg.inv(with_prior(slopes.T @ slopes))))
-        groups = tuple(group for group in two_sided_amplitude_groups(found) if np.any(z_sd[list(group.at)] > _STRAIGHT))
-        if not groups:
-            return None
-        x, by_x = found.z.copy(), slopes.copy()
-        for group in groups:
-            at = list(group.at)
-            x[at] = group.values(found.z[None, at])[0]
-            by_x[:, at] = np.linalg.solve(group.values_by_coordinates(found.z[at]).T, slopes[:, at].T).T
-        return cls(groups, x, by_x.T @ by_x, by_x.T @ (residual + by_x @ x))
-
-    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw coordinates, (n_samples, n_params), each the end of a chain of its own."""
-        drawn, precision = np.tile(self.x, (n_samples, 1)), np.ones((n_samples, len(self.x)))
-        own = np.arange(len(self.x))
-        for _ in range(_SWEEPS):
-            for group in self.groups:
-                at, sds = list(group.at), group.sds
-                squares = np.sum(drawn[:, at] ** 2, axis=1)
-                log_weight = -0.5 * squares[:, None] / sds**2 - len(at) * np.log(sds)
-                component = np.argmax(log_weight + rng.gumbel(size=log_weight.shape), axis=1)
-                precision[:, at] = sds[component, None] ** -2
-            every = np.repeat(self.curvature[None], n_samples, axis=0)
-            every[:, own, own] += precision + _ROUNDING * np.diag(self.curvature)
-            # Of the mean plus a draw of covariance 1 / every: one solution with a right side of covariance `every`.
-            root = np.linalg.cholesky(every)
-            noise = np.einsum("nij,nj->ni", root, rng.standard_normal(drawn.shape))
-            drawn = np.linalg.solve(every, (self.downhill + noise)[:, :, None])[:, :, 0]
-        for group in self.groups:
-            drawn[:, list(group.at)] = group.coordinates(drawn[:, list(group.at)])
-        return drawn
-
-
-def two_sided_amplitude_groups(found: Fit) -> Iterator[AmplitudeGroup]:
+def _two_sided_amplitude_groups(found: Fit) -> Iterator[_AmplitudeGroup]:
     """List the amplitudes of a fit's effects that may have either sign, values with one scale together."""
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
         own = effect.prior
         if isinstance(own, SharedScalePrior):
-            every = tuple(range(columns.start, columns.stop))
-            yield AmplitudeGroup(every, own, own.typical, own.component_sds / own.typical)
+            every = [*range(columns.start, columns.stop)]
+            yield _AmplitudeGroup(every, own, own.typical, own.component_sds / own.typical)
         marginals = list(getattr(own, "marginals", {}).values())
         for k in (k for k in effect.amplitudes if k < len(marginals)):
             one = marginals[k]
             if isinstance(one, HeavyTailedPrior) and not one.positive:
                 alone = Product({own.names[k]: one})
-                yield AmplitudeGroup((columns.start + k,), alone, one.typical, one.component_sds / one.typical)
+                yield _AmplitudeGroup([columns.start + k], alone, one.typical, one.component_sds / one.typical)
 
 
-@dataclass(frozen=True, eq=False)
+def draws_of_linear_amplitudes(
+    found: Fit, slopes: FloatArray, residual: FloatArray, n_samples: int, *, rng: np.random.Generator
+) -> FloatArray | None:
+    """Draw coordinates, (n_samples, n_params), from the linearised posterior of a fit, each the end of its own chain.
+
+    None if no amplitude is wide in its coordinate. `slopes`, `residual`: whitened slopes (n_points, n_params) and
+    residuals (n_points,), in noise sds. The unknowns x are the values of these amplitudes, in typical sizes, and the
+    coordinates of all else.
+    """
+    z_sd = np.sqrt(np.diag(np.linalg.inv(with_prior(slopes.T @ slopes))))
+    groups = [group for group in _two_sided_amplitude_groups(found) if np.any(z_sd[group.at] > _STRAIGHT)]
+    if not groups:
+        return None
+    x, by_x = found.z.copy(), slopes.copy()
+    for group in groups:
+        at, steps = group.at, _STEP * np.eye(len(group.at))
+        x[at] = group.values(found.z[None, at])[0]
+        values_by_z = (group.values(found.z[at] + steps) - group.values(found.z[at] - steps)).T / (2 * _STEP)
+        by_x[:, at] = np.linalg.solve(values_by_z.T, slopes[:, at].T).T
+    curvature, downhill = by_x.T @ by_x, by_x.T @ (residual + by_x @ x)  # the latter at x = 0
+    drawn, precision, own = np.tile(x, (n_samples, 1)), np.ones((n_samples, len(x))), np.arange(len(x))
+    for _ in range(_SWEEPS):
+        for group in groups:
+            squares = np.sum(drawn[:, group.at] ** 2, axis=1)
+            log_weight = -0.5 * squares[:, None] / group.sds**2 - len(group.at) * np.log(group.sds)
+            component = np.argmax(log_weight + rng.gumbel(size=log_weight.shape), axis=1)
+            precision[:, group.at] = group.sds[component, None] ** -2
+        every = np.repeat(curvature[None], n_samples, axis=0)
+        every[:, own, own] += precision + _ROUNDING * np.diag(curvature)
+        # Of the mean plus a draw of covariance 1 / every: one solution with a right side of covariance `every`.
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(every), rng.standard_normal(drawn.shape))
+        drawn = np.linalg.solve(every, (downhill + noise)[:, :, None])[:, :, 0]
+    for group in groups:
+        drawn[:, group.at] = group.coordinates(drawn[:, group.at])
+    return drawn
+
+
 class LinearView:
-    """The tangent of what a model simulates before its effects on the readings.
+    """The tangent, at a fit, of what a simulator gives before the effects on its readings.
 
     It is linear in straight coordinates. For a parameter of the null (the model without effects) that is a linear
     function of the parameter; for one of an effect it is its coordinate, whose prior is standard normal. Many
     simulations are linear in a parameter, such as a starting level, but not in the coordinate of its uniform prior.
-
-    `model`: the model, of the simulator `system`; `z`: coordinates at which the tangent touches, (n_params,); `view`:
-    what is simulated there, (n_points,); `slopes`: its derivatives, (n_params, n_points); 0 for coordinates of effects
-    on the readings.
     """
 
-    model: Model
-    system: System
-    z: FloatArray
-    view: FloatArray
-    slopes: FloatArray
-
-    @classmethod
-    def of(cls, found: Fit) -> Self | None:
-        """Return the tangent at a fit of a simulator; None if not all of its readings are finite, or for a sensor.
-
-        A light sensor simulates what each of its Gaussians sees.
-        """
-        if not isinstance(found.model.sensor, System):
-            return None
-        model, is_upstream = found.model, np.ones(found.model.n_params, dtype=np.bool_)
-        for effect in filter(acts_on_readings, model.effects):
-            is_upstream[model.coordinate_slice(effect.name)] = False
+    def __init__(self, found: Fit, system: System) -> None:
+        self.model, self.system, self.z = found.model, system, found.z
+        is_upstream = np.ones(found.model.n_params, dtype=np.bool_)
+        for effect in filter(_acts_on_readings, self.model.effects):
+            is_upstream[self.model.coordinate_slice(effect.name)] = False
         upstream = np.flatnonzero(is_upstream)
         points, steps = difference_points_and_steps(found.z)
-        views = model.chain.simulated_view(model.theta(points[[0, *(1 + upstream)]]), model.plan)
-        if not np.isfinite(views).all():
-            return None
-        slopes = np.zeros((model.n_params, views.shape[1]))
-        slopes[upstream] = (views[1:] - views[0]) / steps[upstream, None]
-        return cls(model, found.model.sensor, found.z, views[0], slopes)
+        theta = self.model.theta(points[[0, *(1 + upstream)]])
+        views = self.model.chain.simulated_view(theta, self.model.plan)
+        self.view, self.is_finite = views[0], bool(np.isfinite(views).all())
+        self.slopes = np.zeros((self.model.n_params, views.shape[1]))  # 0 for coordinates of effects on the readings
+        with np.errstate(invalid="ignore"):
+            self.slopes[upstream] = (views[1:] - views[0]) / steps[upstream, None]
+        self.theta, self.derivatives = system.theta(self._own(found.z[None])), self._theta_by_z(found.z[None])
 
-    @cached_property
-    def _n_own(self) -> int:
-        return self.system.n_params
+    def _own(self, z: FloatArray) -> FloatArray:
+        return z[:, : self.system.n_params]
 
-    def _theta_by_coordinates(self, z: FloatArray) -> FloatArray:
-        theta = self.system.theta
-        return np.asarray((theta(z[:, : self._n_own] + _STEP) - theta(z[:, : self._n_own] - _STEP)) / (2 * _STEP))
-
-    @cached_property
-    def _theta_and_derivatives(self) -> tuple[FloatArray, FloatArray]:
-        z = self.z[None]
-        return self.system.theta(z[:, : self._n_own]), self._theta_by_coordinates(z)
+    def _theta_by_z(self, z: FloatArray) -> FloatArray:
+        theta, own = self.system.theta, self._own(z)
+        return np.asarray((theta(own + _STEP) - theta(own - _STEP)) / (2 * _STEP))
 
     def straightened(self, z: FloatArray) -> FloatArray:
         """Return the straight coordinates of coordinates, (n_samples, n_params) both."""
-        theta, derivatives = self._theta_and_derivatives
-        own = self.z[: self._n_own] + (self.system.theta(z[:, : self._n_own]) - theta) / derivatives
-        return np.concatenate([own, z[:, self._n_own :]], axis=1)
+        own = self._own(self.z[None]) + (self.system.theta(self._own(z)) - self.theta) / self.derivatives
+        return np.concatenate([own, z[:, self.system.n_params :]], axis=1)
 
     def coordinates(self, straight: FloatArray) -> FloatArray:
         """Return the coordinates of straight ones, (n_samples, n_params) both; infinite outside the prior's support."""
-        theta, derivatives = self._theta_and_derivatives
-        own = self.system.coordinates(theta + (straight[:, : self._n_own] - self.z[: self._n_own]) * derivatives)
-        return np.concatenate([own, straight[:, self._n_own :]], axis=1)
+        theta = self.theta + (self._own(straight) - self._own(self.z[None])) * self.derivatives
+        return np.concatenate([self.system.coordinates(theta), straight[:, self.system.n_params :]], axis=1)
 
     def log_volume(self, z: FloatArray) -> FloatArray:
         """Return the log of the volume of straight coordinates per volume of coordinates, (n_samples,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            stretched = np.log(np.abs(self._theta_by_coordinates(z) / self._theta_and_derivatives[1]))
+            stretched = np.log(np.abs(self._theta_by_z(z) / self.derivatives))
         return np.asarray(stretched.sum(axis=1))
 
     def predict(self, z: FloatArray) -> FloatArray:
@@ -211,7 +165,7 @@ class LinearView:
         return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)
 
 
-def acts_on_readings(effect: Effect) -> bool:
+def _acts_on_readings(effect: Effect) -> bool:
     """Return whether an effect changes readings that are simulated already."""
     return effect.stage >= Stage.SEEN
 
@@ -230,16 +184,15 @@ class ConditionallyLinearDensity:
     Those are the value of the effect's amplitude, in units of its typical size, and the straight coordinates (see
     `LinearView`) of every other parameter.
 
-    `view`: the tangent of the simulation; `at`: index of the coordinate of the grid; `own`: that of the amplitude among
-    the others; `amplitude`: the amplitude; `nodes`: the grid, equally spaced, (n_nodes,); `log_shares`: log probability
-    of each node and component, (n_nodes, n_components); `means`: means of the others, (n_nodes, n_components, n_params
-    - 1); `roots`: lower Cholesky factors of their precisions, (n_nodes, n_components, n_params - 1, n_params - 1).
+    `at`: index of the coordinate of the grid; `own`: that of the amplitude among the others; `nodes`: the grid, equally
+    spaced, (n_nodes,); `log_shares`: log probability of each node and component, (n_nodes, n_components); `means` of
+    the others, (n_nodes, n_components, n_params - 1); `roots`: lower Cholesky factors of their precisions.
     """
 
     view: LinearView
     at: int
     own: int
-    amplitude: AmplitudeGroup
+    amplitude: _AmplitudeGroup
     nodes: FloatArray
     log_shares: FloatArray
     means: FloatArray
@@ -249,32 +202,46 @@ class ConditionallyLinearDensity:
     def of(cls, found: Fit, law: NoiseLaw, recording: Recording, covariance: FloatArray, sd: float) -> Self | None:
         """Return the density over the least known of the coordinates that can be gridded; None if there is none.
 
-        It can be that of an effect on the readings, without change points, with one amplitude of either sign.
+        It can be a nonlinear one of an effect on the readings, without change points, whose one amplitude has either
+        sign. None also of a light sensor, which simulates what each of its Gaussians sees, and where not all that is
+        simulated is finite.
 
         `covariance`: of the coordinates, by Laplace's approximation, (n_params, n_params).
         """
-        able = list(_grid_coordinates_with_amplitudes(found))
-        view = LinearView.of(found) if able else None
-        if view is None:
+        able, system = list(_grid_coordinates_with_amplitudes(found)), found.model.sensor
+        if not able or not isinstance(system, System):
+            return None
+        view = LinearView(found, system)
+        if not view.is_finite:
             return None
         at, amplitude = max(able, key=lambda each: covariance[each[0], each[0]])
         own = amplitude.at[0] - (amplitude.at[0] > at)
         x = np.delete(found.z, at)
-        x[own] = amplitude.values(found.z[None, list(amplitude.at)])[0, 0]
+        x[own] = amplitude.values(found.z[None, amplitude.at])[0, 0]
         moved = x + np.concatenate([np.zeros((1, len(x))), DIFFERENCE * np.eye(len(x))])
         precision = np.ones((len(amplitude.sds), len(x)))
         precision[:, own] = amplitude.sds**-2.0
-        sigma = law.likeliest_sigma(law(found.residuals)[:, None])
+        sigma, usable = law.likeliest_sigma(law(found.residuals)[:, None]), recording.usable
         n_at_once = max(1, _BLOCK // (len(moved) * len(found.residuals)))
+
+        def quadratic_log_likelihood(nodes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            """Return the log likelihood at x = 0, its gradient there and minus its second derivatives, by node."""
+            points = np.tile(_inserted(moved, at, own, amplitude), (len(nodes), 1, 1))
+            points[:, :, at] = nodes[:, None]
+            predicted = view.predict(points.reshape(-1, len(found.z)))[:, usable]
+            with np.errstate(all="ignore"):  # of predictions that ran away: not finite in the result
+                whitened = law((recording.readings[usable] - predicted).T).T.reshape(*points.shape[:2], -1)
+                at_x, sigmas = whitened[:, 0].T, np.broadcast_to(sigma, len(nodes))
+                height = -law.minus_log_likelihood(at_x, sigmas)
+                normal = law.normal_pseudo_residuals(at_x, sigmas).T
+                slopes = (whitened[:, :1] - whitened[:, 1:]) / (DIFFERENCE * sd)
+                curvature, gradient = slopes @ slopes.transpose(0, 2, 1), np.einsum("nij,nj->ni", slopes, normal) / sd
+            height = height - gradient @ x - 0.5 * np.einsum("i,nij,j->n", x, curvature, x)
+            return height, gradient + curvature @ x, curvature
 
         def on_grid(low: float, high: float) -> Self | None:
             nodes = np.asarray(np.linspace(low, high, _N_NODES), dtype=np.float64)
-            points = np.tile(_inserted(moved, at, own, amplitude), (len(nodes), 1, 1))
-            points[:, :, at] = nodes[:, None]
-            parts = [
-                _quadratic_log_likelihood(view, law, recording, points[first : first + n_at_once], x, sigma, sd)
-                for first in range(0, len(nodes), n_at_once)
-            ]
+            parts = [quadratic_log_likelihood(nodes[k : k + n_at_once]) for k in range(0, len(nodes), n_at_once)]
             height, downhill, curvature = (np.concatenate(part) for part in zip(*parts, strict=True))
             if not (np.isfinite(height).all() and np.isfinite(curvature).all()):
                 return None
@@ -315,7 +282,7 @@ class ConditionallyLinearDensity:
 
     def log_density(self, z: FloatArray) -> FloatArray:
         """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""
-        x, at = np.delete(self.view.straightened(z), self.at, axis=1), list(self.amplitude.at)
+        x, at = np.delete(self.view.straightened(z), self.at, axis=1), self.amplitude.at
         x[:, self.own] = self.amplitude.values(z[:, at])[:, 0]
         steps = np.rint((z[:, self.at] - self.nodes[0]) / (self.nodes[1] - self.nodes[0]))
         node = np.clip(steps, 0, len(self.nodes) - 1).astype(np.int64)
@@ -337,45 +304,23 @@ class ConditionallyLinearDensity:
         return np.asarray((1 - share) * self.means[below] + share * self.means[below + 1])
 
 
-def _quadratic_log_likelihood(
-    view: LinearView,
-    law: NoiseLaw,
-    recording: Recording,
-    points: FloatArray,
-    x: FloatArray,
-    sigma: FloatArray,
-    sd: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the log likelihood at x = 0, its gradient there and minus its second derivatives, at each node.
-
-    `points` (n_nodes, n_rest + 1, n_params) are the coordinates of x, and of x moved along each of its n_rest axes;
-    the result has shapes (n_nodes,), (n_nodes, n_rest), (n_nodes, n_rest, n_rest).
-    """
-    n, n_moved, n_params = points.shape
-    predicted = view.predict(points.reshape(-1, n_params))[:, recording.usable]
-    with np.errstate(all="ignore"):  # of predictions that ran away: not finite in the result
-        whitened = law((recording.readings[recording.usable] - predicted).T).T.reshape(n, n_moved, -1)
-        at_x, sigmas = whitened[:, 0].T, np.broadcast_to(sigma, n)
-        height = -law.minus_log_likelihood(at_x, sigmas)
-        normal = law.normal_pseudo_residuals(at_x, sigmas).T
-        slopes = (whitened[:, :1] - whitened[:, 1:]) / (DIFFERENCE * sd)
-        curvature, gradient = slopes @ slopes.transpose(0, 2, 1), np.einsum("nij,nj->ni", slopes, normal) / sd
-    height = height - gradient @ x - 0.5 * np.einsum("i,nij,j->n", x, curvature, x)
-    return height, gradient + curvature @ x, curvature
-
-
-def _inserted(x: FloatArray, at: int, own: int, amplitude: AmplitudeGroup) -> FloatArray:
+def _inserted(x: FloatArray, at: int, own: int, amplitude: _AmplitudeGroup) -> FloatArray:
     out = x.copy()
     out[:, [own]] = amplitude.coordinates(x[:, [own]])
     return np.insert(out, at, 0.0, axis=1)
 
 
-def _grid_coordinates_with_amplitudes(found: Fit) -> Iterator[tuple[int, AmplitudeGroup]]:
+def _grid_coordinates_with_amplitudes(found: Fit) -> Iterator[tuple[int, _AmplitudeGroup]]:
     """List the nonlinear coordinates of the effects on the readings that have one amplitude, which has either sign."""
-    groups = {group.at: group for group in two_sided_amplitude_groups(found) if len(group.at) == 1}
+    groups = {group.at[0]: group for group in _two_sided_amplitude_groups(found) if len(group.at) == 1}
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
-        amplitudes = tuple(columns.start + k for k in effect.amplitudes)
-        if acts_on_readings(effect) and not effect.has_change_point and amplitudes in groups:
+        amplitudes = [columns.start + k for k in effect.amplitudes]
+        if (
+            _acts_on_readings(effect)
+            and not effect.has_change_point
+            and len(amplitudes) == 1
+            and amplitudes[0] in groups
+        ):
             for at in range(columns.start, columns.stop):
-                if at not in amplitudes:
-                    yield at, groups[amplitudes]
+                if at != amplitudes[0]:
+                    yield at, groups[amplitudes[0]]

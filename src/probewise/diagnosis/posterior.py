@@ -29,7 +29,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from probewise._arrays import BoolArray, FloatArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, with_prior
-from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
+from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, draws_of_linear_amplitudes
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.diagnosis.simulator_fit import log_evidence_of
@@ -630,13 +630,12 @@ def posterior_draws(
 ) -> FloatArray:
     """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
 
-    Unless `annealed`, they are draws of Laplace's approximation, or of `LinearAmplitudes` where it applies. Otherwise:
-    If an effect on the readings has a nonlinear coordinate, they are resampled from a `ConditionallyLinearDensity`;
-    else, where many samples cost little more than one, they are drawn by adaptive importance sampling. Without either,
-    samples of Laplace's approximation are moved to the posterior in two stages, the first through a quadratic
-    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
-
-    `n_samples` is their number; the other parameters are those of `sample_model`.
+    Unless `annealed`, they are draws of Laplace's approximation, or of its linear amplitudes where it has any.
+    Otherwise: if an effect on the readings has a nonlinear coordinate, they are resampled from a
+    `ConditionallyLinearDensity`; else, where many samples cost little more than one, they are drawn by adaptive
+    importance sampling. Without either, samples of Laplace's approximation are moved to the posterior in two stages,
+    the first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's samples
+    predict new angles far worse. The parameters are those of `sample_model`.
     """
     model, law, usable = found.model, noise.likeliest_law, recording.usable
     # Laplace's approximation: normal, of covariance steps.T @ steps, with `slopes` and `residual` in noise sds.
@@ -661,11 +660,8 @@ def posterior_draws(
         return np.asarray(center) if is_possible else found.z
 
     if not annealed:
-        linear = LinearAmplitudes.of(found, slopes, residual)
-        if linear is not None:
-            return linear.draw(n_samples, rng=rng)
-        center = mode()
-        return np.asarray(center + rng.standard_normal((n_samples, len(center))) @ steps)
+        linear = draws_of_linear_amplitudes(found, slopes, residual, n_samples, rng=rng)
+        return mode() + rng.standard_normal((n_samples, len(found.z))) @ steps if linear is None else linear
     normal = rng.standard_normal((_N_NEAR, len(found.z)))
     problem = HypothesisProblem(model, recording, noise.with_likeliest_node_alone)
 

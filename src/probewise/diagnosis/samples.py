@@ -151,7 +151,7 @@ def sample_model(
 
     `weights`: by effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,),
     when it was added; `annealed`: whether samples are of the posterior; otherwise of Laplace's approximation, with
-    `LinearAmplitudes`.
+    `draws_of_linear_amplitudes`.
     """
     law, n_samples = noise.likeliest_law, N_SAMPLES
     weights = weights_beside_other_effects(found, law, np.flatnonzero(recording.usable), weights)

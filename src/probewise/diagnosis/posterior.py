@@ -19,8 +19,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TypeAlias, cast
 
 import numpy as np
@@ -29,7 +29,12 @@ from scipy.special import logsumexp, ndtr, ndtri
 from probewise._arrays import BoolArray, FloatArray, read_only_floats
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, with_prior
-from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, draws_of_linear_amplitudes
+from probewise.diagnosis.linear_posterior import (
+    TangentModel,
+    draws_of_linear_amplitudes,
+    modes_of_opposite_sign,
+    sizes_with_shape,
+)
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.diagnosis.simulator_fit import log_evidence_of
@@ -46,6 +51,7 @@ from probewise.nested.weights import (
 )
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
+from probewise.systems import System
 
 NUMBERS = 4_000_000
 """Readings that are predicted at once."""
@@ -399,7 +405,7 @@ class _Ridge:
 
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
-_LEAST_OF_IT = 0.5  # least acceptable share of the target
+_LEAST_SHARE = 0.25  # least acceptable effective sample size, likewise
 _ALIKE = 0.98  # effective share of a few draws, from which means of all are off by a seventh of an sd at most
 _EFFECTIVE = 0.5  # least effective share of the samples after a step of beta
 _AT_LAST = 3  # factor on the number of moves at beta = 1
@@ -416,21 +422,20 @@ def importance_resample(
     *,
     n_wanted: int,
     rng: np.random.Generator,
-    least: float = _LEAST_OF_IT * _ENOUGH,
     n_tried: int | None = None,
 ) -> FloatArray | None:
     """Draw from a density by importance resampling: (n_wanted, n_params), in random order.
 
     `first`: samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated,
     for an effective sample size of half of `n_wanted`. `log_q`, `log_p`: unnormalised log densities of the proposal and
-    the target; the latter is minus infinity outside its support. `least`: share of `n_wanted` that the effective sample
-    size must reach; else None. `n_tried`: samples evaluated first; if these are fewer than wanted and nearly all
-    effective, so are the others.
+    the target; the latter is minus infinity outside its support. `n_tried`: samples evaluated first; if these are fewer
+    than wanted and nearly all effective, so are the others. None if the effective sample size is below a quarter of
+    `n_wanted`.
     """
     tried = first[: n_tried or n_wanted]
     gain = log_p(tried) - log_q(tried)
     share = _n_distinct_effective(gain, tried) / len(gain)
-    if share * len(first) < least * n_wanted:
+    if share * len(first) < _LEAST_SHARE * n_wanted:
         return None
     if len(tried) < n_wanted and share > _ALIKE:
         return first[:n_wanted]
@@ -438,7 +443,7 @@ def importance_resample(
     if enough > len(tried):
         more = first[len(tried) : enough]
         gain = np.append(gain, log_p(more) - log_q(more))
-    if _n_distinct_effective(gain, first[: len(gain)]) < least * n_wanted:
+    if _n_distinct_effective(gain, first[: len(gain)]) < _LEAST_SHARE * n_wanted:
         return None
     rows = resampled_rows(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])
@@ -604,10 +609,8 @@ def surrogate_log_density(
 
 _N_WALKERS = 250
 _MOVES = 6  # of each walker after a step of beta
-_N_FIRST = 1000  # draws of a proposal
-_LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
-_NEARLY_ALL = 0.8  # and where adaptive importance sampling costs little
-_SIZES_HERE = 1000, 60, 8, 250.0  # of that: draws of a round, kernels, rounds, effective draws that suffice
+# Of adaptive importance sampling where it costs little: draws of a round, kernels, rounds, and enough effective draws.
+_SIZES_HERE = 1000, 60, 8, 250.0
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -631,11 +634,10 @@ def posterior_draws(
     """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
 
     Unless `annealed`, they are draws of Laplace's approximation, or of its linear amplitudes where it has any.
-    Otherwise: if an effect on the readings has a nonlinear coordinate, they are resampled from a
-    `ConditionallyLinearDensity`; else, where many samples cost little more than one, they are drawn by adaptive
-    importance sampling. Without either, samples of Laplace's approximation are moved to the posterior in two stages,
-    the first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's samples
-    predict new angles far worse. The parameters are those of `sample_model`.
+    Otherwise, where many samples cost little more than one, or an effect may be of either sign, they are drawn by
+    adaptive importance sampling. Else samples of Laplace's approximation are moved to the posterior in two stages, the
+    first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict
+    new angles far worse. The parameters are those of `sample_model`.
     """
     model, law, usable = found.model, noise.likeliest_law, recording.usable
     # Laplace's approximation: normal, of covariance steps.T @ steps, with `slopes` and `residual` in noise sds.
@@ -665,8 +667,8 @@ def posterior_draws(
     normal = rng.standard_normal((_N_NEAR, len(found.z)))
     problem = HypothesisProblem(model, recording, noise.with_likeliest_node_alone)
 
-    def log_posterior(z: FloatArray) -> FloatArray:
-        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
+    def log_posterior(z: FloatArray, of: HypothesisProblem = problem) -> FloatArray:
+        height = of.prior.log_prob(z) + of.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
     def resampled_or_annealed(
@@ -678,19 +680,23 @@ def posterior_draws(
         some = first[:_N_WALKERS]
         return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n_wanted, rng=rng, progress=progress)
 
-    in_bulk, tried = model.sensor.predicts_in_bulk, n_tried(model)
-    grid = ConditionallyLinearDensity.of(found, law, recording, steps.T @ steps, sd)
-    if grid is not None:
-        first, least = grid.draw(n_samples if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
-        drawn = importance_resample(
-            first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least, n_tried=tried
-        )
-        if drawn is not None:
-            return drawn
-    if in_bulk:
-        draws, _ = draw_by_importance(problem, [found], law, sizes=_SIZES_HERE, rng=rng, progress=progress)
-        if draws.n_eff >= _LEAST_OF_IT * _ENOUGH * n_samples:
-            return draws.samples(n_samples, rng=rng)
+    tried, system = n_tried(model), model.sensor
+    cheap: Model | TangentModel | None = model if system.predicts_in_bulk else None
+    if tried and isinstance(system, System) and sizes_with_shape(found):
+        tangent = TangentModel(found, system)
+        cheap = tangent if tangent.is_finite else None
+    if cheap is not None:
+        stand_in = replace(problem, model=cast(Model, cheap))
+        modes = [found, *modes_of_opposite_sign(cheap, found, recording, law)]
+        draws, _ = draw_by_importance(stand_in, modes, law, sizes=_SIZES_HERE, rng=rng, progress=progress)
+        if draws.n_eff >= _LEAST_SHARE * n_samples:
+            if cheap is model:
+                return draws.samples(n_samples, rng=rng)
+            first = draws.samples(_N_NEAR, rng=rng)
+            log_q = partial(log_posterior, of=stand_in)
+            drawn = importance_resample(first, log_q, log_posterior, n_wanted=n_samples, rng=rng, n_tried=tried)
+            if drawn is not None:
+                return drawn
     center, readings = mode(), recording.readings[usable]
     near = surrogate_log_density(lambda z: model.predict(z)[:, usable], center, steps, readings, law, sd)
     e = resampled_or_annealed(normal, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)

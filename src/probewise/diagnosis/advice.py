@@ -44,8 +44,7 @@ EffectEntry: TypeAlias = tuple[Effect, FloatArray]
 """An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
+class _Columns(NamedTuple):
     """The columns of an effect, in noise sds: in `old` readings and `further` ones, (n_points, n_columns) each.
 
     `of_run`: whether each is the value of one run; then `further` are the columns of the mean of all runs' values.
@@ -194,10 +193,8 @@ def pairs_with_separating_scans(
     sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
     best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
-        for effects, (one, other) in sized.items():
-            gained = [
-                nats_against((before, further[rows]), true, rival, rows) for true, rival in ((one, other), (other, one))
-            ]
+        for effects, amounts in sized.items():
+            gained = [nats_against((before, further[rows]), *acting, rows) for acting in (amounts, amounts[::-1])]
             nats = np.min([nats - nats[0] for nats in gained], axis=0)
             if not nats[-1] > NOTHING_NATS:
                 continue
@@ -239,9 +236,8 @@ class NextMeasurement:
 
     `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
     true; rivals that the readings cannot tell apart count as one. `between`: each of the hypotheses, in words;
-    `effects`: the effects of each; `probabilities`: of each, as used here, (n_rivals,); `nats` (n_rivals, n_rivals):
-    expected log Bayes factor of each, if true, over each other. `minutes`: duration with breaks; of a table without a
-    time in a known unit, a guess of one second per row.
+    `effects`: the effects of each; `nats` (n_rivals, n_rivals): expected log Bayes factor of each, if true, over each
+    other. `minutes`: duration with breaks; of a table without a time in a known unit, a guess of one second per row.
     """
 
     plan: Plan
@@ -250,7 +246,6 @@ class NextMeasurement:
     expected_log_bayes_factor: float
     between: tuple[str, ...]
     effects: tuple[Names, ...]
-    probabilities: FloatArray
     nats: FloatArray
 
     def classes_among(self, hypotheses: Collection[Names]) -> list[list[int]]:
@@ -355,7 +350,6 @@ def measurement_separating_rivals(
         _mean_over_closest(nats, weights),
         tuple(rival.label for rival in rivals),
         tuple(tuple(sorted(rival.model.names)) for rival in rivals),
-        weights,
         nats,
     )
 
@@ -394,9 +388,8 @@ def measurement_at_place(
         commands[best].description,
         commands[best].minutes,
         float(nats[best]),
-        (f"{apparatus.words.null} {apparatus.words.before_in_words}", NO_NAME),
+        (_null_in_words(apparatus), NO_NAME),
         ((), ("unknown",)),
-        np.full(2, 0.5),
         nats[best] * (1 - np.eye(2)),
     )
 
@@ -471,16 +464,13 @@ def choose_next_measurement(
     it is the verdict (`is_unknown`), or the only rival of the null, the readings go where its residuals are largest,
     `unknown_shows_in`, if anywhere.
     """
-    prepared = searched.prepared
-    plan, apparatus = prepared.recording.plan, prepared.apparatus
-    by_mean = searched.posterior.marginal_over_noise
-    unknown = by_mean.get(("unknown",), 0.0)
+    prepared, by_mean = searched.prepared, searched.posterior.marginal_over_noise
+    plan, apparatus, unknown = prepared.recording.plan, prepared.apparatus, by_mean.get(("unknown",), 0.0)
     # An unknown effect makes no prediction beyond the null.
     probabilities: dict[Names, float] = {(): by_mean.get((), 0.0) + unknown}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
-    ranked = sorted(probabilities, key=lambda names: -probabilities[names])
     found, held = list[WeighedFit](), 0.0  # those of the fewest hypotheses that hold .95, at most five
-    for names in ranked:
+    for names in sorted(probabilities, key=lambda names: -probabilities[names]):
         candidate = searched.best_refit_of(names, searched.certain) if names else null
         if candidate is not None:
             found.append(candidate)
@@ -494,17 +484,20 @@ def choose_next_measurement(
         return measurement_at_place(unknown_shows_in, null.found, prepared.everything, sd, plan, apparatus)
     if is_settled(searched) or len(found) == 1:
         return None
-    unrepaired = f"{apparatus.words.null} {apparatus.words.before_in_words}"
     rivals = []
     for fit in found:
-        label = hypothesis_in_words(fit.names, nothing=unrepaired)
-        slopes, own_sd = fit.found.slopes, fit.whitened_sd
+        label = hypothesis_in_words(fit.names, nothing=_null_in_words(apparatus))
+        slopes, own_sd, model = fit.found.slopes, fit.whitened_sd, fit.found.model
         free = residual_degrees_of_freedom(slopes, own_sd, len(slopes))
         root = covariance_root(slopes, own_sd**2 * len(slopes) / free)
-        of_run = apparatus.coordinates_of_new_run(fit.found.model)
-        rivals.append(Rival(label, fit.found.model, fit.found.z, root, probabilities[fit.names], of_run))
+        of_run = apparatus.coordinates_of_new_run(model)
+        rivals.append(Rival(label, model, fit.found.z, root, probabilities[fit.names], of_run))
     asked = measurement_separating_rivals(rivals, sd, plan, apparatus)
     return asked if asked is not None and asked.expected_log_bayes_factor >= ENOUGH_NATS else None
+
+
+def _null_in_words(apparatus: Apparatus) -> str:
+    return f"{apparatus.words.null} {apparatus.words.before_in_words}"
 
 
 def is_settled(searched: Searched) -> bool:

@@ -164,12 +164,7 @@ class Apparatus(ABC):
         return ()
 
     def covariate_of_effect(
-        self,
-        effect: Effect,
-        change: FloatArray,
-        without: FloatArray,
-        plan: Plan,
-        known: Sequence[Covariate],
+        self, effect: Effect, change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
     ) -> Covariate | None:
         """Return the first of an effect's covariates that is `known`; None if none is, or `change` is 0 at every row.
 

@@ -242,10 +242,10 @@ def places_of_effect(
     `change`: its change of the readings, (n_points,); `scans`: the covariate `scan`, if there are several; `residuals`:
     residuals of the null, (n_points,), for the mean curve.
     """
-    name = covariate.name
+    name, curve = covariate.name, _mean_curve_fields(covariate, residuals)
     if name == "run":
         strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
-        return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals))]
+        return [Place(name, strongest, None, None, p_value, size, **curve)]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
         curve = _mean_curve_fields(scans, residuals)
         # A scan without usable readings is not in the plan, and a name may return.
@@ -258,11 +258,9 @@ def places_of_effect(
     # The levels absorb what all readings share: where nearly all move one way, those at rest stand out.
     strength = np.abs(own - own.mean() if name == "direction" else own)
     # An effect with a threshold in level begins where it is first significant.
-    significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
-    values = covariate.values[significant]
-    curve = _mean_curve_fields(covariate, residuals)
-    start, end = float(values.min()), float(values.max())
-    return [Place(covariate.published_name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
+    values = covariate.values[strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()]
+    ends = float(values.min()), float(values.max())
+    return [Place(covariate.published_name, None, *ends, p_value, size, **curve, without_effect=name == "level")]
 
 
 def _mean_curve_fields(covariate: Covariate, residuals: FloatArray) -> dict[str, Any]:

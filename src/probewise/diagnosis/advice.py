@@ -168,9 +168,9 @@ def pairs_with_separating_scans(
     if not (pairs and scans):
         return list(pairs)
     everywhere = apparatus.plan_of_alternatives(scans, plan)
-    expected, slopes = replace(found.model, plan=everywhere).predict_and_differentiate(found.z)
+    expected, by_z = replace(found.model, plan=everywhere).predict_and_differentiate(found.z)
     of_run = apparatus.coordinates_of_new_run(found.model)  # a further run has values of its own of these
-    shared, own = slopes / problem.sd, slopes[:, of_run] / problem.sd
+    shared, own = by_z / problem.sd, by_z[:, of_run] / problem.sd
     shared[:, of_run] = 0.0
     further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
     before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
@@ -193,8 +193,9 @@ def pairs_with_separating_scans(
     sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
     best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
-        for effects, amounts in sized.items():
-            gained = [nats_against((before, further[rows]), *acting, rows) for acting in (amounts, amounts[::-1])]
+        slopes = before, further[rows]
+        for effects, (one, other) in sized.items():
+            gained = [nats_against(slopes, *acting, rows) for acting in ((one, other), (other, one))]
             nats = np.min([nats - nats[0] for nats in gained], axis=0)
             if not nats[-1] > NOTHING_NATS:
                 continue

@@ -122,7 +122,7 @@ class BestRepair:
         repaired = fit_under_noise(fit, law, recording)
         calibrated = repaired if fit is null else fit_under_noise(null, law, recording)
         after = Linearised.of(repaired, law)
-        rms = [rms_beside_walk(found.residuals, law, recording) for found in (calibrated, repaired)]
+        rms, rms_after = (rms_beside_walk(found.residuals, law, recording) for found in (calibrated, repaired))
         held, p_after, comes_next = HeldOutGain(0.0, 0.0, 0, ()), test.p_value, None
         if fit is not null:
             # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
@@ -133,7 +133,7 @@ class BestRepair:
             comes_next = None if later is None else gain_on(later, each_alone=True)
             p_after = p_value_after(searched, fit, after, rng=rng)
         log_evidence = fit.evidence[noise].log_z - null.evidence[searched.certain].log_z
-        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, *rms, p_after, comes_next)
+        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms, rms_after, p_after, comes_next)
         return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 

@@ -111,7 +111,7 @@ def draws_of_linear_amplitudes(
 
 def sizes_with_shape(found: Fit) -> list[int]:
     """List the coordinates of sizes of either sign, one of an effect on the readings, beside which it has a shape."""
-    sizes, out = {group.at[0] for group in _two_sided_amplitude_groups(found) if len(group.at) == 1}, []
+    sizes, out = {group.at[0] for group in _two_sided_amplitude_groups(found) if len(group.at) == 1}, list[int]()
     for effect, columns in effects_with_columns(found.model.effects, found.model.sensor.n_params):
         own = {columns.start + k for k in effect.amplitudes}
         is_shaped = len(effect.prior.names) > 1 and not effect.has_change_point

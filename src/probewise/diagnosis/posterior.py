@@ -530,7 +530,7 @@ def _ensemble_step(
         length = scale * 2.38 / math.sqrt(2 * z.shape[1]) * rng.choice([1.0, 0.3], (len(own), 1))
         to = z[own] + length * (first - second)
         there = np.stack([log_q(to), log_p(to)])
-        taken = np.isfinite(there).all(axis=0)
+        taken = np.asarray(np.isfinite(there).all(axis=0))
         of_q, of_p = (there - heights[:, own])[:, taken]
         taken[taken] = np.log(rng.random(len(own)))[taken] < (1 - beta) * of_q + beta * of_p
         z[own[taken]], heights[:, own[taken]] = to[taken], there[:, taken]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
 
@@ -337,11 +337,19 @@ def verdict_and_combination(
     certain: frozenset[str] = frozenset(),
     named_needs_half: bool = False,
 ) -> tuple[Verdict, Names]:
-    """Return the verdict and the combination it names; effects on the mean also need a global test with p up to .01.
+    """Return the verdict and the combination it names.
 
-    Effects in `certain`, which the readings show beyond doubt, need no significant test. With `named_needs_half`,
-    effects on the mean count whatever effects on the noise are beside them, and need half the probability; otherwise
-    the verdict is `cannot_tell`, with the combination.
+    Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
+    is `named` (`noise` if all its effects are on the noise). The verdict is `cannot_tell` instead,
+
+    - with half the probability or more, if one aliased with it (`aliased_with`) has over a fifth of its probability;
+    - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
+    - with less, if clean or unknown is more probable, or if there is no combination: then none is named;
+    - if the p-value of the global test is above .01, of effects on the mean: then none is named, but those in
+      `certain`, which the readings show beyond doubt.
+
+    With `named_needs_half`, effects on the mean count whatever effects on the noise are beside them, and need half the
+    probability to be `named`.
     """
     by_mean, fullest = dict[Names, float](), dict[Names, Names]()
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
@@ -350,47 +358,30 @@ def verdict_and_combination(
             mean = _without(mean, noise_names) or mean
         by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
         fullest.setdefault(mean, hypothesis.effects)
-    verdict, top = _verdict_by_probability(by_mean, noise_names, aliases, aliased_with)
-    if named_needs_half and verdict == "named" and by_mean[top] < 0.5:
+    unknown, clean = by_mean.get(("unknown",), 0.0), by_mean.get((), 0.0)
+    named = {effects: p for effects, p in by_mean.items() if effects not in ((), ("unknown",))}
+    top = max(named, key=lambda effects: named[effects], default=())
+    of_class, verdict = _combination_and_alias_swaps(top, aliases), cast(Verdict, "named")
+    if unknown >= 0.5:
+        verdict, top = "unknown", ("unknown",)
+    elif clean >= 0.5:
+        verdict, top = "clean", ()
+    elif not named:
         verdict = "cannot_tell"
+    elif named[top] >= 0.5:
+        if any(named.get(other, 0.0) > OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
+            verdict = "cannot_tell"
+    elif len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
+        verdict = "cannot_tell"
+    elif max(clean, unknown) > named[top]:
+        verdict, top = "cannot_tell", ()
     combination = fullest.get(top, top)
+    if verdict == "named" and {*top} <= noise_names:
+        return "noise", combination
+    if verdict == "named" and named_needs_half and named[top] < 0.5:
+        return "cannot_tell", combination
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
-
-
-def _verdict_by_probability(
-    probability: Mapping[Names, float],
-    noise_names: frozenset[str],
-    aliases: tuple[Alias, ...],
-    aliased_with: Callable[[Names], frozenset[Names]],
-) -> tuple[Verdict, Names]:
-    """Return the verdict by probabilities and aliases alone, and the combination it names.
-
-    Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
-    is `named` (`noise` if all its effects are on the noise). The verdict is `cannot_tell` instead,
-
-    - with half the probability or more, if one aliased with it (`aliased_with`) has over a fifth of its probability;
-    - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
-    - with less, if clean or unknown is more probable, or if there is no combination: then none is named.
-    """
-    if probability.get(("unknown",), 0.0) >= 0.5:
-        return "unknown", ("unknown",)
-    if probability.get((), 0.0) >= 0.5:
-        return "clean", ()
-    named = {effects: p for effects, p in probability.items() if effects not in ((), ("unknown",))}
-    if not named:
-        return "cannot_tell", ()
-    top = max(named, key=lambda effects: named[effects])
-    if named[top] >= 0.5:
-        if any(named.get(other, 0.0) > OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
-            return "cannot_tell", top
-        return ("noise" if set(top) <= noise_names else "named"), top
-    of_class = _combination_and_alias_swaps(top, aliases)
-    if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
-        return "cannot_tell", top
-    if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
-        return "cannot_tell", ()
-    return ("noise" if set(top) <= noise_names else "named"), top
 
 
 def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:

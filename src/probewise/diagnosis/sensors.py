@@ -209,37 +209,6 @@ _RIDGE = 1e-8  # of each variance, by which a covariance of samples is sure to b
 _LEAST_VARIANCE = 1e-16  # of a coordinate, relative to its size
 
 
-def sensor_from_posterior(
-    names: Sequence[str], mean: FloatArray, cov: FloatArray, *, height_mm: float | None = None
-) -> CalibratedSensor:
-    """Build a prior from an earlier sensor's posterior mean and covariance, calibrated at `height_mm`.
-
-    Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
-
-    Raises ParameterError if the names are not those of a mixture of Gaussians with two free levels.
-    """
-    names = list(names)
-    n_gaussians = sum(name.startswith("a_") for name in names)
-    wanted = [*mixture_parameter_names(max(n_gaussians, 1)), "I_min", "I_max"]
-    if any(name not in names for name in wanted):
-        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
-    at = [names.index(name) for name in wanted]
-    mean, cov = np.asarray(mean, dtype=np.float64)[at], np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
-    free = is_free_form(mean[None, :-2])
-    natural_from_theta = theta_to_free_form if free else partial(theta_to_natural, n_gaussians=n_gaussians)
-    center = natural_from_theta(mean[None, :])[0]
-    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
-    up, down = natural_from_theta(mean + np.diag(steps)), natural_from_theta(mean - np.diag(steps))
-    slope = ((up - down) / (2 * steps[:, None])).T
-    natural_cov = slope @ cov @ slope.T
-    # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
-    size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
-    size[levels] = np.abs(center[levels]).max() or 1.0
-    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
-    factor = np.linalg.cholesky(natural_cov + np.diag(floor))
-    return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm)
-
-
 class SensorPrior(Protocol):
     """An earlier posterior of the sensor: a FittedSensor, or anything with its names and samples."""
 
@@ -269,15 +238,36 @@ def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
 
 
 def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
-    """Build a prior from an earlier sensor's posterior samples; see `sensor_from_posterior`.
+    """Build a prior from an earlier sensor's posterior samples.
 
-    If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
+    Only the SSF's and the levels' columns are used; effects of the earlier model are dropped. If the samples average
+    several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
+
+    Raises ParameterError if the names are not those of a mixture of Gaussians with two free levels.
     """
     height_mm = None
     if isinstance(sensor, FittedSensor):
         sensor, height_mm = sensor.with_leading_effects(), sensor.instrumentation.height_mm
-    samples = np.asarray(sensor.samples, dtype=np.float64)
-    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T), height_mm=height_mm)
+    names, samples = list(sensor.names), np.asarray(sensor.samples, dtype=np.float64)
+    n_gaussians = sum(name.startswith("a_") for name in names)
+    wanted = [*mixture_parameter_names(max(n_gaussians, 1)), "I_min", "I_max"]
+    if any(name not in names for name in wanted):
+        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
+    at = [names.index(name) for name in wanted]
+    mean, cov = samples.mean(axis=0)[at], np.cov(samples.T)[np.ix_(at, at)]
+    free = is_free_form(mean[None, :-2])
+    natural_from_theta = theta_to_free_form if free else partial(theta_to_natural, n_gaussians=n_gaussians)
+    center = natural_from_theta(mean[None, :])[0]
+    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
+    up, down = natural_from_theta(mean + np.diag(steps)), natural_from_theta(mean - np.diag(steps))
+    slope = ((up - down) / (2 * steps[:, None])).T
+    natural_cov = slope @ cov @ slope.T
+    # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
+    size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
+    size[levels] = np.abs(center[levels]).max() or 1.0
+    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
+    factor = np.linalg.cholesky(natural_cov + np.diag(floor))
+    return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

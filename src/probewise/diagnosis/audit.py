@@ -327,15 +327,14 @@ def audit_plan(
     plan: Plan | Recording,
     *,
     sensor: SensorPrior | None = None,
-    noise_sd: float | None = None,
     effects: Mapping[str, LightEffect] = VOCABULARY,
     progress: Progress = silent,
 ) -> PlanAudit:
     """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
 
-    Arguments and result, with up to five scans to add, are those of `probewise.audit`; and `noise_sd` of one reading,
-    in its unit (by default the calibrated sensor's, or a hundredth of the span between black and white), and the
-    vocabulary `effects`, by name. Raises ParameterError as that, and if units differ or the noise is not above 0.
+    Arguments and result, with up to five scans to add, are those of `probewise.audit`; and the vocabulary `effects`, by
+    name. The noise sd of a reading is the calibrated sensor's, or a hundredth of the span between black and white.
+    Raises ParameterError as that, and if units differ.
     """
     plan = plan.plan if isinstance(plan, Recording) else plan
     require_plan(plan)
@@ -345,9 +344,7 @@ def audit_plan(
     require_patterns_described(plan)
     if sensor is not None:
         require_same_unit(sensor, plan)
-    if noise_sd is None and isinstance(sensor, FittedSensor):
-        noise_sd = float(sensor.noise_sd.mean())
-    expected, unit = _expected_sensor(plan, sensor, noise_sd, effects), plan.instrumentation.unit
+    expected, unit = _expected_sensor(plan, sensor, effects), plan.instrumentation.unit
     progress("judging the plan")
     before, cosines = audits_and_cosines(expected.bank(plan), list(effects), unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
@@ -380,12 +377,7 @@ def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, 
     return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
 
 
-def audit_plan_of_diagnosis(
-    diagnosis: Diagnosis,
-    *,
-    sensor: SensorPrior | None = None,
-    effects: Mapping[str, LightEffect] = VOCABULARY,
-) -> PlanAudit:
+def audit_plan_of_diagnosis(diagnosis: Diagnosis, *, sensor: SensorPrior | None = None) -> PlanAudit:
     """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
 
     `diagnosis` is of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...)
@@ -402,9 +394,10 @@ def audit_plan_of_diagnosis(
     else:
         null = default_sensor(extent, known.n_gaussians)
     z, sd = np.clip(null.z(own)[0], -FARTHEST, FARTHEST), float(known.noise_sd.mean())
-    scaled, assumed = partial(_effects_under, effects, _levels(known.chain.names, mean)), f"{_AS_CALIBRATED} from these"
-    expected = Expected(null, z, sd, scaled, f"{assumed} readings")
-    seen, cosines = audits_and_cosines(expected.bank(plan, most=_SETTINGS), list(effects), plan.instrumentation.unit)
+    scaled = partial(_effects_under, VOCABULARY, _levels(known.chain.names, mean))
+    expected = Expected(null, z, sd, scaled, f"{_AS_CALIBRATED} from these readings")
+    bank = expected.bank(plan, most=_SETTINGS)
+    seen, cosines = audits_and_cosines(bank, list(VOCABULARY), plan.instrumentation.unit)
     return PlanAudit(plan, expected.assumed, seen, cosines, (), seen)
 
 
@@ -419,10 +412,8 @@ def _effects_under(kinds: Mapping[str, LightEffect], levels: tuple[float, float]
     return {name: effect for name, effect in maybe.items() if effect is not None}
 
 
-def _expected_sensor(
-    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None, effects: Mapping[str, LightEffect]
-) -> Expected:
-    """Return a sensor as calibrated, or a typical one, of a noise sd or that expected of it."""
+def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[str, LightEffect]) -> Expected:
+    """Return a sensor as calibrated, or a typical one, with its noise sd."""
     null: CalibratedSensor
     if sensor is not None:
         null, said = sensor_from_samples(sensor), _AS_CALIBRATED
@@ -435,8 +426,7 @@ def _expected_sensor(
         low, high = (bottom + share * span for share in _LEVELS)
         null, z = default_sensor(Extent(low, high, plan), 2), _TYPICAL.copy()
         said = f"a typical sensor of {low:g} to {high:g}"
-    sd = _NOISE * (high - low) if noise_sd is None else noise_sd
-    require(sd > 0, "noise_sd", sd, "greater than 0")
+    sd = float(sensor.noise_sd.mean()) if isinstance(sensor, FittedSensor) else _NOISE * (high - low)
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
     return Expected(null, z, sd, partial(_effects_under, effects, (low, high)), said)
 

@@ -479,52 +479,28 @@ def diagnose_prepared(
     test = run_global_test(searched, rng=rng)
     progress("testing the repair on held-out readings")
     judged, best = judged_and_best_repair(searched, test, judge(searched, test), rng=rng)
-    null_samples, best_samples, repaired = draw_models(searched, test, judged, best, rng=rng, progress=progress)
-    found = effects_found(searched, judged.hypotheses, best, best_samples, rng=rng)
+    null, samples, repaired = draw_models(searched, test, judged, best, rng=rng, progress=progress)
+    found = effects_found(searched, judged.hypotheses, best, samples, rng=rng)
     progress("locating the residuals")
     where = locate_effects_and_residuals(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
-    change = np.zeros(len(prepared.usable_rows))
-    if judged.verdict == "unknown" and not best.out_of_vocabulary:
+    change, is_unknown = np.zeros(len(prepared.usable_rows)), judged.verdict == "unknown"
+    if is_unknown and not best.out_of_vocabulary:
         improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")
-    asked = choose_next_measurement(
-        searched, test.null, unknown_shows_in=next(iter(where), None), is_unknown=judged.verdict == "unknown"
-    )
-    noise = noise_found(searched, best, best_samples, rng=rng)
+    shows_in = next(iter(where), None)
+    asked = choose_next_measurement(searched, test.null, unknown_shows_in=shows_in, is_unknown=is_unknown)
+    noise = noise_found(searched, best, samples, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
-    formula = formula_of(searched, judged, best, best_samples)
-    shares, beside = searched.evidences.unknown_shares, searched.likeliest_fit_beside_unknown(test.noise)
-    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
-    settles, apart = separating_readings_in_words(searched, judged, asked)
-    grounds = Grounds(
-        words=prepared.apparatus.words,
-        n_readings=len(prepared.usable_rows),
-        least_readings=prepared.least_readings,
-        form=searched.nulls[searched.likeliest_order].ssf_in_words,
-        sentences={effect.name: effect.sentence for effect in found},
-        like=tuple(sentence_from_samples(each, best_samples.effect_samples(each.name)) for each in formulas),
-        family=max(shares, key=lambda family: shares[family], default=""),
-        beside=beside.names if beside else (),
-        shows_in=tuple(place.covariate for place in where),
-        p_value_after=best.improvement.p_value_after,
-        nuisances=noise.nuisances,
-        settles=settles,
-        apart=apart,
-    )
-    reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
-    if prepared.is_thinned:
-        n_usable = int(prepared.everything.usable.sum())
-        reason += f" (From {len(prepared.usable_rows)} of {n_usable} readings, evenly spread.)"
     before, after = predictions_before_and_after(prepared, best, change)
-    return Diagnosis(
+    diagnosis = Diagnosis(
         recording=prepared.everything,
         apparatus=prepared.apparatus,
         **vars(judged),
-        reason=reason,
+        reason="",
         effects=found,
         noise=noise,
-        null=null_samples,
+        null=null,
         repaired=repaired,
         improvement=best.improvement,
         before=before,
@@ -535,8 +511,37 @@ def diagnose_prepared(
         is_settled=is_settled(searched),
         weighings=weighings,
         remainder=remainder,
-        formula=formula,
+        formula=formula_of(searched, judged, best, samples),
     )
+    return replace(diagnosis, reason=_reason(diagnosis, searched, test, best, samples))
+
+
+def _reason(diagnosis: Diagnosis, searched: Searched, test: GlobalTest, best: BestRepair, samples: ModelSamples) -> str:
+    """Return the verdict and its reason in words; `samples` are those of the best repair."""
+    prepared, shares = searched.prepared, searched.evidences.unknown_shares
+    beside = searched.likeliest_fit_beside_unknown(test.noise)
+    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
+    settles, apart = separating_readings_in_words(searched, diagnosis, diagnosis.next_measurement)
+    grounds = Grounds(
+        words=prepared.apparatus.words,
+        n_readings=len(prepared.usable_rows),
+        least_readings=prepared.least_readings,
+        form=searched.nulls[searched.likeliest_order].ssf_in_words,
+        sentences={effect.name: effect.sentence for effect in diagnosis.effects},
+        like=tuple(sentence_from_samples(each, samples.effect_samples(each.name)) for each in formulas),
+        family=max(shares, key=lambda family: shares[family], default=""),
+        beside=beside.names if beside else (),
+        shows_in=tuple(place.covariate for place in diagnosis.where),
+        p_value_after=diagnosis.improvement.p_value_after,
+        nuisances=diagnosis.noise.nuisances,
+        settles=settles,
+        apart=apart,
+    )
+    reason = sentence_with_agreement(reason_of(diagnosis, grounds), diagnosis.weighings)
+    if prepared.is_thinned:
+        n_usable = int(prepared.everything.usable.sum())
+        reason += f" (From {len(prepared.usable_rows)} of {n_usable} readings, evenly spread.)"
+    return reason
 
 
 def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:

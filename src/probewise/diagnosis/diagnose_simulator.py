@@ -134,32 +134,27 @@ def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolAr
     return _without_readings(recording, rows, note)
 
 
-def readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> BoolArray:
-    """Return the mask of the readings at an end of the declared range, and of those whose noise an end cuts off.
+def without_readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> RunRecording:
+    """Leave out, with a note, readings whose noise an end of the declared range cuts off, and note those at an end.
 
-    Of the latter, the fit predicts the signal near an end or beyond, and explains the reading; (n_points,) in all.
-    There are none at an end that no reading reaches, nor where only the misfit of the simulator tells the noise sd.
+    Of the former, the fit predicts the signal near an end or beyond, and explains the reading: near an end only noise
+    away from the end is seen, so their mean is biased. There are none at an end that no reading reaches, nor where only
+    the misfit of the simulator tells the noise sd. Where too few readings would be left for a fit, all stay. The
+    recording itself is returned if no reading is near an end.
     """
-    table, own_sd = cast(RunTable, recording.plan), sd * recording.relative_sd
-    low, high = system.simulator.noise.ends
-    if not is_noise_sd_known_beside_misfit(system.simulator, table):
-        return recording.usable & recording.censored
-    at_low, at_high = masks_of_readings_at_ends(recording.readings, low, high, system.simulator.noise.step)
-    predicted = replace(system, limited=False).chain(table, ()).predict(system.theta(found.z[None, :]), table)[0]
-    is_near = at_low.any() & (predicted - low < NEAR_END * own_sd)
-    is_near |= at_high.any() & (high - predicted < NEAR_END * own_sd)
-    is_explained = np.abs(recording.readings - np.clip(predicted, low, high)) < _EXPLAINED * own_sd
-    return np.asarray(recording.usable & (recording.censored | is_near & is_explained))
-
-
-def without_readings_near_ends(system: System, recording: RunRecording, near_ends: BoolArray) -> RunRecording:
-    """Leave out, with a note, those of the readings `near_ends` that are not at an end.
-
-    Near an end only noise away from the end is seen, so the mean of these readings is biased. Where too few readings
-    would be left for a fit, all stay.
-    """
-    at_end = near_ends & recording.censored
-    cut = near_ends & ~at_end & ((recording.usable & ~near_ends).sum() >= system.least_readings)
+    table, usable = cast(RunTable, recording.plan), recording.usable
+    near = at_end = usable & recording.censored
+    if is_noise_sd_known_beside_misfit(system.simulator, table):
+        (low, high), own_sd = system.simulator.noise.ends, sd * recording.relative_sd
+        at_low, at_high = masks_of_readings_at_ends(recording.readings, low, high, system.simulator.noise.step)
+        predicted = replace(system, limited=False).chain(table, ()).predict(system.theta(found.z[None, :]), table)[0]
+        is_near = at_low.any() & (predicted - low < NEAR_END * own_sd)
+        is_near |= at_high.any() & (high - predicted < NEAR_END * own_sd)
+        is_explained = np.abs(recording.readings - np.clip(predicted, low, high)) < _EXPLAINED * own_sd
+        near = at_end | usable & is_near & is_explained
+    if not near.any():
+        return recording
+    cut = near & ~at_end & ((usable & ~near).sum() >= system.least_readings)
     words = (
         (at_end, "at an end of the declared range: used only as the statement that the signal is there or beyond"),
         (cut, "left out near an end of the declared range, which cuts off the noise"),
@@ -310,10 +305,9 @@ def prepare_system(
         told("fitting the simulator without lost readings")
         recording = cast(RunRecording, lost.left_out_of(recording))
         system, found, sd = fit_system(plain, recording)
-    near_ends = readings_near_ends(system, found, sd, recording)
-    if near_ends.any():
-        recording = without_readings_near_ends(system, recording, near_ends)
-        known = is_noise_sd_known_beside_misfit(simulator, table)
+    beside_ends = without_readings_near_ends(system, found, sd, recording)
+    if beside_ends is not recording:
+        recording, known = beside_ends, is_noise_sd_known_beside_misfit(simulator, table)
         system = replace(system, first=found.z, slack=NEAR_END * sd if known else 0.0)
         system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd

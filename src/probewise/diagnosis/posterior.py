@@ -26,7 +26,7 @@ from typing import TypeAlias, cast
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, read_only_floats
+from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, with_prior
 from probewise.diagnosis.linear_posterior import (
@@ -175,9 +175,6 @@ class FoldedNormal(StandardNormal):
 
     sensor: CalibratedSensor
     near: FloatArray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "near", read_only_floats(self.near))
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
@@ -634,10 +631,11 @@ def posterior_draws(
     """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
 
     Unless `annealed`, they are draws of Laplace's approximation, or of its linear amplitudes where it has any.
-    Otherwise, where many samples cost little more than one, or an effect may be of either sign, they are drawn by
-    adaptive importance sampling. Else samples of Laplace's approximation are moved to the posterior in two stages, the
-    first through a quadratic surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict
-    new angles far worse. The parameters are those of `sample_model`.
+    Otherwise, where many samples cost little more than one, they are drawn by adaptive importance sampling; so are
+    those of a simulator that is called for each sample and has an effect with a size and a shape, by its tangent. Else
+    samples of Laplace's approximation are moved to the posterior in two stages, the first through a quadratic
+    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse. The
+    parameters are those of `sample_model`.
     """
     model, law, usable = found.model, noise.likeliest_law, recording.usable
     # Laplace's approximation: normal, of covariance steps.T @ steps, with `slopes` and `residual` in noise sds.

@@ -260,18 +260,14 @@ class NextMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A hypothesis about the mean readings (not their noise): label, model with best point z (n_params,), probability.
+    """A hypothesis about the mean readings (not their noise)."""
 
-    `label` is its name in words; `root` (n_params, n_params) a square root of the covariance of z: root root^T.
-    `of_run` are the indices of the coordinates of which each run has a value of its own: in a new run it is not known.
-    """
-
-    label: str
+    label: str  # its name in words
     model: Model
-    z: FloatArray
-    root: FloatArray
+    z: FloatArray  # its best point, (n_params,)
+    root: FloatArray  # a square root of the covariance of z, (n_params, n_params): root root^T
     probability: float
-    of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # coordinates with a value per run
 
     def predict(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""

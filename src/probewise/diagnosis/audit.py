@@ -77,17 +77,15 @@ class Seen(NamedTuple):
 class EffectBank:
     """The templates of all effects under one plan: changes of its readings, in noise sds.
 
-    `columns` (n_points, n_columns) are grouped in entries: one for each setting (parameter values) of an effect's
-    bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `built`,
-    `settings` its parameter values. `slopes` (n_points, n_params) are those of the model. `built`: effects by name.
+    They are grouped in entries: one for each setting (parameter values) of an effect's bank.
     """
 
-    slopes: FloatArray
-    columns: FloatArray
-    entry: IntArray
-    owner: IntArray
+    slopes: FloatArray  # of the model, (n_points, n_params)
+    columns: FloatArray  # (n_points, n_columns)
+    entry: IntArray  # of each column, (n_columns,)
+    owner: IntArray  # the index of the effect of each entry in `built`, (n_entries,)
     built: Mapping[str, Effect]
-    settings: tuple[FloatArray, ...]
+    settings: tuple[FloatArray, ...]  # the parameter values of each entry
 
     def _norms_of_entries(self, columns: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
@@ -155,17 +153,13 @@ def _run_start_indices(codes: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """The model about which a plan is audited: a null at a point z (n_params,), and the noise sd of a reading.
-
-    `effects_under`: function of a plan, the effects scaled to it, by name, without those that cannot act there;
-    `assumed`: model and noise in words.
-    """
+    """The model about which a plan is audited."""
 
     null: Null
-    z: FloatArray
-    sd: float
-    effects_under: Callable[[Plan], Mapping[str, Effect]]
-    assumed: str
+    z: FloatArray  # its coordinates, (n_params,)
+    sd: float  # of the noise of a reading
+    effects_under: Callable[[Plan], Mapping[str, Effect]]  # scaled to a plan, without those that cannot act there
+    assumed: str  # model and noise in words
 
     def bank(self, plan: Plan, *, most: int | None = None) -> EffectBank:
         """Build the templates of the effects on the mean under a plan.

@@ -91,19 +91,15 @@ _RUIN = -1.0  # nats per held-out reading below which named effects are withdraw
 
 @dataclass(frozen=True, eq=False)
 class BestRepair:
-    """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null.
-
-    `calibrated` and `repaired`: the null and that fit as they are under the noise found, which figures show.
-    `out_of_vocabulary`: if the verdict is `unknown`, its effects with a formula but no name in the vocabulary.
-    """
+    """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null."""
 
     fit: WeighedFit
     noise: Names
     problem: Linearised
     improvement: Improvement
-    calibrated: Fit
-    repaired: Fit
-    out_of_vocabulary: Names = ()
+    calibrated: Fit  # the null and
+    repaired: Fit  # that fit as they are under the noise found, which figures show
+    out_of_vocabulary: Names = ()  # of the verdict `unknown`, its effects with a formula but no name in the vocabulary
 
     @classmethod
     def of(

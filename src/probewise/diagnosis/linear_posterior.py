@@ -36,16 +36,12 @@ _ROUNDING = 1e-12  # of the curvature, by which that of readings fitted exactly 
 
 @dataclass(frozen=True, eq=False)
 class _AmplitudeGroup:
-    """Amplitudes with one component of the mixture in common: one alone, or values with one scale.
+    """Amplitudes with one component of the mixture in common: one alone, or values with one scale."""
 
-    `at` (n,): numbers of their coordinates; `prior`: theirs; `typical`: the unit of their values here; `sds`
-    (n_components,): sds of the components, in typical sizes.
-    """
-
-    at: list[int]
+    at: list[int]  # their coordinates
     prior: Prior
-    typical: float
-    sds: FloatArray
+    typical: float  # the unit of their values here
+    sds: FloatArray  # of the components, in typical sizes, (n_components,)
 
     def values(self, z: FloatArray) -> FloatArray:
         """Return the values, in typical sizes, from coordinates, (n_samples, n) both."""

@@ -404,32 +404,21 @@ _OPEN = 0.05  # least probability of a rival: what has less is no open question
 
 @dataclass(frozen=True)
 class Grounds:
-    """The facts, in addition to the verdict, for the sentence that gives its reason.
-
-    `n_readings`, `least_readings`: usable readings, and the fewest for a verdict;
-    `form`: description of the calibrated SSF, "" if there is none; `sentences`: sentence on each effect, by name;
-    `like`: sentences on the effects that the unknown one resembles; `family`: the most probable family of bases of the
-    unknown effect, such as "time"; `beside`: effects that act in addition to the unknown one; `shows_in`: names of the
-    covariates in which effects and residuals are located, in the order of `Diagnosis.where`; `p_value_after`: p-value
-    of the global test of the repaired model; `settles`: the readings that would separate the hypotheses that the
-    sentence names, in words; "" if no such readings do, None if that is not known; `apart`: which of these hypotheses
-    they separate, in words; `nuisances`: sentences on the noise that was found beside what has a name in the
-    vocabulary.
-    """
+    """The facts, in addition to the verdict, for the sentence that gives its reason."""
 
     words: Words
-    n_readings: int
-    least_readings: int
-    form: str = ""
-    sentences: Mapping[str, str] = field(default_factory=dict)
-    like: tuple[str, ...] = ()
-    family: str = ""
-    beside: tuple[str, ...] = ()
-    shows_in: tuple[str, ...] = ()
-    p_value_after: float = 1.0
-    settles: str | None = None
-    apart: str = ALL
-    nuisances: tuple[str, ...] = ()
+    n_readings: int  # usable ones
+    least_readings: int  # the fewest for a verdict
+    form: str = ""  # of the calibrated SSF, if there is one
+    sentences: Mapping[str, str] = field(default_factory=dict)  # on each effect, by name
+    like: tuple[str, ...] = ()  # sentences on the effects that the unknown one resembles
+    family: str = ""  # the most probable family of bases of the unknown effect, such as "time"
+    beside: tuple[str, ...] = ()  # effects that act in addition to the unknown one
+    shows_in: tuple[str, ...] = ()  # covariates of effects and residuals, in the order of `Diagnosis.where`
+    p_value_after: float = 1.0  # of the global test of the repaired model
+    settles: str | None = None  # the readings that would separate what is open; "" if none do, None if not known
+    apart: str = ALL  # which of the hypotheses they separate
+    nuisances: tuple[str, ...] = ()  # sentences on noise that was found beside what has a name in the vocabulary
 
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:

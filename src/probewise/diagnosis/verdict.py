@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias, cast
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -361,7 +361,8 @@ def verdict_and_combination(
     unknown, clean = by_mean.get(("unknown",), 0.0), by_mean.get((), 0.0)
     named = {effects: p for effects, p in by_mean.items() if effects not in ((), ("unknown",))}
     top = max(named, key=lambda effects: named[effects], default=())
-    of_class, verdict = _combination_and_alias_swaps(top, aliases), cast(Verdict, "named")
+    of_class = _combination_and_alias_swaps(top, aliases)
+    verdict: Verdict = "named"
     if unknown >= 0.5:
         verdict, top = "unknown", ("unknown",)
     elif clean >= 0.5:

@@ -434,7 +434,7 @@ def diagnose(
     Parameters
     ----------
     null
-        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape.
+        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape. Not with a `sensor`.
     effects
         The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; they are named where hardly anything
         else out of vocabulary explains the readings.
@@ -444,11 +444,6 @@ def diagnose(
     hands
         Whether a person can exchange or turn sheets for the next readings; if not, the next scans are over the sheet in
         place.
-
-    Raises
-    ------
-    ParameterError
-        As `probewise.diagnose`, and if both a sensor and a null are given.
     """
     require_rng(rng)
     require_progress(progress)
@@ -547,25 +542,11 @@ def _reason(diagnosis: Diagnosis, searched: Searched, test: GlobalTest, best: Be
 def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
     """Fit the sensor with these effects, at the SSF order (number of Gaussians) with the largest evidence.
 
-    Parameters
-    ----------
-    recording
-        What was read.
-    names
-        Names of `EFFECTS`, in the vocabulary or out of it; empty for the calibrated sensor alone.
-    rng
-        Source of randomness, for the posterior samples.
+    `names` are of `EFFECTS`, in the vocabulary or out of it; empty for the calibrated sensor alone. The samples are
+    without any effect on the mean if the search kept no refit with all of them, and without the noise effects (but
+    those beyond doubt) if it kept no noise model of just these.
 
-    Returns
-    -------
-    ModelSamples
-        The samples; without any effect on the mean if the search kept no refit with all of them, and without the noise
-        effects (but those beyond doubt) if it kept no noise model of just these.
-
-    Raises
-    ------
-    ParameterError
-        If there is no effect of a name, or it cannot act in this recording.
+    Raises ParameterError if there is no effect of a name, or it cannot act in this recording.
     """
     require_recording(recording)
     require_rng(rng)

@@ -125,8 +125,8 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
     entry of an effect's bank (its changes of readings, at a grid of its parameters).
     """
     prepared, misfit_templates = searched.prepared, searched.misfit_templates
-    telling, chosen = dict[str, FloatArray](), dict[str, EffectEntry]()
-    for name, effect in prepared.effects.items():
+    chosen, bases, pairs = dict[str, EffectEntry](), dict[str, FloatArray](), list[Alias]()
+    for name, effect in sorted(prepared.effects.items()):
         is_copy = name_of_first_copy(name) is not None
         if name in prepared.noise_effect_names or effects_out_of_vocabulary((name,)) or is_copy:
             continue
@@ -134,15 +134,12 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         blocks = OrthonormalBlocks.of(problem, templates.columns)
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
-        telling[name] = templates.columns[best]
         chosen[name] = templates.variant_of_entry(best), templates.settings[best]
-    bases = {name: _projected_basis(problem, problem.whiten(telling[name]))[0] for name in sorted(telling)}
-    pairs = []
+        bases[name] = _projected_basis(problem, problem.whiten(templates.columns[best]))[0]
     for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
         cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
         if cosines[0] >= ALIAS_COSINE:
-            settles_nothing = prepared.apparatus.words.settles_nothing
-            pairs.append(Alias(pair, float(min(cosines[0], 1.0)), settles_nothing, 0))
+            pairs.append(Alias(pair, float(min(cosines[0], 1.0)), prepared.apparatus.words.settles_nothing, 0))
     pairs.sort(key=lambda alias: -alias.cosine)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
 

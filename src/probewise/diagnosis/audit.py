@@ -673,8 +673,7 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     out |= {"clock_drift": timeless, noise_per_run.name: one_run}
     for name in own.parameters:
         out |= {f"drifts:{name}": timeless, f"steps:{name}": nothing}
-        if name not in own.per_run:
-            out[f"differs:{name}"] = one_run
+        out |= {} if name in own.per_run else {f"differs:{name}": one_run}
     for state in about.states:
         kinds = ("damping", "drag", "friction", "forcing", "periodic_forcing", "limit")
         out |= {f"{kind}:{state}": nothing for kind in kinds}

@@ -16,17 +16,7 @@ from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.words import join_names
-from probewise.effects import Effect, Extent, LightEffect, NoiseEffect
-from probewise.effects.noise import (
-    correlated_noise,
-    drifting_noise,
-    dropouts,
-    noise_per_run,
-    outliers,
-    quantisation,
-    random_walk,
-    signal_dependent_noise,
-)
+from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
@@ -153,10 +143,10 @@ def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
 
 
 ON_NOISE: tuple[LightEffect, ...] = (
-    signal_dependent_noise, correlated_noise, random_walk, noise_per_run, outliers, dropouts, quantisation,
-    drifting_noise,
+    noise.signal_dependent_noise, noise.correlated_noise, noise.random_walk, noise.noise_per_run, noise.outliers,
+    noise.dropouts, noise.quantisation, noise.drifting_noise,
 )  # fmt: skip
-_ALONG_ROWS = (correlated_noise, random_walk, drifting_noise)
+_ALONG_ROWS = (noise.correlated_noise, noise.random_walk, noise.drifting_noise)
 CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 10,000 in a diagnosis
 # Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
 # table as of a short one.
@@ -239,7 +229,7 @@ class SimulatorApparatus(Apparatus):
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
-            kinds.remove(random_walk)
+            kinds.remove(noise.random_walk)
         stop = None if self.stop is None else self.stop.effect
         beside = (*(kind.for_extent(extent) for kind in kinds), stop, self.lost)
         return bind_forms(self.about) | {effect.name: effect for effect in beside if effect is not None}

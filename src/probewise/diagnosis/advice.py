@@ -17,14 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import (
-    ENOUGH_NATS,
-    MOST_READINGS,
-    NOTHING_NATS,
-    SETTLED,
-    Apparatus,
-    rows_by_command,
-)
+from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, NOTHING_NATS, SETTLED, Apparatus, rows_by_command
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covariance_root
 from probewise.diagnosis.fit import Fit, Model, residual_degrees_of_freedom
 from probewise.diagnosis.locate import Place

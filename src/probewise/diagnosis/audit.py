@@ -26,12 +26,7 @@ from probewise.diagnosis.apparatus import ENOUGH_NATS, Command, Words
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
-from probewise.diagnosis.light_sensor import (
-    LightSensorApparatus,
-    candidate_scans,
-    scan_started_after,
-    target_swaps,
-)
+from probewise.diagnosis.light_sensor import LightSensorApparatus, candidate_scans, scan_started_after, target_swaps
 from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,

@@ -26,18 +26,13 @@ from probewise.systems.table import published_covariate
 
 @dataclass(frozen=True, eq=False)
 class Covariate:
-    """One covariate (time, place, level, ...) of the usable readings.
-
-    `rows` (n_rows,): indices of the usable readings for which it is defined; `values` (n_rows,): its values there, in
-    its unit; `groups`: whether it is categorical (an orientation, a scan); `scan`: name of the scan to which it is
-    restricted, or None.
-    """
+    """One covariate (time, place, level, ...) of the usable readings."""
 
     name: str
-    values: FloatArray
-    rows: IntArray
-    groups: bool = False
-    scan: str | None = None
+    values: FloatArray  # where it is defined, in its unit, (n_rows,)
+    rows: IntArray  # indices of these readings, (n_rows,)
+    groups: bool = False  # categorical: an orientation, a scan
+    scan: str | None = None  # the one to which it is restricted
 
     @property
     def published_name(self) -> str:

@@ -93,17 +93,16 @@ class StandardNormal:
 class HypothesisProblem:
     """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
 
-    Predictions of many samples are made in blocks, to fit in memory.
-
-    `model`, `recording`: model and data; `noise`: evidence of a fit by node of the noise model (a set of its
-    parameters); the probable nodes are averaged over; `near`: a point, (n_params,), such as its best fit, onto the
-    nearest order of whose Gaussians the prior is folded. Predictions do not depend on the order, nor does the evidence.
+    Predictions of many samples are made in blocks, to fit in memory. They do not depend on the order of exchangeable
+    Gaussians, nor does the evidence.
     """
 
     model: Model
     recording: Recording
-    noise: NoiseEvidence
-    near: FloatArray | None = None
+    noise: (
+        NoiseEvidence  # of a fit by node of the noise model (a set of its parameters): the probable are averaged over
+    )
+    near: FloatArray | None = None  # (n_params,), onto the nearest order of whose Gaussians the prior is folded
 
     @cached_property
     def prior(self) -> StandardNormal:
@@ -168,13 +167,10 @@ class FoldedNormal(StandardNormal):
     """A standard normal prior, folded onto the order of a sensor's Gaussians that is nearest to a point.
 
     The density of a point is the sum of the normal's densities over all orders (permutations of the Gaussians).
-
-    `n_params`: number of coordinates; `sensor`: sensor with exchangeable Gaussians; its coordinates come first; `near`:
-    the point, (n_params,).
     """
 
-    sensor: CalibratedSensor
-    near: FloatArray
+    sensor: CalibratedSensor  # with exchangeable Gaussians; its coordinates come first
+    near: FloatArray  # the point, (n_params,)
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:

@@ -165,16 +165,11 @@ _UNLIKELY = 0.1
 
 @dataclass(frozen=True, eq=False)
 class SimulatorApparatus(Apparatus):
-    """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
+    """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects."""
 
-    `about`: the system, its table, the first fit, and the sd of a reading; `stop`: the level at which the meter stops
-    without having declared it, if the readings show one; `lost`: the effect that lost readings which were left out, if
-    any.
-    """
-
-    about: ReferenceFit
-    stop: MeterStop | None = None
-    lost: NoiseEffect | None = None
+    about: ReferenceFit  # the system, its table, the first fit, and the sd of a reading
+    stop: MeterStop | None = None  # where the meter stops without having declared it, if the readings show that
+    lost: NoiseEffect | None = None  # the effect that lost readings which were left out, if any
 
     @property
     def system(self) -> System:

@@ -135,11 +135,13 @@ def _rounds_until_stop(
         elif reason is None and number == len(rngs):
             reason = f"the limit of {number} rounds is reached"
         elif reason is None and following is not None and affordable is None:
-            reason = f"the budget of {budget.exhausted_part(following.plan)} is spent"
+            first = next((rows for rows in following.plan.rows_by_scan() if rows.size), ())
+            reason = f"the budget of {'readings' if len(first) > budget.readings else 'minutes'} is spent"
         yield Round(number, recordings[-1], in_words, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:
             return
-        budget = budget.minus(affordable, over_s)
+        minutes = max(budget.minutes - _minutes_of_plan(affordable, over_s), 0.0)
+        budget = Budget(max(budget.readings - len(affordable), 0), minutes)
         plan, in_words = affordable, following.description
         if affordable is not following.plan:
             in_words = f"{in_words.rstrip('.')}; the budget allows {len(affordable)} of {len(following.plan)} readings"
@@ -160,10 +162,6 @@ class Budget:
             if not checked_number(name, getattr(self, name)) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
-    def minus(self, plan: Plan, after_s: float) -> Budget:
-        """Return the budget without the cost of a plan, at least 0; minutes count from time `after_s` to its end."""
-        return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes_of_plan(plan, after_s), 0.0))
-
     def affordable_scans(self, plan: Plan, after_s: float) -> Plan | None:
         """Return the plan's first scans that fit the budget, in minutes from the time `after_s`; None if none does."""
         kept = np.zeros(0, dtype=np.int64)
@@ -175,11 +173,6 @@ class Budget:
         if len(kept) == len(plan):
             return plan
         return plan.take(kept) if kept.size else None
-
-    def exhausted_part(self, plan: Plan) -> str:
-        """Return which part of the budget a plan's first scan exceeds: "readings", otherwise "minutes"."""
-        first = next((rows for rows in plan.rows_by_scan() if rows.size), ())
-        return "readings" if len(first) > self.readings else "minutes"
 
 
 def _minutes_of_plan(plan: Plan, after_s: float) -> float:
@@ -265,20 +258,19 @@ class RoundsFolder:
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
         self.path = path
-        file, wanted = path / _SETTINGS, dict(settings)
-        if resume:
-            if not file.exists():
-                raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")
-            before = parse_json_file_text(file, read_text(file, _ALLOWED), _ALLOWED)
-            if not isinstance(before, dict):
-                raise FileError(file, "no JSON object", _ALLOWED)
-            for name, value in wanted.items():
-                if before.get(name) != value:
-                    had = f"an investigation with {name} {before.get(name)!r}"
-                    raise FileError(file, had, f"{value!r}, as asked now")
-        elif file.exists():
+        file, self._settings = path / _SETTINGS, dict(settings)
+        if not resume and file.exists():
             raise FileError(file, "an investigation is in this folder", "--resume to continue it, or another --out")
-        self._settings = wanted
+        if not resume:
+            return
+        if not file.exists():
+            raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")
+        before = parse_json_file_text(file, read_text(file, _ALLOWED), _ALLOWED)
+        if not isinstance(before, dict):
+            raise FileError(file, "no JSON object", _ALLOWED)
+        for name, value in self._settings.items():
+            if before.get(name) != value:
+                raise FileError(file, f"an investigation with {name} {before.get(name)!r}", f"{value!r}, as asked now")
 
     def record_round(
         self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent
@@ -291,9 +283,8 @@ class RoundsFolder:
         if not planned.exists():
             self.path.mkdir(parents=True, exist_ok=True)
             if not (self.path / _SETTINGS).exists():
-                write_text_atomically(
-                    self.path / _SETTINGS, json.dumps(self._settings, indent=1, allow_nan=False) + "\n"
-                )
+                text = json.dumps(self._settings, indent=1, allow_nan=False) + "\n"
+                write_text_atomically(self.path / _SETTINGS, text)
             write_plan(plan, planned)
         plan = read_plan(planned)
         readings = readings_of_recording(read_recording(readings_file)) if readings_file.exists() else []
@@ -356,24 +347,17 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
 
 def _parse_one_effect(text: str) -> Concealed:
     name, _, numbers = text.partition(":")
-    kinds = {own: kind for own, kind in KINDS.items() if _is_of_numbers(kind)}
+    names_of = {own: inspect.signature(kind).parameters for own, kind in KINDS.items()}
+    kinds = {own for own, taken in names_of.items() if {each.annotation for each in taken.values()} == {"float"}}
     if name not in kinds:
-        meant = did_you_mean(name, kinds)
-        raise ParameterError(
-            "--truth", name, f"{NOTHING}, or an effect of probewise.world.concealed with its values{meant}"
-        )
-    kind = kinds[name]
-    wanted = ",".join(inspect.signature(kind).parameters)
-    allowed = f"{name}:{wanted}, all of them numbers of magnitude up to {_LARGEST:g}"
+        allowed = f"{NOTHING}, or an effect of probewise.world.concealed with its values{did_you_mean(name, kinds)}"
+        raise ParameterError("--truth", name, allowed)
+    allowed = f"{name}:{','.join(names_of[name])}, all of them numbers of magnitude up to {_LARGEST:g}"
     try:
         values = [float(number) for number in numbers.split(",")]
-        effect: Concealed = kind(*values)
+        effect: Concealed = KINDS[name](*values)
     except (TypeError, ValueError) as error:
         raise ParameterError("--truth", text, allowed) from error
     if not all(abs(value) <= _LARGEST for value in values):  # nor NaN
         raise ParameterError("--truth", text, allowed)
     return effect
-
-
-def _is_of_numbers(kind: Callable[..., Concealed]) -> bool:
-    return {parameter.annotation for parameter in inspect.signature(kind).parameters.values()} == {"float"}

@@ -157,7 +157,7 @@ def test_an_effect_that_is_there_twice_has_the_name_of_diagnosis_json_in_the_tab
 def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
     effects = (("lag",), ("delay",), ("settling",))
     plan = NextMeasurement(
-        range(8), "scan again", 1.2, 12.3, ("lag", "delay", "settling"), effects, np.full(3, 1 / 3),
+        range(8), "scan again", 1.2, 12.3, ("lag", "delay", "settling"), effects,
         np.array([[0.0, 0.1, 20.0], [0.1, 0.0, 20.0], [20.0, 20.0, 0.0]]),
     )  # fmt: skip
     found = SimpleNamespace(

@@ -17,7 +17,7 @@ from scipy.special import betaln, ndtri, stdtr
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start, with_prior
-from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
+from probewise.diagnosis.locate import Covariate, window_columns
 from probewise.diagnosis.noise import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
 from probewise.effects import NoiseEffect
@@ -57,7 +57,7 @@ def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covar
     even = float(betaln(total + _A, n - total + _A) - betaln(_A, _A))
     scores: dict[str, list[FloatArray]] = {}
     for covariate in covariates:
-        columns, _ = window_columns_and_bounds(covariate, n)
+        columns, _ = window_columns(covariate, n)
         if columns.shape[1]:
             inside, many = far_out @ columns, columns.sum(axis=0)
             outside, few = total - inside, n - many

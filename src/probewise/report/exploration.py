@@ -147,24 +147,18 @@ def _fault_section(steps: Sequence[Step], trust: float, draw: html.Draw) -> html
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
-    step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
+    step, truth = run.last, dict(truth)
+    likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
+    names = [step.names[k] for k in columns]
+    if all(name in truth for name in names):  # the angle nearest the estimate's by the shape's symmetry
+        near = with_angles_near(likely, np.array([[truth[name] for name in names]]), step.mean[columns])[0]
+        truth |= dict(zip(names, near.tolist(), strict=True))
     return ", ".join(
         f"{words_without_unit(name.removeprefix(f'{step.likely_shape}.'))} "
         f"{value_with_error(float(mean) - truth[name], float(sd), unit_of_name(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
-
-
-def _truth_with_angles_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
-    """Return the truth by name, its angle nearest the estimate's by the shape's symmetry; two sides may be swapped."""
-    step = run.last
-    likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
-    names = [step.names[k] for k in columns]
-    if not all(name in truth for name in names):
-        return dict(truth)
-    near = with_angles_near(likely, np.array([[truth[name] for name in names]]), step.mean[columns])[0]
-    return {**truth, **dict(zip(names, near.tolist(), strict=True))}
 
 
 def summary_sentence(run: Exploration) -> str:

@@ -120,6 +120,11 @@ def figure(image: bytes, caption: str) -> Markup:
     return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
 
 
+def figures(drawn: Mapping[str, bytes], captions: Mapping[str, str]) -> dict[str, Markup]:
+    """Build the figures that have a caption, by file name."""
+    return {name: figure(drawn[name], caption) for name, caption in captions.items() if name in drawn}
+
+
 def _least_width_attribute(png: bytes) -> str:
     """Return a style attribute: the width (CSS px) below which a PNG's text is too small, 0.9 of the width as drawn."""
     with Image.open(io.BytesIO(png)) as picture:

@@ -38,13 +38,8 @@ class Section:
     @property
     def elements(self) -> tuple[Markup, ...]:
         """The body as HTML."""
-        return tuple(map(_as_element, self.body))
-
-
-def _as_element(part: str | Mapping[str, str]) -> Markup:
-    if isinstance(part, Markup):
-        return part
-    return paragraph(part) if isinstance(part, str) else definition_list(part.items())
+        texts = (definition_list(p.items()) if isinstance(p, Mapping) else p for p in self.body)
+        return tuple(text if isinstance(text, Markup) else paragraph(text) for text in texts)
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
@@ -164,10 +159,12 @@ def page(
         sections = [
             replace(s, body=(*s.body, *_explain_new_terms(" ".join((s.heading, *s.elements)), known))) for s in sections
         ]
+    listed = sum(1 + len(s.parts) for s in sections) >= _FEWEST_LISTED
+    entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
         key_figure,
-        *_table_of_contents(sections),
+        *([element("nav", element("ol", *entries), aria_label="contents")] if listed else []),
         *(_section_element(s, str(k), 2) for k, s in enumerate(sections, start=1)),
     )
     again = () if reload_s is None else (Markup(f'<meta http-equiv="refresh" content="{reload_s}">'),)
@@ -199,13 +196,6 @@ def _section_element(section: Section, number: str, level: int) -> Markup:
     parts = (_section_element(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
     heading = element(f"h{level}", section.heading)
     return element("section", heading, *section.elements, *parts, id=_section_id(number))
-
-
-def _table_of_contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
-    if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
-        return ()
-    entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
-    return (element("nav", element("ol", *entries), aria_label="contents"),)
 
 
 def _contents_entry(section: Section, number: str) -> Markup:

@@ -52,8 +52,8 @@ def interval_table_lines(rows: Sequence[tuple[str, float, tuple[float, float]]])
 def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
     """Return read-only copies of samples (n_samples, n_params) and noise sds (n_samples,); `names` has n_params names.
 
-    Raises ShapeError or ParameterError if the shapes do not fit, a name is no text, there are fewer than 500 samples, a
-    value is not finite, or an sd is not positive.
+    ShapeError or ParameterError if the shapes do not fit, a name is no text, there are fewer than 500 samples, a value
+    is not finite, or an sd is not positive.
     """
     checked_texts("names", names, "names of the columns of samples")
     samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)

@@ -78,29 +78,12 @@ def investigate(
     A round, a recording and its diagnosis, is carried out only when it is asked for; the last has a `stop_reason`. An
     explanation is settled if it has probability 0.95 and the verdict is not `cannot_tell`.
 
-    Parameters
-    ----------
-    record
-        Function that takes the readings: of a round's number, its plan and the plan in words; returns the recording.
-    plan
-        The first plan.
-    sensor
-        An earlier calibration, whose posterior becomes the prior; without it each diagnosis calibrates its own.
-    effects
-        The vocabulary: classes of effects, by name.
-    budget
-        Budget beyond `plan`; default: 400 readings.
-    rounds
-        Largest number of rounds, including the first.
-    hands
-        Whether a person can turn or exchange sheets; if not, plans only scan the sheet in place.
-    rng
-        Each round has its own child of it, so that a resumed investigation is reproducible.
-
-    Raises
-    ------
-    ParameterError
-        If an argument is invalid; see also `diagnose`.
+    `record` takes the readings: of a round's number, its plan and the plan in words; returns the recording. `plan` is
+    the first plan; `sensor` an earlier calibration, whose posterior becomes the prior, without which each diagnosis
+    calibrates its own; `effects` the vocabulary, by name; `budget` what may be spent beyond `plan`, by default 400
+    readings; `rounds` the largest number of rounds, including the first; `hands` whether a person can turn or exchange
+    sheets; if not, plans only scan the sheet in place. Each round has its own child of `rng`, so that a resumed
+    investigation is reproducible. ParameterError if an argument is invalid; see also `diagnose`.
     """
     require_accepts_positional("record", record, 3, "a function of a round's number, its plan and the plan in words")
     require_plan(plan)
@@ -259,8 +242,8 @@ _KEPT_AGAIN_S = 0.5  # an arm takes longer per reading, so that none of its read
 class RoundsFolder:
     """The folder of one investigation: plan and readings of each round; made with the first round.
 
-    `settings`, as JSON takes them, determine the investigation. Raises FileError if the folder holds an investigation
-    and `resume` is False, or holds none, or one with other settings, and `resume` is True.
+    `settings`, as JSON takes them, determine the investigation. FileError if the folder holds an investigation and
+    `resume` is False, or holds none, or one with other settings, and `resume` is True.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
@@ -331,10 +314,7 @@ _LARGEST = 1e9  # largest magnitude of a parameter of an effect
 
 @dataclass(frozen=True)
 class SimulatedRecorder:
-    """A `Take` function (for `RoundsFolder`) that simulates a round's plan in a world.
-
-    The noise of a round follows from the seed and the round's number.
-    """
+    """A `Take` function that simulates a plan in a world, with noise by the seed and the round's number."""
 
     world: World
     seed: int
@@ -349,7 +329,7 @@ class SimulatedRecorder:
 def parse_concealed(text: str) -> tuple[Concealed, ...]:
     """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing" for none.
 
-    Raises ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
+    ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
     """
     return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 

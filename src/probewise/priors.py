@@ -308,9 +308,8 @@ SMALLEST_AND_LARGEST = (0.05, 25.0)
 class HeavyTailedPrior:
     """Scale mixture of normal distributions about zero, by default with sds from 0.05 to 25 times a typical size.
 
-    The weights are equal, so the density falls about as 1/abs(x) between the smallest and the largest sd and is
-    proper. With `positive` the distribution is folded onto x >= 0. `smallest` and `largest` are the smallest and the
-    largest sd, in typical sizes.
+    The weights are equal, so the density falls about as 1/abs(x) between the sds `smallest` and `largest`, in typical
+    sizes, and is proper. With `positive` the distribution is folded onto x >= 0.
     """
 
     typical: float
@@ -409,14 +408,12 @@ class LogHeavyTailedPrior:
 
 @dataclass(frozen=True)
 class SharedScalePrior:
-    """Values that are normal about zero with the same sd, log-uniform over the sds of `each`.
+    """Values that are normal about zero with the same sd, log-uniform over the sds of `each`; `names` are two or more.
 
-    Independent heavy-tailed priors ask of every value anew how large it is. Where one has told, here the others are
-    expected to be as large. The distribution depends on the root of the sum of squares alone, so that standard-normal
-    coordinates have the direction of the values, and their length is that of equal probability.
-
-    `names`: names of the values, two or more; `each`: the prior of one value, about: a heavy-tailed prior with sds over
-    the same range.
+    Independent heavy-tailed priors, such as `each`, of one value, leave the size of every value open. Where one is
+    known, here the others are expected to be as large. The distribution depends on the root of the sum of squares
+    alone, so that standard-normal coordinates have the direction of the values, and their length is that of equal
+    probability.
     """
 
     names: tuple[str, ...]

@@ -30,8 +30,8 @@ def shipped_geometry_path() -> Path:
 def read_geometry(path: str | Path) -> Geometry:
     """Read an arm's geometry from a TOML file of format "arm/1".
 
-    Raises FileError if the file is missing or not TOML, an entry is missing or not allowed, or a name is unknown; the
-    message gives file, entry, content and what is allowed.
+    FileError, with entry, content and what is allowed, if the file is missing or not TOML, an entry is missing or not
+    allowed, or a name is unknown.
     """
     path = checked_path("path", path)
     text = read_text(path, "an arm's geometry, TOML in UTF-8")
@@ -78,14 +78,11 @@ def read_geometry(path: str | Path) -> Geometry:
 
 
 def text_with_fitted_values(text: str, geometry: Geometry) -> str:
-    """Return the text of a geometry file with the fitted values and their accuracy replaced.
+    """Return the text of a geometry file, its comments kept, with the fitted values and their accuracy replaced.
 
-    Limits and stops of the joints, which shift with their home angles, are replaced too. The table [accuracy] is added
-    if missing; no other entry is.
-
-    `text`: text of the file before the fit; its comments are kept; `geometry`: the fitted geometry. Raises
-    ParameterError if a number is not on a line of its own below the header of its table, as in an inline table: it
-    would stay.
+    Limits and stops of the joints, which shift with their home angles, are replaced too; the table [accuracy] is added
+    if missing. Raises ParameterError if a number is not on a line of its own below the header of its table, as in an
+    inline table: it would stay.
     """
     numbers: dict[tuple[str, str], float] = {
         ("base", "x_mm"): geometry.axis_mm[0],

@@ -183,16 +183,11 @@ def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: 
 class Reach:
     """The reachable places of an arm: a ring about its axis, intersected with the field.
 
-    The axis stands beyond the middle of the field's upper long side. The default is the reach of the LEGO arm whose
+    The axis stands `axis_beyond_mm` beyond the middle of the field's upper long side; `field_mm` is width and height of
+    the field, whose lower left corner is the lab frame's origin. The default is the reach of the LEGO arm whose
     geometry ships with the package: all but 2 % of the field, at the corners farthest from the axis and nearest to the
-    axis, where the arm cannot fold.
-
-    Raises ParameterError if a length is negative or not finite, or `nearest_mm` is not below `farthest_mm`; ReachError
-    if no place on the field is within reach.
-
-    `field_mm`: width and height of the field; its lower left corner is the lab frame's origin; `axis_beyond_mm`:
-    distance of the axis from the field; `nearest_mm`, `farthest_mm`: smallest and largest distance of the sensor from
-    the axis.
+    axis, where the arm cannot fold. Raises ParameterError if a length is negative or not finite, or `nearest_mm` is not
+    below `farthest_mm`; ReachError if no place on the field is within reach.
     """
 
     field_mm: tuple[float, float] = FIELD_MM

@@ -18,10 +18,7 @@ N_CHECKED = 33  # points checked along a move
 
 
 class SoftLimits:
-    """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts.
-
-    `geometry`: limits of the joints, and the lowest height of the sensor.
-    """
+    """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts."""
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
@@ -50,10 +47,9 @@ class SoftLimits:
         return np.asarray(self._geometry.position_mm(way)[:, 2])
 
     def require_allowed_move(self, joint: int, here: int, to: int) -> None:
-        """Raise ReachError if a move of one joint, the others at rest, leaves the allowed range.
+        """Raise ReachError if a move of one joint from count `here` to `to` leaves the allowed range.
 
-        `here` and `to` are the counts of the joint's motor at start and end. A joint beyond its limits may move back,
-        and a sensor below the lowest height may rise.
+        The others are at rest. A joint beyond its limits may move back, and a sensor below the lowest height may rise.
         """
         geometry, mechanics = self._geometry, self._geometry.joints[joint]
         angle, start = mechanics.angle_at(to), mechanics.angle_at(here)
@@ -119,10 +115,7 @@ class Machine(Protocol):
 
 
 class DryRun:
-    """A dry run: prints every commanded move, and reads nothing.
-
-    `geometry`: geometry of the arm; `say`: function called with one line per command.
-    """
+    """A dry run: `say` is called with a line per commanded move, and nothing is read."""
 
     def __init__(self, geometry: Geometry, say: Callable[[str], None]) -> None:
         self._geometry, self._say = geometry, say

@@ -24,7 +24,7 @@ from probewise.arm import (
 )
 from probewise.arm.fitting import spread_mark_places
 from probewise.arm.geometry import JOINTS
-from probewise.arm.height_check import HeightReading, check_heights
+from probewise.arm.height_check import check_heights
 from probewise.cli import _bench
 from probewise.cli._arm import SCENE, parse_arm, parse_place
 from probewise.cli._common import (
@@ -248,20 +248,20 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
             paper = "lay white matt paper, the same everywhere, over the field, or under each place"
             prompter_unless_dry_run(arguments, arm)(paper)
 
-        def height_reading_at(place: tuple[float, float], height_mm: float) -> HeightReading:
+        def height_reading_at(place: tuple[float, float], height_mm: float) -> tuple[float, float, float]:
             arm.go_down(*place, height_mm)
             values = np.array([arm.brightness() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
-            return HeightReading(float(arm.position_mm[2]), float(values.mean()), error)
+            return float(arm.position_mm[2]), float(values.mean()), error
 
         arm.go_over(*places[0])
         lowest_mm = geometry.read_height_mm
-        curve = [height_reading_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
+        curve = np.array([height_reading_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)])
         lights = []
         for place in places[1:]:
             lights.append(height_reading_at(place, lowest_mm))
             if not arguments.dry_run:
-                check = check_heights(curve, lights)
+                check = check_heights(curve, np.array(lights))
                 say(_height_error_in_words(place, check.off_mm[-1], check.sd_mm[-1]))
     if arguments.dry_run:
         return

@@ -77,10 +77,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def add(to: argparse._ActionsContainer, usage: str, about: str, **more: Any) -> None:
-    """Add an argument or option by its usage, "NAME METAVAR", and its help; `more` goes to `add_argument`.
-
-    An option without metavar and `more` is a flag.
-    """
+    """Add an argument or option by its usage, "NAME METAVAR", and its help; without metavar and `more` it is a flag."""
     name, _, metavar = usage.partition(" ")
     if metavar:
         more["metavar"] = metavar
@@ -231,10 +228,7 @@ def print_warning(text: str) -> None:
 
 
 def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
-    """Return a message: how many readings, marks or tasks (`noun`) a file holds, and the command that resumes the run.
-
-    `options` are added to the words of the command line; `of` is the total number, 1 if it is not known.
-    """
+    """Return how many of a `noun` (`of` a total) a file holds, and the command, with `options`, that resumes."""
     import shlex
     import subprocess
 

@@ -33,10 +33,9 @@ Verb = Callable[[argparse.Namespace], int]
 
 
 def diagnose_each(arguments: argparse.Namespace, diagnose: Verb) -> int:
-    """Diagnose each recording into a folder of its own; write table.csv and a page of all; return the exit status.
+    """Diagnose each recording, by the verb `diagnose`, into a folder of its own; write table.csv and a page of all.
 
-    `diagnose` runs the verb on the arguments of one recording. One that cannot be diagnosed is a row of the table;
-    folders that are complete, of the same files and options, are not diagnosed again.
+    One that cannot be diagnosed is a row of the table; folders that are complete, of the same files and options, stay.
     """
     out = checked_output_directory(arguments.out)
     folders = {name: out / name for name in _device_names(arguments.recordings)}

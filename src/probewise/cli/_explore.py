@@ -36,7 +36,7 @@ from probewise.verbs import calibrate, naive_levels
 if TYPE_CHECKING:
     from probewise._arrays import FloatArray
     from probewise.arm import Geometry, Instrument, Reading
-    from probewise.experiment import Experiment, Journal, Model, Step
+    from probewise.experiment import Experiment, Model, Step
     from probewise.inference import Naive
     from probewise.progress import Progress
 
@@ -63,10 +63,7 @@ class Inputs:
 
 
 def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
-    """Read the files that the options name, check the options, and build the experiment.
-
-    Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.
-    """
+    """Read the files that the options name, check the options against each other, and build the experiment."""
     chosen = parse_arm(arguments.arm)
     if chosen.kind == "file" and arguments.geometry is not None:
         raise ParameterError("--geometry", str(arguments.geometry), "none with FILE.py, which defines its own reach")
@@ -114,10 +111,7 @@ def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
 
 
 def _shipped_sensor(arguments: argparse.Namespace, chosen: ArmName) -> FittedSensor:
-    """Calibrate the sensor of the recording that ships, and say so; a resumed run reads the one that it began with.
-
-    Raises ParameterError for a real arm.
-    """
+    """Calibrate the sensor of the recording that ships, and say so; a resumed run reads the one that it began with."""
     require(not chosen.is_real, "--sensor", "none", "the sensor model of this arm, as `probewise calibrate` writes it")
     if arguments.resume and (arguments.out / _SHIPPED).exists():
         return read_sensor(arguments.out / _SHIPPED)
@@ -143,10 +137,7 @@ def _refuse_settings_that_the_arm_lacks(arguments: argparse.Namespace, geometry:
 
 
 def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
-    """Return the field given as "WIDTH,HEIGHT" (mm), else the geometry's, else the paper's.
-
-    Raises ParameterError if the one given contradicts the geometry, or is no such text.
-    """
+    """Return the field given as "WIDTH,HEIGHT" (mm), else the geometry's, with which it agrees, else the paper's."""
     of_arm = None if geometry is None else Field(*geometry.field_mm)
     if text is None:
         return of_arm or Field()
@@ -159,10 +150,7 @@ def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
 
 
 def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
-    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card, of known albedo, centred at (X, Y) in mm.
-
-    Raises ParameterError if a text is anything else, or a card is not wholly on the field.
-    """
+    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card on the field, of known albedo, centred at (X, Y) in mm."""
     cards = []
     for text in texts:
         numbers = common.parse_numbers(text)
@@ -179,11 +167,7 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
 
 
 def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> HiddenShape:
-    """Parse the true shape from "[SHAPE:]V,V,...", its parameters; if `text` is None, draw it from the prior.
-
-    Without SHAPE it is the first of `names`. Raises ParameterError for an unknown shape, a wrong number of values, or
-    values that the shape's prior excludes.
-    """
+    """Parse the true shape from "[SHAPE:]V,V,...", without SHAPE the first of `names`; None: draw it from the prior."""
     if text is None:
         return HiddenShape.drawn_from_prior({name: SHAPES[name](field) for name in names}, rng=rng)
     name, _, listed = text.rpartition(":")
@@ -200,10 +184,7 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
 def _naive_levels(
     arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
 ) -> Naive | None:
-    """Return the paper's naive model's readings over black and white, with sds; None if it is not used.
-
-    Raises ParameterError if an option does not apply, or a real arm has no recording.
-    """
+    """Return the paper's naive model's readings over black and white, with sds; None if it is not used."""
     common.refuse_nested_stop(arguments)
     wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
     if arguments.levels is not None and not wanted:
@@ -217,10 +198,9 @@ def _naive_levels(
 
 
 class ArmAndTruth(NamedTuple):
-    """An arm over a field, with the true shape if it is simulated.
+    """An arm over a field; if it is simulated, with the true outline, (n_points, 2), and parameters by hypothesis name.
 
-    `outline_mm` is the true outline, (n_points, 2), `known` the true parameters by the hypotheses' names, and `about`
-    the entries for the journal; with a real arm, None and empty.
+    `about` are the entries for the journal.
     """
 
     arm: Instrument
@@ -230,10 +210,7 @@ class ArmAndTruth(NamedTuple):
 
 
 def _open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> ArmAndTruth:
-    """Open the chosen arm, to continue after the readings `taken`; with it, if simulated, return its true shape.
-
-    Raises ParameterError, FileError or ArmError if a truth was given with a real arm, or the arm cannot be opened.
-    """
+    """Open the chosen arm, to continue after the readings `taken`; with it, if simulated, return its true shape."""
     chosen, geometry, start_s = inputs.arm, inputs.geometry, taken[-1].time_s if taken else 0.0
     if chosen.is_real:
         require(arguments.truth is None, "--truth", arguments.truth, "none with a real arm, whose target is unknown")
@@ -259,9 +236,8 @@ def _open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tu
 class Pictures:
     """The pictures of a run: draws each step as it arrives, and keeps steps and pictures for the report.
 
-    `files` are the run's input files, which stay where they are when results of an earlier run are removed from `out`.
-    `shadows` are the steps of the other sensor model on the same readings; `frames` has a PNG of each step, b"" where
-    it could not be drawn.
+    `files` are the run's inputs, which stay when an earlier run's results are removed from `out`; `shadows` the other
+    sensor model's steps on the same readings; `frames` has a PNG of each step, b"" where it could not be drawn.
     """
 
     out: Path
@@ -315,8 +291,7 @@ class Pictures:
     ) -> list[str]:
         """Write result.json, posterior samples and sensor.json, then animation and report; return lines to print.
 
-        The sensor is the one that the run was given, with the effect that the run found in it, if any; what a run with
-        --learn-sensor learnt of SSF and levels is not in it.
+        The sensor is the one given, with the effect that the run found in it, if any; not what --learn-sensor learnt.
         """
 
         def write_files(stage: StagedFiles) -> None:
@@ -358,7 +333,11 @@ def explore(arguments: argparse.Namespace) -> int:
     out = checked_output_directory(arguments.out, "journal.jsonl", "live.html", "frames")
     inputs = read_checked_inputs(arguments)
     journal = out / "journal.jsonl"
-    before = _journal_to_resume(journal, resume=arguments.resume)
+    if arguments.resume and not journal.exists():
+        raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
+    if journal.exists() and not arguments.resume:
+        raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
+    before = read_journal(journal) if arguments.resume else None
     site = _open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
     common.print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     if arguments.sensor is None:
@@ -449,13 +428,3 @@ def _path_relative_to_folder(folder: Path, path: Path) -> str:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # on another drive
         return str(path.absolute())
-
-
-def _journal_to_resume(journal: Path, *, resume: bool) -> Journal | None:
-    if not journal.exists():
-        if resume:
-            raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
-        return None
-    if not resume:
-        raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
-    return read_journal(journal)

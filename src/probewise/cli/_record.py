@@ -101,7 +101,8 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
             ask = prompter_unless_dry_run(arguments, arm)
         else:
             arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
-            emulated = not is_own and _is_pty(nxt_port(arguments.arm))
+            # A pseudo-terminal is an emulator's.
+            emulated = not is_own and os.path.realpath(nxt_port(arguments.arm)).startswith(("/dev/pts/", "/dev/ttys"))
             ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             print_result(
@@ -151,10 +152,7 @@ def _read_unfinished_recording(path: Path) -> Recording:
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> list[Reading]:
-    """List the readings of an earlier session, from `out`; none without `resume`.
-
-    Raises FileError if the file exists without `resume`, or it was begun with another plan or another description.
-    """
+    """List the readings of an earlier session, from `out`, which was begun with this plan; none without `resume`."""
     if not resume:
         if out.exists():
             raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
@@ -212,9 +210,9 @@ def person_at_bench(
 ) -> Callable[[RequestToPerson], None]:
     """Return a function that prompts a person to carry out a request of `carry_out`, and then checks the sheet.
 
-    `origin_mm` is the place of the plan's origin. With `check_sheets` a sheet is checked before it is scanned, until it
-    is right or the person overrides the check; a user's own instrument takes only the plan's readings. If `emulated`,
-    requests are carried out by typing in the emulator's terminal, and the prompt says what.
+    With `check_sheets` a sheet is checked before it is scanned, until it is right or the person overrides the check; a
+    user's own instrument takes only the plan's readings. If `emulated`, requests are carried out by typing in the
+    emulator's terminal, and the prompt says what.
     """
     answer = _bench.prompter_for_answer(arm)
 
@@ -241,7 +239,7 @@ def person_at_bench(
         return sheet_check.complaint_about_levels(name, values)
 
     def ask(request: RequestToPerson) -> None:
-        answer(f"{request[0].upper()}{request[1:]}{hint(request)}, then press Enter: ")
+        _bench.press_enter(answer, f"{request}{hint(request)}")
         if request.pattern is None or not check_sheets:
             return
         while (wrong := complaint_about_sheet(request.pattern)) is not None:
@@ -252,11 +250,6 @@ def person_at_bench(
                 break
 
     return ask
-
-
-def _is_pty(port: str) -> bool:
-    """Return whether a port is a pseudo-terminal, and hence an emulator."""
-    return os.path.realpath(port).startswith(("/dev/pts/", "/dev/ttys"))
 
 
 class SheetCheck:
@@ -277,10 +270,7 @@ class SheetCheck:
             self._shades[rows] = uniform_shades_at_places(plan.patterns[name], places[rows])
 
     def complaint_about_reading(self, row: int, value: float) -> str | None:
-        """Return a complaint if the reading of a plan's row contradicts its sheet's pattern, else None.
-
-        There is at most one complaint for each sheet and shade, white or black.
-        """
+        """Return a complaint, one a sheet and shade, if the reading of a plan's row contradicts its sheet's pattern."""
         shade = self._shades[row]
         if math.isnan(shade) or math.isnan(value):
             return None
@@ -296,10 +286,7 @@ class SheetCheck:
         return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
 
     def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
-        """Check a sheet by a reading over its white (True) and one over its black (False); return a complaint or None.
-
-        Readings that are right are kept as levels for later checks.
-        """
+        """Return a complaint about readings over a sheet's white (True) and black (False), else keep them as levels."""
         wrong = None
         if len(values) == 2:
             contrast = values[True] - values[False]
@@ -319,8 +306,8 @@ class SheetCheck:
     ) -> dict[bool, tuple[float, float]]:
         """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
 
-        Return (x, y) in mm in the plan's frame, by these keys; a key is missing if there is no such place. `allowed`
-        returns the mask, (n,), of reachable places, (n, 2), in that frame.
+        Return (x, y) in mm in the plan's frame by these keys, if there is such a place; `allowed` returns the mask
+        of reachable places, (n, 2), in that frame.
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)

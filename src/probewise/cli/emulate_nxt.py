@@ -97,10 +97,7 @@ class _TypedCommands:
         self._is_in_table = False
 
     def poll(self) -> None:
-        """Execute the lines typed so far, without waiting; report if the sensor has gone through the table or come out.
-
-        From a terminal it reads only in the foreground, as job control requires.
-        """
+        """Execute the lines typed so far, if it is in the foreground; report if the sensor went through the table."""
         stand = self._bench.arm.sensor_pose()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0

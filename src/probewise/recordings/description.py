@@ -33,11 +33,7 @@ class Description:
 
 
 def shortest_degrees(angle_rad: float) -> float:
-    """Convert to the degrees of fewest digits that convert back to exactly the same radians.
-
-    The package works in radians and its files hold degrees; a plain conversion there and back
-    can change an angle by a rounding error.
-    """
+    """Convert to the degrees of fewest digits that convert back to exactly the same radians, for files."""
     plain = math.degrees(angle_rad)
     candidates = [round(plain, digits) for digits in range(16)]
     candidates += [plain, math.nextafter(plain, math.inf), math.nextafter(plain, -math.inf)]
@@ -121,10 +117,7 @@ def _parse_pattern(found: _Object, kind: type[Pattern]) -> Pattern:
 
 
 def read_description(path: Path) -> Description:
-    """Read NAME.json, the description beside NAME.csv: instrumentation, patterns, and notes on what is not used.
-
-    Raises FileError if it is missing, does not parse, or a field is missing or invalid.
-    """
+    """Read NAME.json, the description beside NAME.csv; FileError if a field is missing or invalid."""
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     top = _Object(path, "", parse_json_file_text(path, text, "strict JSON, each name once"))
     top.value("format", f'"{FORMAT}"', lambda v: v == FORMAT)
@@ -176,10 +169,7 @@ def _parse_instrumentation(top: _Object) -> Instrumentation:
 
 
 def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:
-    """Return the text of NAME.json, with numbers in full precision.
-
-    Raises ParameterError for a pattern that is of none of the format's kinds.
-    """
+    """Return the text of NAME.json, with numbers in full precision; ParameterError for a pattern of no known kind."""
     inst = instrumentation
     reading = {"unit": inst.unit, "min": inst.min, "max": inst.max, "step": inst.step}
     sensor = {"name": inst.sensor, "height_mm": inst.height_mm}

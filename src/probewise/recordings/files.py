@@ -44,11 +44,11 @@ PathLike = str | os.PathLike[str]
 
 
 def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
-    """Read a recording: NAME.csv, and NAME.json beside it.
+    """Read a recording: NAME.csv, and NAME.json beside it; `progress` is called as rows are read.
 
     Missing readings become NaN, readings outside the declared range keep their value; both are counted in the notes and
-    are not `usable`. `progress` is called as rows are read. Raises FileError if either file cannot be used; it names
-    the file, row and column, what was found and what is allowed.
+    are not `usable`. Raises FileError, with row, column, what was found and what is allowed, if either file cannot be
+    used.
     """
     plan, readings, notes = _read_with_json(path, progress)
     if readings is None:
@@ -76,8 +76,8 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
 def write_recording(recording: Recording, path: PathLike) -> None:
     """Write NAME.csv, NAME.json and the images of its patterns, each file atomically, in full precision.
 
-    Raises ParameterError if the format cannot hold the recording (an unknown pattern, a name with line ends); FileError
-    if the files cannot be written.
+    ParameterError if the format cannot hold it (an unknown pattern, a name with line ends); FileError if files cannot
+    be written.
     """
     require_recording(recording)
     inst = recording.plan.instrumentation
@@ -87,20 +87,13 @@ def write_recording(recording: Recording, path: PathLike) -> None:
 
 
 def write_plan(plan: Plan, path: PathLike) -> None:
-    """Write a plan as NAME.csv, NAME.json and the images of its patterns, each file atomically.
-
-    Raises ParameterError if the format cannot hold the plan (an unknown pattern, a name with line ends); FileError if
-    the files cannot be written.
-    """
+    """Write a plan as NAME.csv, NAME.json and the images of its patterns; raises as `write_recording`."""
     require_plan(plan)
     _write_with_json(plan, checked_path("path", path), plan_columns(plan))
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
-    """Format the rows of a plan as cells (texts) by column of its CSV file, in full precision.
-
-    Raises ParameterError if the format cannot hold the plan.
-    """
+    """Format the rows of a plan as cells by column of its CSV file, in full precision; ParameterError if it cannot."""
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         require(name == name.strip() and name.isprintable(), "name", name, _A_NAME)
     clash = [name for name in plan.covariates if name in (*_KNOWN, SESSION, "")]
@@ -157,10 +150,7 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
 
 
 def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
-    """Return the images among patterns by the name of their file.
-
-    Raises ParameterError if a file is no plain name, or two images that differ name one file.
-    """
+    """Return the images among patterns by their file's plain name, which two that differ do not share."""
     images: dict[str, Image] = {}
     for name, pattern in patterns.items():
         if not isinstance(pattern, Image):
@@ -250,8 +240,8 @@ def _error_in_table(table: CSVTable, error: ParameterError, described: Sequence[
 def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str]) -> dict[str, FloatArray]:
     """Return the numeric columns that are not the format's own but for `session`, by name; add `notes` on the rest.
 
-    A column is numeric if most of its cells hold numbers. FileError if one that was commanded, `led`, `height_mm` or
-    one of `controls`, or a `session` that differs between rows, is not.
+    A column is numeric if most of its cells hold numbers. FileError if a commanded one, or a `session` that differs
+    between rows, is not.
     """
     out: dict[str, FloatArray] = {}
     if "led" in table.columns:
@@ -278,8 +268,8 @@ def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str
 def fingerprint(recording: Recording) -> str:
     """Return the SHA-256, in hexadecimal, of a recording's content, written in a fixed order.
 
-    The content is its rows, readings, scans, sessions, covariates, patterns and instrument; not the free-text
-    description, file names, column order or line ends.
+    That is its rows, readings, scans, sessions, covariates, patterns and instrument; not the free-text description,
+    file names, column order or line ends.
     """
     plan = recording.plan
     columns = plan_columns(plan) | {"reading": [number_text(value) for value in recording.readings]}

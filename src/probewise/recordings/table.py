@@ -74,20 +74,10 @@ class CSVTable:
     def column_of_numbers(
         self, name: str, *, missing: bool = False, largest: float | None = LARGEST, allowed: str = ""
     ) -> FloatArray:
-        """Read a column as numbers, shape (n_rows,).
+        """Read a column as numbers, (n_rows,); FileError, which says what is `allowed`, at the first cell that is none.
 
-        Raises FileError at the first cell that is not such a number.
-
-        Parameters
-        ----------
-        name
-            The column.
-        missing
-            Whether an empty cell, `nan`, `na` or `n/a` is allowed; it becomes NaN.
-        largest
-            Largest magnitude allowed; None: any finite number.
-        allowed
-            What is allowed, for the error; "": in words of the other arguments.
+        With `missing` an empty cell, `nan`, `na` or `n/a` is allowed and becomes NaN; `largest` is the largest
+        magnitude allowed, None: any finite number.
         """
         cells = self.columns[name]
         most = np.finfo(np.float64).max if largest is None else largest
@@ -115,9 +105,9 @@ def cell_in_words(cell: object) -> str:
 class _Layout:
     """Where the header of a file is, and how its cells are separated; rows are indices of records.
 
-    `declared` says whether the file itself names its separator, `blanks` which blanks are one. `numeric` are the
-    columns that hold numbers or times, `width` the number of cells of a row below the header, `above` and `units` the
-    rows above the header and those between it and the first reading.
+    `declared`: whether the file itself names its separator; `blanks`: which blanks are one; `numeric`: columns of
+    numbers or times; `width`: cells of a row below the header; `above`, `units`: rows above the header, and below it
+    those without readings.
     """
 
     mark: str
@@ -268,23 +258,12 @@ def read_table(
     """Read a table with one header row, as loggers and spreadsheets write it; blank lines are skipped.
 
     Cells may be separated by commas, semicolons, tabs or blanks. The header is the row above the numbers, or the one
-    with more of the `wanted` columns. Numbers and times are rewritten as plain numbers; `notes` says how.
+    with more of the `wanted` columns. Numbers and times are rewritten as plain numbers, but for the columns `names`,
+    which are texts; `notes` says how. The column `time` holds numbers, or dates or clocks, which count from the first
+    row in `time_unit`. `progress` is called as rows are read.
 
     Raises FileError if it cannot be read, has no header or a repeated column, a row is too short or too long, quotes do
     not close, or a cell can be read in several ways.
-
-    Parameters
-    ----------
-    path
-        The file.
-    wanted
-        Columns by which the header is known.
-    names
-        Columns that are texts, whatever they look like.
-    time, time_unit
-        Name of a column of numbers, or of dates or clocks, which count from the first row in this unit.
-    progress
-        Called as rows are read.
     """
     text = read_text(path, "a CSV file")
     layout = _Layout.of_text(text, wanted)

@@ -22,11 +22,9 @@ class SensorError(LinkError):
 
 
 def normalized_from_counts(raw_counts: int) -> int:
-    """Convert A/D counts, which fall with brightness, to 0 (dark) to 1023 (bright).
+    """Convert A/D counts, 0 to 1023 (else ParameterError), which fall with brightness, to 0 (dark) to 1023 (bright).
 
     The firmware's integer arithmetic for types 05 and 06: only 697 of the 1024 values occur.
-
-    Raises ParameterError if the counts are outside the converter's 0 to 1023.
     """
     require(0 <= raw_counts <= AD_MAX, "raw_counts", raw_counts, f"0 to {AD_MAX}")
     dark = max(raw_counts - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT
@@ -82,8 +80,8 @@ class LightSensor:
     def read(self) -> LightReading:
         """Read once, with the LED as last set (by default on).
 
-        Raises SensorError if the brick marks every reading as invalid; TelegramError if the brick's answers remain
-        inconsistent after repeated questions.
+        Raises SensorError if the brick marks every reading as invalid, TelegramError if its answers remain
+        inconsistent.
         """
         if self._type is None:
             self.set_led()

@@ -233,10 +233,7 @@ class Motor:
         return here
 
     def _try_to_start_limited_move(self, target: int, side: Side, command: SetOutputState) -> bool:
-        """Command a limited move, exactly once; return whether the brick accepted it.
-
-        Raises LinkError if several successive commands were not accepted.
-        """
+        """Command a limited move, exactly once; return whether the brick accepted it; at the third refusal raise."""
         try:
             self._link.ask(command)
         except (NoAnswerError, TelegramError, BrickError) as error:

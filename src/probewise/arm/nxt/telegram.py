@@ -151,8 +151,7 @@ class Request(Body, Generic[A_co]):
     def decode_answer(self, reply: Reply) -> A_co:
         """Decode a reply to this command into its answer.
 
-        Raises BrickError if the brick refused the command; the status gives the reason; TelegramError if the reply
-        belongs to another command or port, or its length is wrong.
+        BrickError if the brick refused the command; TelegramError for another command, port or length.
         """
         if reply.opcode != self.OPCODE:
             raise TelegramError(f"a reply to opcode {reply.opcode:02X} came for {self.name}, {self.OPCODE:02X}")

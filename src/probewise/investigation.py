@@ -20,7 +20,7 @@ import numpy as np
 
 from probewise._arrays import own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import checked_number, checked_whole, require_accepts_positional, require_kind, require_rng
+from probewise._kinds import checked_number, checked_whole, require_accepts, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
@@ -85,7 +85,8 @@ def investigate(
     sheets; if not, plans only scan the sheet in place. Each round has its own child of `rng`, so that a resumed
     investigation is reproducible. ParameterError if an argument is invalid; see also `diagnose`.
     """
-    require_accepts_positional("record", record, 3, "a function of a round's number, its plan and the plan in words")
+    takes = "a function of a round's number, its plan and the plan in words"
+    require_accepts("record", record, takes, None, None, None)
     require_plan(plan)
     require_rng(rng)
     if budget is not None:

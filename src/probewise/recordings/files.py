@@ -107,23 +107,19 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     for k in np.unique(plan.scan).tolist():  # one like the scan's before gains a word, as a file would join the two
         again = bool(names) and plan.scan_names[k] == names[max(names)]
         names[k] = plan.scan_names[k] + " (again)" * again
+    turns, which = np.unique(plan.orientation_rad, return_inverse=True)  # few: each conversion is a search
+    degrees = [number_text(shortest_degrees(angle)) for angle in turns.tolist()]
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
         "x_mm": _number_cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
         "y_mm": _number_cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
-        "orientation_deg": _degree_cells(plan.orientation_rad),
+        "orientation_deg": [degrees[k] for k in which.reshape(-1).tolist()],
         "time_s": _number_cells("time_s", plan.time_s),
     }
     if len({plan.sessions[k] for k in names} if plan.sessions else ()) > 1:
         columns[SESSION] = [str(plan.sessions[k]) for k in plan.scan]
     return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
-
-
-def _degree_cells(angles_rad: FloatArray) -> list[str]:
-    distinct, which = np.unique(angles_rad, return_inverse=True)  # few: each conversion is a search
-    cells = [number_text(shortest_degrees(angle)) for angle in distinct.tolist()]
-    return [cells[k] for k in which.reshape(-1).tolist()]
 
 
 def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]:

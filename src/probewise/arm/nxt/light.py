@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 from probewise.arm.instrument import Clock
 from probewise.arm.nxt.link import Link
-from probewise.arm.nxt.telegram import GetInputValues, InputValues, SensorMode, SensorType, SetInputMode, TelegramError
+from probewise.arm.nxt.telegram import (
+    LED_OFF,
+    LED_ON,
+    NO_SENSOR,
+    RAW,
+    GetInputValues,
+    InputValues,
+    SetInputMode,
+    TelegramError,
+)
 from probewise.errors import LinkError, require
 
 AD_MAX = 1023
@@ -56,12 +65,12 @@ class LightSensor:
 
     def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:
         self._link, self.port, self._clock, self._valid_s = link, port, clock, valid_s
-        self._type: SensorType | None = None
+        self._type: int | None = None
 
     def set_led(self, lit: bool = True) -> None:
         """Switch the LED on (`lit`) or off, and set the input to raw readings."""
-        self._type = SensorType.LIGHT_ACTIVE if lit else SensorType.LIGHT_INACTIVE
-        self._link.ask(SetInputMode(self.port, self._type, SensorMode.RAW))
+        self._type = LED_ON if lit else LED_OFF
+        self._link.ask(SetInputMode(self.port, self._type, RAW))
 
     def flash(self) -> LightReading:
         """Light the LED for one reading, as in the paper: it is at the same temperature in all of them.
@@ -90,7 +99,7 @@ class LightSensor:
         while True:
             number += 1
             values = self._link.ask(GetInputValues(self.port), check=_require_consistent)
-            as_set = (values.type, values.mode) == (self._type, SensorMode.RAW)
+            as_set = (values.type, values.mode) == (self._type, RAW)
             # An invalid reading still holds the old values.
             if as_set and values.valid:
                 return LightReading(values.raw)
@@ -100,12 +109,12 @@ class LightSensor:
                     "is the light sensor plugged in?"
                 )
             if not as_set:  # a program that starts or stops resets all settings
-                self.set_led(self._type == SensorType.LIGHT_ACTIVE)
+                self.set_led(self._type == LED_ON)
 
     @property
     def off_command(self) -> SetInputMode:
         """The command that switches the LED off and unconfigures the input."""
-        return SetInputMode(self.port, SensorType.NONE, SensorMode.RAW)
+        return SetInputMode(self.port, NO_SENSOR, RAW)
 
 
 def _require_consistent(values: InputValues) -> None:
@@ -118,7 +127,7 @@ def _require_consistent(values: InputValues) -> None:
             f"input {values.port + 1} says valid {values.valid}, calibrated {values.calibrated}, {values.raw} counts; "
             f"allowed: 0 or 1, 0, 0 to {AD_MAX}"
         )
-    is_light = values.type in (SensorType.LIGHT_ACTIVE, SensorType.LIGHT_INACTIVE) and values.mode == SensorMode.RAW
+    is_light = values.type in (LED_ON, LED_OFF) and values.mode == RAW
     if (
         values.valid
         and is_light

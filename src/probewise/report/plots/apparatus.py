@@ -209,9 +209,15 @@ def reach_map(
     the place of the arm's axis.
     """
     ax = canvas.axes_or_new(ax, size_in=(8.2, 5.0))
-    degrees = _unwrapped_about_mean_deg(np.degrees(orientation_rad))
+    degrees = np.degrees(orientation_rad)
+    known = degrees[np.isfinite(degrees)]
+    # Within 180 of their mean, so that 179 and -179 have similar colours.
+    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(known)).sum()))) if known.size else 0.0
+    degrees = middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0
     image = canvas.draw_map(ax, degrees, x_mm, y_mm, cmap="cividis")
-    levels = _contour_levels_deg(degrees)
+    levels = known = degrees[np.isfinite(degrees)]
+    if known.size:  # multiples of 15 degrees within the range of the angles
+        levels = np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
     if levels.size:
         style: dict[str, Any] = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
         lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
@@ -231,21 +237,6 @@ def reach_map(
     share = 100 * float(np.isfinite(degrees).mean())
     title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
     return canvas.label_axes(ax, x="x (mm)", y="y (mm)", title=title)
-
-
-def _unwrapped_about_mean_deg(degrees: FloatArray) -> FloatArray:
-    """Shift angles (degrees) by full turns to within 180 of their mean, so that 179 and -179 have similar colours."""
-    known = np.radians(degrees[np.isfinite(degrees)])
-    middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
-    return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
-
-
-def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
-    """Return the multiples of 15 degrees within the range of the angles, (n_lines,); none if no angle is finite."""
-    known = degrees[np.isfinite(degrees)]
-    if not known.size:
-        return known
-    return np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
 
 
 def _angle_text(degrees: float) -> str:

@@ -169,7 +169,16 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         return 0
     room = LETTERS_PER_IN * ax.get_position().width * figure_of(ax).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
-    n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width_letters(labels, n) < room), 1)
+
+    def lines_by_column(n: int) -> list[list[str]]:
+        """Return the lines of text in each of `n` columns; a legend is filled column by column."""
+        columns = np.array_split(np.array(labels, dtype=np.object_), n)
+        return ["\n".join(column).split("\n") for column in columns]
+
+    def width(n: int) -> int:
+        return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in lines_by_column(n))
+
+    n_columns = next((n for n in range(len(labels), 1, -1) if width(n) < room), 1)
     ax.legend(
         handles,
         labels,
@@ -184,17 +193,7 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         borderaxespad=0.1,
         columnspacing=1.2,
     )
-    return max(map(len, _legend_lines_by_column(labels, n_columns)))
-
-
-def _legend_width_letters(labels: Sequence[str], n_columns: int) -> int:
-    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _legend_lines_by_column(labels, n_columns))
-
-
-def _legend_lines_by_column(labels: Sequence[str], n_columns: int) -> list[list[str]]:
-    """Return the lines of text in each column of a legend, which is filled column by column."""
-    columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
-    return ["\n".join(column).split("\n") for column in columns]
+    return max(map(len, lines_by_column(n_columns)))
 
 
 def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:

@@ -76,7 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     source = ", ".join(path.name for path in arguments.recordings)
     rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
-    audited: Callable[[], PlanAudit | None] = lambda: None  # noqa: E731
+    outdated: tuple[str, ...] = OF_ONE_RUN
+    audited: Callable[[], PlanAudit] | None = None
     with contextlib.ExitStack() as stack:
         simulator = (
             stack.enter_context(open_simulator(arguments.simulator, arguments.workers)) if of_simulator else None
@@ -107,11 +108,13 @@ def run(arguments: argparse.Namespace) -> int:
                 audited = partial(engine.audit_plan_of_diagnosis, diagnosis, sensor=sensor)
             files, notes = partial(write_files, diagnosis, rng=files_rng), joined.notes
             read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
-            advised, column, outdated = engine.NEXT_PLAN, "reading", OF_ONE_RUN
+            advised, column = engine.NEXT_PLAN, "reading"
         renamed = drawings.write_results(
             files,
             report.figure_drawers(diagnosis),
-            lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audited()),
+            lambda drawn: report.page_html(
+                diagnosis, drawn, source=source, seed=arguments.seed, audit=None if audited is None else audited()
+            ),
             inputs=common.inputs_and_filled_in_plan(read, drawings.out / advised, column),
             outdated=outdated,
             progress=progress,

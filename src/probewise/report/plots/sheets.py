@@ -168,8 +168,8 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
 
     def write(axis: int, at: float, text: str, **style: Any) -> None:
         """Write a text beside the mark of a place."""
-        place = (at, near[1] - 6.0) if axis == 0 else (near[0] - 10.0, at)
-        ax.text(*place, text, rotation=90 * axis, **{**said, **style})
+        x, y = (at, near[1] - 6.0) if axis == 0 else (near[0] - 10.0, at)
+        ax.text(x, y, text, rotation=90 * axis, **{**said, **style})
 
     for axis in (1, 0):
         for at in (near[axis], far[axis]):

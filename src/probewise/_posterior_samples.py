@@ -64,8 +64,7 @@ def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
         raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one per sample")
     require_finite("samples", samples)
     require_finite("noise_sd", noise_sd)
-    if not (noise_sd > 0).all():
-        raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
+    require((noise_sd > 0).all(), "noise_sd", float(noise_sd.min()), "greater than 0")
     return samples, noise_sd
 
 

@@ -23,7 +23,7 @@ from io import FileIO
 from pathlib import Path
 
 from probewise._signals import defer_signals, raise_if_stopped, reporting_what_is_kept
-from probewise.errors import FileError, ParameterError, ProbewiseError, message_of
+from probewise.errors import FileError, ParameterError, ProbewiseError, message_of, require
 from probewise.progress import Progress, silent
 
 PAGE = "report.html"
@@ -186,8 +186,7 @@ def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out")
     ParameterError for a directory, an input or a path below a file, FileError if its directory cannot be written to.
     """
     _require_short_name(path)
-    if path.is_dir():
-        raise ParameterError(option, str(path), "a file name; this is a directory")
+    require(not path.is_dir(), option, str(path), "a file name; this is a directory")
     for taken in inputs:
         if taken is not None and path.exists() and taken.exists() and path.samefile(taken):
             raise ParameterError(option, str(path), f"another file than the input {taken}")

@@ -25,7 +25,7 @@ from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import VOCABULARY, LightEffect
-from probewise.errors import FileError, ParameterError, did_you_mean
+from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.progress import Progress, silent
 from probewise.recordings import (
     parse_json_file_text,
@@ -141,8 +141,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("readings", "minutes"):
-            if not checked_number(name, getattr(self, name)) >= 0:
-                raise ParameterError(name, getattr(self, name), "0 or more")
+            require(checked_number(name, getattr(self, name)) >= 0, name, getattr(self, name), "0 or more")
 
     def minus(self, plan: Plan, after_s: float) -> Budget:
         """Return the budget without the cost of a plan, at least 0; minutes count from time `after_s` to its end."""

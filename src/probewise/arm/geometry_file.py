@@ -155,12 +155,6 @@ class _TomlTable:
     def number(self, name: str) -> float:
         return float(self.value(name, f"a number of magnitude up to {LARGEST:g}", _is_number))
 
-    def rows_of_numbers(self, name: str) -> tuple[tuple[float, ...], ...]:
-        allowed, of_numbers = "rows of numbers, [[...], [...], ...]", f"rows of numbers of magnitude up to {LARGEST:g}"
-        rows = self.value(name, allowed, lambda v: isinstance(v, list) and all(isinstance(row, list) for row in v))
-        self.value(name, of_numbers, lambda v: all(_is_number(number) for row in v for number in row))
-        return tuple(tuple(map(float, row)) for row in rows)
-
     def require_all_taken(self) -> None:
         if self._left:
             name = min(self._left)
@@ -191,4 +185,7 @@ def _parse_accuracy(table: _TomlTable) -> Accuracy:
     if "covariance" not in table.content:
         again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"
         raise FileError(table.path, "accuracy.covariance is missing", again)
-    return _built(table, Accuracy, marks, *sds, table.rows_of_numbers("covariance"))
+    allowed, of_numbers = "rows of numbers, [[...], [...], ...]", f"rows of numbers of magnitude up to {LARGEST:g}"
+    table.value("covariance", allowed, lambda v: isinstance(v, list) and all(isinstance(row, list) for row in v))
+    rows = table.value("covariance", of_numbers, lambda v: all(_is_number(number) for row in v for number in row))
+    return _built(table, Accuracy, marks, *sds, tuple(tuple(map(float, row)) for row in rows))

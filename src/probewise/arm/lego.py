@@ -146,7 +146,10 @@ class LegoArm:
         value = self.read_here()
         time_s = self._clock.monotonic() - self._zero_s
         covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
-        reading = Reading(value=value, pose=self._pose(), time_s=time_s, covariates=covariates)
+        angles = self.angles_rad
+        x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0].tolist()
+        turned_rad = wrapped_to_pi(self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad)
+        reading = Reading(value, Pose(x_mm, y_mm, float(turned_rad)), time_s, covariates)
         self._raise_after_reading()
         return reading
 
@@ -270,13 +273,6 @@ class LegoArm:
         angles = self.angles_rad
         angles[joint] += checked_finite_number("by_rad", by_rad)
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
-
-    def _pose(self) -> Pose:
-        """Return the sensor's pose by the motors' counters."""
-        angles = self.angles_rad
-        x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0]
-        standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
-        return Pose(float(x_mm), float(y_mm), float(wrapped_to_pi(standing)))
 
     def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[JointTarget]:
         """Return the targets of base, shoulder and elbow for a place and height; ReachError if it is out of reach."""

@@ -219,14 +219,11 @@ class OwnInstrument:
         except BaseException as error:
             if not self.source or isinstance(error, KeyboardInterrupt):
                 raise
-            raise LinkError(self._error_message(what, error)) from error
-
-    def _error_message(self, what: str, error: BaseException) -> str:
-        frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
-        where = f"{self.source}, line {frames[-1]}" if frames else self.source
-        if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
-            return f"{where}: {error}"
-        return f"{where}: {what} raises {message_of(error)}"
+            frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
+            where = f"{self.source}, line {frames[-1]}" if frames else self.source
+            returned = isinstance(error, ParameterError | ShapeError) and not frames  # a wrong value
+            said = str(error) if returned else f"{what} raises {message_of(error)}"
+            raise LinkError(f"{where}: {said}") from error
 
 
 def as_instrument(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Mapping
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from probewise._words import count_with_noun
 from probewise._writing import PAGE, Drawings, StagedFiles, staged_output
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
-from probewise.calibration import Calibration, FittedSensor, calibrate, predict, write_sensor
+from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
 from probewise.cli import diagnose as diagnose_verb
 from probewise.cli._executor import worker_pool
 from probewise.diagnosis import Diagnosis
@@ -60,7 +60,9 @@ def run_demo(
     with worker_pool(2) as pool:
         progress(doing, 0, 8)
         diagnosing = pool.submit(diagnose_shipped_recording, seed)
-        calibration = _calibrate_shipped_recording(seed, full, pool)
+        orders, n_live = ((1, 2, 3, 4), 300) if full else ((1, 2), N_LIVE)
+        recording, rng = read_recording(shipped("paper")), np.random.default_rng([seed, 1])
+        calibration = calibrate(recording, orders=orders, n_live=n_live, rng=rng, executor=pool)
         sensor = calibration.sensor
 
         def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
@@ -75,8 +77,7 @@ def run_demo(
             future.result()
             progress(doing, done, 8)
     progress("writing the results")
-    diagnosis, recording = diagnosing.result(), read_recording(shipped("paper"))
-    prediction = predict(sensor, recording.plan, recording.readings)
+    diagnosis, prediction = diagnosing.result(), predict(sensor, recording.plan, recording.readings)
     searches, started_alike, doubted = (
         _searches_with_true_circle(sensor, ((name, run.result()) for name, run in runs.items()), truth)
         for runs in (searching, starting, doubting)
@@ -100,8 +101,8 @@ def run_demo(
     with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
         write_sensor(sensor, stage / "sensor.json")
         (stage / DIAGNOSIS).mkdir()
-        *_, rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_files(diagnosis, StagedFiles(stage / DIAGNOSIS), rng=rng)
+        *_, files_rng = diagnose_verb.generators_of_diagnosis(seed)
+        diagnose_verb.write_files(diagnosis, StagedFiles(stage / DIAGNOSIS), rng=files_rng)
         answers = report.main_findings_by_key(found)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
 
@@ -139,12 +140,6 @@ def _searches_with_true_circle(
     outline_mm = outlines(_CIRCLE.region(np.array([truth])))[0]
     levels = (means["I_min"], means["I_max"])
     return [report.RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
-
-
-def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calibration:
-    orders, n_live = ((1, 2, 3, 4), 300) if full else ((1, 2), N_LIVE)
-    rng = np.random.default_rng([seed, 1])
-    return calibrate(read_recording(shipped("paper")), orders=orders, n_live=n_live, rng=rng, executor=pool)
 
 
 def _frame_png(search: report.RobotSearch, step: Step) -> bytes:

@@ -107,18 +107,13 @@ class _TypedCommands:
             typed = os.read(0, 4096)
             self._is_heard = bool(typed)
             *lines, self._typed = (self._typed + typed).split(b"\n")
-            for line in lines:
-                self._execute_line(line.decode(errors="replace"))
-
-    def _execute_line(self, line: str) -> None:
-        if line.strip() == "where":
-            print_result(_position_in_words(self._bench.arm.sensor_pose()))
-            return
-        try:
-            self._bench.table.carry_out_line(line)
-            print_result(f"done: {line}")
-        except ParameterError as error:
-            print_result(str(error))
+            for line in (line.decode(errors="replace") for line in lines):
+                try:
+                    if line.strip() != "where":
+                        self._bench.table.carry_out_line(line)
+                    print_result(_position_in_words(stand) if line.strip() == "where" else f"done: {line}")
+                except ParameterError as error:
+                    print_result(str(error))
 
 
 def _position_in_words(stand: SensorPose) -> str:

@@ -108,9 +108,13 @@ def figure(image: bytes, caption: str) -> Markup:
     """Build a figure that embeds a PNG or an SVG; b"" could not be drawn."""
     if not image:
         return element("figure", paragraph("This figure could not be drawn."), element("figcaption", caption))
-    kind = "svg+xml" if image.startswith(b"<svg") else "png"
+    kind, size = "svg+xml", ""
+    if not image.startswith(b"<svg"):
+        with Image.open(io.BytesIO(image)) as picture:
+            dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
+            # Below 0.9 of the width as drawn (CSS px), a PNG's text is too small.
+            kind, size = "png", f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    size = "" if kind == "svg+xml" else _least_width_attribute(image)
     shown = Markup(f'<img src="{source}" alt="{html.escape(caption)}"{size}>')
     return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
 
@@ -118,13 +122,6 @@ def figure(image: bytes, caption: str) -> Markup:
 def figures(drawn: Mapping[str, bytes], captions: Mapping[str, str]) -> dict[str, Markup]:
     """Build the figures that have a caption, by file name."""
     return {name: figure(drawn[name], caption) for name, caption in captions.items() if name in drawn}
-
-
-def _least_width_attribute(png: bytes) -> str:
-    """Return a style attribute: the width (CSS px) below which a PNG's text is too small, 0.9 of the width as drawn."""
-    with Image.open(io.BytesIO(png)) as picture:
-        dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
-        return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:

@@ -72,9 +72,9 @@ def covariate_values(diagnosis: Diagnosis, place: Place) -> FloatArray:
 
 
 def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
-    """Return the names, by value, of a place's covariate if it is scan, run, direction, or up to 24 orientations.
+    """Return the names, by ascending value, of a place's covariate: scan, run, direction, or up to 24 orientations.
 
-    Values ascend. None for other covariates; of a table's covariates, only the run has names.
+    None for other covariates; of a table's covariates, only the run has names.
     """
     words = diagnosis.apparatus.words
     if place.covariate == words.run:
@@ -93,9 +93,9 @@ def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, st
 class CovariateView:
     """A covariate against which residuals are drawn.
 
-    `at` holds its values, (n_points,), NaN in rows not drawn; `label` is the axis label. `names` gives each value's
-    name if the covariate is categorical. `window` is the interval to shade, in the covariate's unit or, if categorical,
-    in positions on the axis. `place` is the window with significant residuals that is drawn; None: another view.
+    `at` holds its values, (n_points,), NaN in rows not drawn; `label` is the axis label; `names` each value's name if
+    the covariate is categorical. `window` is the interval to shade, in the covariate's unit or, if categorical, in
+    positions on the axis. `place` is the window with significant residuals that is drawn; None: another view.
     """
 
     at: FloatArray
@@ -196,10 +196,7 @@ class ResidualNoise:
 
 
 def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:
-    """List a place's views: `view_along_scan` if it is a whole scan or run; then, for every place, along its covariate.
-
-    Residuals that change sign within a scan show in the former.
-    """
+    """List a place's views: along its scan or run, if it is a whole one; then, for every place, along its covariate."""
     at, names = covariate_values(diagnosis, place), category_name_by_value(diagnosis, place)
     label = axis_label(diagnosis, place.covariate, place.scan)
     if place.without_effect:
@@ -245,10 +242,7 @@ def is_scan_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
 
 
 def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float:
-    """Return the probability that the unknown effect depends on a place's covariate.
-
-    It is 0 unless the verdict is `unknown` and the most probable form of the effect is a family of bases.
-    """
+    """Return the probability that the unknown effect, if that is the verdict, depends on a place's covariate."""
     shares = diagnosis.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in RARE_EFFECTS:
         return 0.0
@@ -257,10 +251,7 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
 
 
 def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
-    """List views of time, X or a column, folded at the period of each periodic effect of the verdict.
-
-    Only where the recording spans more than three periods.
-    """
+    """List views of time, X or a column, folded at periods of the verdict of which the recording spans three."""
     plan = diagnosis.recording.plan
     folded: list[tuple[FloatArray, float, str, str]] = []
     for effect in diagnosis.effects:

@@ -36,10 +36,7 @@ _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readin
 
 
 def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
-    """List a diagnosis's figures by file name, as functions that draw SVGs.
-
-    These are: first, before and after, residuals, noise, gain, places.
-    """
+    """List a diagnosis's figures by file name, as functions that draw SVGs."""
     chance = cache(partial(ResidualNoise, diagnosis))
     drawers: dict[str, Callable[[], bytes]] = {
         "first.svg": lambda: _first_figure_svg(chance()),
@@ -166,9 +163,9 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
 
 
 def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
-    """Return row numbers of the scan with the largest sum of squares of `change`; of the longest if nothing changes.
+    """Return row numbers of the scan, if possible along a line, with the largest sum of squares of `change`.
 
-    `change`, (n_points,), is the repair's change of each predicted reading. Scans along a line are preferred.
+    `change`, (n_points,), is the repair's change of each predicted reading; without any, it is the longest scan.
     """
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
     lines = [rows for rows in scans if is_scan_along_line(plan, rows)]

@@ -50,8 +50,8 @@ def draw_robot_view(
     """Draw the robot's view of the field after a step of an experiment, as in the paper; return the axes.
 
     `readings` are x_mm, y_mm and value up to this step, `levels` the readings over black and white; `truth_mm` is the
-    outline of the true shape, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot
-    chose; `lego_scale` adds the paper's coordinates at the top.
+    true outline, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot chose;
+    `lego_scale` adds the paper's coordinates at the top.
     """
     seen = np.asarray(readings, dtype=np.float64).reshape(-1, 3)
     pose, drawn = step.next_pose, drawn or step.map
@@ -95,10 +95,7 @@ def robot_views_by_model_png(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the posteriors of several sensor models from the same readings, one below the other; return a PNG.
-
-    Each of `views` is a title, a step and its experiment; the rest is as in `draw_robot_view`.
-    """
+    """Draw several models' posteriors (title, step, experiment), one below the other; parameters as above."""
     axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
         known = f"{title}, {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits"

@@ -30,10 +30,7 @@ def summary_sentence(fit: SystemFit) -> str:
 
 
 def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
-    """List a fit's figures by file name: functions that draw recorded against predicted readings, and residuals.
-
-    Residuals are drawn against time, predicted reading, and up to four input columns that vary.
-    """
+    """List a fit's figures by file name, as functions that draw SVGs: predicted readings, and residuals."""
     residuals = [("fitted", fit.residuals)]
     unit = unit_after_number(fit.fitted.simulator.unit)
     return {

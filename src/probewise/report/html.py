@@ -43,10 +43,7 @@ class Section:
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
-    """Build an element; of attribute names, a trailing underscore is dropped (`class_`), others become hyphens.
-
-    Children and attribute values are escaped; a child that is `Markup` is kept.
-    """
+    """Build an element of escaped or `Markup` children; `class_` stands for class, underscores for hyphens."""
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
     )

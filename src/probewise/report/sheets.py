@@ -124,10 +124,7 @@ def points_of_lines(sheet: Sheet) -> FloatArray:
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
-    """Make one sheet per pattern that the plan uses, which reaches 40 mm or more beyond the plan's readings.
-
-    Without a plan, the sheets show each pattern's own extent.
-    """
+    """Make one sheet per pattern used, 40 mm or more beyond the plan's readings; without a plan, of its own extent."""
     sheets = []
     for name, pattern in patterns.items():
         places, turns = np.concatenate([np.zeros((1, 2)), _points_sheet_must_show(pattern)]), ()

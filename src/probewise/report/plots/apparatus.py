@@ -49,10 +49,7 @@ def arm_and_sensor(
 
 
 def draw_arm_lengths(geometry: Geometry) -> Axes:
-    """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
-
-    The sensor reads in the middle of its reach.
-    """
+    """Draw the arm, in the middle of its reach, from the side with its lengths, motors and gear ratios."""
     away = sum(geometry.radii_in_reach_mm()) / 2
     middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
     place = np.array([geometry.axis_mm]) + away * np.array([[np.cos(middle), np.sin(middle)]])
@@ -120,7 +117,7 @@ def draw_sensor_face(
 ) -> None:
     """Draw the sensor seen from below: package, photodiode (white), LED (red) and the ridge between them.
 
-    `size` is the width of the package in the axes' units; it is turned anticlockwise, at 0 the photodiode is at the
+    `size` is the width of the package in the axes' units, `turned_rad` its anticlockwise turn from the photodiode on
     top.
     """
     turn = Affine2D().scale(size).rotate(turned_rad).translate(*center) + ax.transData

@@ -65,10 +65,7 @@ COPPER: Colormap = LinearSegmentedColormap.from_list(
 
 
 def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -> Axes:
-    """Return the axes given, or those of a new figure.
-
-    Raises ParameterError if something other than axes is given; a figure is the usual mistake.
-    """
+    """Return the axes given, or those of a new figure; ParameterError for anything else, such as a figure."""
     if ax is not None:
         require_kind("ax", ax, Axes, _AXES)
     return ax if ax is not None else grid_of_axes(1, 1, size_in=size_in)[0, 0]
@@ -83,10 +80,7 @@ def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], *
 
 
 def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
-    """Open a figure with one pair of axes within fixed margins: left, bottom, right, top.
-
-    To find the margins takes longer than to draw a frame of many.
-    """
+    """Open a figure with one pair of axes within fixed margins, left, bottom, right, top: faster than to find them."""
     (width, height), (left, bottom, right, top) = size_in, margins_in
     within = (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
     return new_figure(size_in).add_axes(within)
@@ -212,10 +206,7 @@ def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
-    """Draw one legend for all axes of a figure with constrained layout, below them, where it covers nothing.
-
-    It has at most `n_columns` entries in a row, text of the colour `ink`, and `ground` behind it.
-    """
+    """Draw one legend for all axes of a figure with constrained layout, below them, with text of the colour `ink`."""
     every: list[Axes] = list(axes.flat) if isinstance(axes, np.ndarray) else [axes]
     handles = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     if handles:
@@ -234,10 +225,7 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
 
 
 def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
-    """Label both axes, set the title, and hide the upper and right spines; return the axes.
-
-    Brackets without a unit, "reading ()", are left out.
-    """
+    """Label both axes (without empty brackets), set the title, and hide the upper and right spines; return the axes."""
     ax.set_xlabel(_EMPTY_BRACKETS.sub("", x))
     ax.set_ylabel(_EMPTY_BRACKETS.sub("", y))
     if title:
@@ -261,10 +249,7 @@ def hide_unused(axes: AxesGrid, n: int) -> None:
 
 
 def draw_map(ax: Axes, values: FloatArray, x: FloatArray, y: FloatArray, **style: Any) -> AxesImage:
-    """Draw values, (n_y, n_x), lower row first, as pixels about the places `x`, (n_x,), and `y`, (n_y,); NaN is blank.
-
-    Places must be even, and `style` goes to `Axes.imshow`.
-    """
+    """Draw values, (n_y, n_x), lower row first, as pixels about even places, (n_x,) and (n_y,); NaN is blank."""
     dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = (float(x[0] - dx), float(x[-1] + dx), float(y[0] - dy), float(y[-1] + dy))
     shown = np.ma.masked_invalid(values)

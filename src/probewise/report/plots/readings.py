@@ -252,10 +252,7 @@ def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: 
 
 
 def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
-    """Draw (recorded minus predicted) / sd by reading number; dashed lines at ±1.96 should hold 95 %.
-
-    Parameters are as for `predicted_and_recorded_by_scan`.
-    """
+    """Draw (recorded minus predicted) / sd, (n_points,), by reading number; dashed lines at ±1.96 should hold 95 %."""
     require_recording(recording)
     ax = canvas.axes_or_new(ax, size_in=(7.2, 2.8))
     ok = np.flatnonzero(recording.usable)

@@ -39,10 +39,9 @@ _WHITE = "95 % of white noise"
 def draw_running_mean(
     ax: Axes, x: FloatArray, y: FloatArray, *, colour: str, line: Any = "-", width: float = 1.6, name: str = ""
 ) -> None:
-    """Draw means of y, (n,), over up to 20 groups of neighbours in x as a curve.
+    """Draw means of y, (n,), over up to 20 groups of neighbours in x as a curve, named after the model `name`.
 
-    Where x has few values, no curve joins them: each has its mean with the 95 % interval of that. `name` is that of the
-    model, for the legend.
+    Where x has few values, no curve joins them: each has its mean with the 95 % interval of that.
     """
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]

@@ -60,8 +60,7 @@ _LABEL_MM = 15.0  # half the length of the text on a glue strip
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
     """Draw cover pages with instructions, one per five sheets, then every sheet at true scale on "a4" or "letter".
 
-    Return the PDF, reproducible byte for byte. ParameterError if a sheet needs more than 400 pages, or for another
-    paper.
+    Return the PDF, reproducible byte for byte. ParameterError for more than 400 pages of a sheet, or another paper.
     """
     cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
     n_covers = -(-len(cut) // _SHEETS_PER_COVER)

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,6 @@ from probewise.recordings.table import LARGEST
 
 FORMAT = "recording/1"
 _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
-
-
-@dataclass(frozen=True)
-class Description:
-    """A parsed description: instrumentation, patterns by name, and notes on fields that are ignored."""
-
-    instrumentation: Instrumentation
-    patterns: Mapping[str, Pattern]
-    notes: tuple[str, ...] = ()
 
 
 def shortest_degrees(angle_rad: float) -> float:
@@ -116,8 +107,8 @@ def _parse_pattern(found: _Object, kind: type[Pattern]) -> Pattern:
         raise found.error(error.name, error.allowed) from error
 
 
-def read_description(path: Path) -> Description:
-    """Read NAME.json, the description beside NAME.csv; FileError if a field is missing or invalid."""
+def read_description(path: Path) -> tuple[Instrumentation, dict[str, Pattern], tuple[str, ...]]:
+    """Read NAME.json beside NAME.csv: instrumentation, patterns, notes; FileError for a field missing or invalid."""
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     top = _Object(path, "", parse_json_file_text(path, text, "strict JSON, each name once"))
     top.value("format", f'"{FORMAT}"', lambda v: v == FORMAT)
@@ -145,7 +136,7 @@ def read_description(path: Path) -> Description:
         for name in instrumentation.controls
         if name not in _CONTROLS
     ]
-    return Description(instrumentation, patterns, tuple(notes))
+    return instrumentation, patterns, tuple(notes)
 
 
 def _parse_instrumentation(top: _Object) -> Instrumentation:

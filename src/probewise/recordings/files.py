@@ -171,8 +171,8 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
     table.require_columns("x_mm", "y_mm", allowed=_OF_A_LIGHT_SENSOR)
     if not len(table):
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
-    description = read_description(path.with_suffix(".json"))
-    notes = [*table.notes, *description.notes]
+    instrumentation, patterns, ignored = read_description(path.with_suffix(".json"))
+    notes = [*table.notes, *ignored]
     time_s = table.column_of_numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
@@ -181,13 +181,13 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         raise FileError(path, "it is in radians", "orientation_deg, in degrees", row=1, column="orientation_rad")
     turned = "orientation_deg" in table.columns
     orientation_deg = table.column_of_numbers("orientation_deg") if turned else np.zeros(len(table))
-    covariates = _covariate_columns(table, description.instrumentation.controls, notes)
+    covariates = _covariate_columns(table, instrumentation.controls, notes)
     try:
         scan, scan_names = scan_codes_and_names(table.columns.get("scan"), len(table))
         sessions = sessions_of_scans(covariates.pop(SESSION, np.zeros(len(table))), scan)
-        pattern = pattern_codes(table.columns.get("pattern"), description.patterns, len(table))
+        pattern = pattern_codes(table.columns.get("pattern"), patterns, len(table))
     except ParameterError as error:
-        raise _error_in_table(table, error, list(description.patterns)) from error
+        raise _error_in_table(table, error, list(patterns)) from error
     plan = Plan(
         x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
         y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
@@ -196,10 +196,10 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         scan=scan,
         scan_names=scan_names,
         pattern=pattern,
-        pattern_names=tuple(description.patterns),
-        patterns=description.patterns,
+        pattern_names=tuple(patterns),
+        patterns=patterns,
         covariates=covariates,
-        instrumentation=description.instrumentation,
+        instrumentation=instrumentation,
         sessions=sessions,
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]

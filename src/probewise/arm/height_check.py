@@ -16,7 +16,7 @@ from probewise.errors import ParameterError
 
 _DEGREE = 2
 _TELLS = 5.0  # sds by which readings at the lowest and at the highest height must differ
-_LEAST_P = 1e-3
+LEAST_P = 1e-3  # p-value below which the light contradicts the counters
 ROUNDING_MM = 0.2  # sd of a height that whole counts leave
 
 
@@ -28,11 +28,6 @@ class HeightCheck:
     off_mm: FloatArray  # by the light, relative to the first place, minus by the counters, elsewhere, (n_places,)
     sd_mm: FloatArray
     p_value: float  # chi-square: the probability of larger `off_mm` if the counters are right
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the heights by the light agree with those by the motors' counters: a p-value of 0.001 or more."""
-        return self.p_value >= _LEAST_P
 
 
 def check_heights(curve: FloatArray, others: FloatArray) -> HeightCheck:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from dataclasses import dataclass
 
 from probewise.arm.instrument import Clock
 from probewise.arm.nxt.link import Link
@@ -40,25 +39,13 @@ def normalized_from_counts(raw_counts: int) -> int:
     return AD_MAX - min(dark, AD_MAX)
 
 
-@dataclass(frozen=True)
-class LightReading:
-    """One reading, in A/D counts, 0 (bright) to 1023 (dark)."""
-
-    raw_counts: int
-
-    @property
-    def normalized(self) -> int:
-        """Brightness from 0 (dark) to 1023 (bright)."""
-        return normalized_from_counts(self.raw_counts)
-
-    @property
-    def fine_percent(self) -> float:
-        """Percent from 0 to 100 at the converter's resolution, about seven steps per percent."""
-        return self.normalized * 100 / AD_MAX
+def percent_from_counts(raw_counts: int) -> float:
+    """Convert A/D counts to percent, 0 (dark) to 100 (bright), about seven steps per percent."""
+    return normalized_from_counts(raw_counts) * 100 / AD_MAX
 
 
 class LightSensor:
-    """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode.
+    """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode: A/D counts.
 
     While the brick marks a reading as invalid, the read is repeated for `valid_s`, three times at least.
     """
@@ -72,7 +59,7 @@ class LightSensor:
         self._type = LED_ON if lit else LED_OFF
         self._link.ask(SetInputMode(self.port, self._type, RAW))
 
-    def flash(self) -> LightReading:
+    def flash(self) -> int:
         """Light the LED for one reading, as in the paper: it is at the same temperature in all of them.
 
         The reading is the first that the brick marks as valid, 20 ms or more after the LED came on. A lost connection
@@ -86,7 +73,7 @@ class LightSensor:
             with contextlib.suppress(LinkError):
                 self._link.tell(self.off_command)
 
-    def read(self) -> LightReading:
+    def read(self) -> int:
         """Read once, with the LED as last set (by default on).
 
         Raises SensorError if the brick marks every reading as invalid, TelegramError if its answers remain
@@ -102,7 +89,7 @@ class LightSensor:
             as_set = (values.type, values.mode) == (self._type, RAW)
             # An invalid reading still holds the old values.
             if as_set and values.valid:
-                return LightReading(values.raw)
+                return values.raw
             if number >= N_INVALID and self._clock.monotonic() > deadline:
                 raise SensorError(
                     f"input {self.port + 1} gave no valid reading for {self._valid_s:g} s; "

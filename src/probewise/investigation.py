@@ -119,7 +119,8 @@ def _rounds_until_stop(
         elif reason is None and number == len(rngs):
             reason = f"the limit of {number} rounds is reached"
         elif reason is None and following is not None and affordable is None:
-            reason = f"the budget of {budget.exhausted_part(following.plan)} is spent"
+            first = next((rows for rows in following.plan.rows_by_scan() if rows.size), ())
+            reason = f"the budget of {'readings' if len(first) > budget.readings else 'minutes'} is spent"
         yield Round(number, recordings[-1], in_words, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:
             return
@@ -158,11 +159,6 @@ class Budget:
         if len(kept) == len(plan):
             return plan
         return plan.take(kept) if kept.size else None
-
-    def exhausted_part(self, plan: Plan) -> str:
-        """Return which part of the budget a plan's first scan exceeds: "readings", otherwise "minutes"."""
-        first = next((rows for rows in plan.rows_by_scan() if rows.size), ())
-        return "readings" if len(first) > self.readings else "minutes"
 
 
 def _minutes_of_plan(plan: Plan, after_s: float) -> float:

@@ -11,33 +11,30 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probewise import experiment as experiments
+from probewise._arrays import FloatArray
 from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise.arm import Geometry, Instrument, Reading
 from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
 from probewise.cli import _common as common
 from probewise.cli._arm import parse_arm, read_or_shipped_geometry
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
-from probewise.experiment import Exploration, HiddenShape, read_journal
+from probewise.experiment import Experiment, Exploration, HiddenShape, Model, Step, read_journal
+from probewise.inference import Naive
+from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped, write_bytes_atomically
 from probewise.report import exploration as report
 from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
 from probewise.verbs import calibrate, naive_levels
-
-if TYPE_CHECKING:
-    from probewise._arrays import FloatArray
-    from probewise.arm import Geometry, Instrument, Reading
-    from probewise.experiment import Experiment, Model, Step
-    from probewise.inference import Naive
-    from probewise.progress import Progress
 
 _SHIPPED = "shipped_sensor.json"
 

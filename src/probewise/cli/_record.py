@@ -10,10 +10,10 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probewise._arrays import BoolArray, FloatArray
 from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
@@ -45,9 +45,6 @@ from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
 from probewise.recordings.patterns import have_same_albedo
 from probewise.scene import region_of
-
-if TYPE_CHECKING:
-    from probewise._arrays import BoolArray, FloatArray
 
 _OFF_PLAN_MM = 5.0  # tolerance, since a user's own instrument may report the true place
 _OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation

@@ -18,17 +18,7 @@ from probewise._arrays import FloatArray, floats
 from probewise._kinds import checked_number, require_kind, require_like
 from probewise.errors import ParameterError, ShapeError, require
 
-__all__ = [
-    "Joint",
-    "LogNormal",
-    "LogUniform",
-    "Marginal",
-    "Normal",
-    "Prior",
-    "Product",
-    "Uniform",
-    "require_prior",
-]
+__all__ = ["Joint", "LogNormal", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform", "require_prior"]
 
 
 @runtime_checkable

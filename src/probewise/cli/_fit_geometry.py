@@ -93,11 +93,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
 
 
 def bring_to_mark(
-    arm: LegoArm,
-    mark_mm: tuple[float, float],
-    block_mm: float,
-    ask: Callable[[], str],
-    tell: Callable[[str], None],
+    arm: LegoArm, mark_mm: tuple[float, float], block_mm: float, ask: Callable[[], str], tell: Callable[[str], None]
 ) -> list[float] | None:
     """Bring the sensor over a mark and down to the block on it, as a person directs.
 

@@ -33,12 +33,7 @@ from probewise.arm.carry_out import BY_HAND_S, duration_s
 from probewise.arm.geometry import wrapped_to_pi
 from probewise.cli import _bench
 from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
-from probewise.cli._arm_tasks import (
-    confirm_lowering,
-    nxt_port,
-    open_instrument,
-    prompter_unless_dry_run,
-)
+from probewise.cli._arm_tasks import confirm_lowering, nxt_port, open_instrument, prompter_unless_dry_run
 from probewise.cli._common import message_to_resume, print_result, print_warning, refuse_options
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown

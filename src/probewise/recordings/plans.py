@@ -15,12 +15,7 @@ from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Quadrant, Un
 from probewise.recordings.plan import Instrumentation, Plan
 
 LEGO = Instrumentation(
-    unit="LEGO",
-    min=0.0,
-    max=100.0,
-    sensor="LEGO 9844 light sensor",
-    height_mm=14.0,
-    controls=("orientation_deg",),
+    unit="LEGO", min=0.0, max=100.0, sensor="LEGO 9844 light sensor", height_mm=14.0, controls=("orientation_deg",)
 )
 PATTERNS: dict[str, Pattern] = {
     "boundary": HalfPlane(0.0, 0.0),  # paper, S_BW

@@ -81,8 +81,7 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
         sections=[
             Section("Posterior", (table(("parameter", "median", "95 % interval", "mode"), rows),)),
             Section(
-                "Residuals",
-                (residuals, "probewise diagnose tests them and names the physics that would explain them."),
+                "Residuals", (residuals, "probewise diagnose tests them and names the physics that would explain them.")
             ),
             Section("This run", (definition_list(facts), *notes_in_words(fit.recording.notes))),
         ],

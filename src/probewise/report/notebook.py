@@ -131,10 +131,7 @@ _PARTS: dict[type, Callable[[Any], tuple[str, ...]]] = {
     ),
     NestedResult: _nested_result_parts,
     Weighted: _weighted_parts,
-    Step: lambda value: (
-        value.summary(),
-        f"Taken at ({value.reading.pose.x_mm:g}, {value.reading.pose.y_mm:g}) mm.",
-    ),
+    Step: lambda value: (value.summary(), f"Taken at ({value.reading.pose.x_mm:g}, {value.reading.pose.y_mm:g}) mm."),
     Exploration: _exploration_parts,
     Prediction: lambda value: (
         value.summary().replace("\n", "; "),

@@ -20,16 +20,7 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
-from probewise.report.sheets import (
-    BOTTOM_MM,
-    LEFT_MM,
-    OVERLAP_MM,
-    PAPERS_MM,
-    Sheet,
-    Tile,
-    points_of_lines,
-    tiles_of,
-)
+from probewise.report.sheets import BOTTOM_MM, LEFT_MM, OVERLAP_MM, PAPERS_MM, Sheet, Tile, points_of_lines, tiles_of
 from probewise.scene import region_of
 
 _MM_PER_IN = 25.4

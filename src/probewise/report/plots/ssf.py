@@ -45,9 +45,7 @@ def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_
 
 
 def ssf_by_n_gaussians(
-    fields: Mapping[int, SSFField],
-    log_z: Mapping[int, float],
-    log_z_error: Mapping[int, float],
+    fields: Mapping[int, SSFField], log_z: Mapping[int, float], log_z_error: Mapping[int, float]
 ) -> canvas.AxesGrid:
     """Draw the mean SSF of each number of Gaussians with its log evidence and standard error (paper, figure 6).
 

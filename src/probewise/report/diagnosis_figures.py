@@ -24,7 +24,7 @@ from probewise.report.covariates import (
     views_of_place,
 )
 from probewise.report.plots import residuals as plots
-from probewise.report.plots.canvas import BLUE, AxesGrid, stack_of_axes, svg
+from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, stack_of_axes, svg
 from probewise.report.plots.probabilities import hypothesis_probabilities, n_further_lines
 from probewise.systems import RunTable
 from probewise.systems.forms import Form
@@ -114,7 +114,7 @@ def _curve_svg(diagnosis: Diagnosis, curve: Form) -> bytes:
     change = curve.apply(np.zeros((len(samples), len(plan))), samples, plan)[:, rows]
     low, middle, high = np.quantile(change - change.mean(axis=1, keepdims=True), [0.025, 0.5, 0.975], axis=0)
     (ax,) = stack_of_axes([2.6])
-    ax.fill_between(at[rows], low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 %")
+    ax.fill_between(at[rows], low, high, label="95 %", **FILLED)
     ax.plot(at[rows], middle, color=BLUE, label=f"{name} of {column}")
     ax.set(xlabel=axis_label(diagnosis, curve.covariates[0]), ylabel=f"added {reading.unit_after_number}".rstrip())
     ax.legend()

@@ -40,7 +40,7 @@ def arm_and_sensor(
     draw_sensor_face(face, size=1.0)
     face.set_axis_off()
     face.set(xlim=(-0.95, 0.95), ylim=(-0.95, 0.95), aspect="equal")
-    face.set_title("sensor, from below", fontsize="medium", loc="left")
+    face.set_title("sensor, from below", **canvas.TITLE)
     face.annotate(
         "photodiode", (0.0, 0.24), xytext=(0.0, 0.72), ha="center", fontsize=canvas.SMALL_PT, arrowprops=_ARROW
     )

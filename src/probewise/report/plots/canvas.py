@@ -36,6 +36,14 @@ BLUE, VERMILLION, PURPLE, GREY = "#0072b2", "#d55e00", "#cc79a7", "#8c8c8c"
 CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 """Okabe and Ito's palette, distinct for the colour-blind."""
 
+THIN: dict[str, Any] = {"color": BLACK, "linewidth": 0.7}
+"""Style of the line at zero."""
+BAND: dict[str, Any] = {"color": GREY, "alpha": 0.3, "linewidth": 0}
+"""Style of a band of chance, or of errors."""
+FILLED: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
+"""Style of the area below a curve."""
+TITLE: dict[str, Any] = {"fontsize": "medium", "loc": "left"}
+
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
@@ -229,7 +237,7 @@ def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
     ax.set_xlabel(_EMPTY_BRACKETS.sub("", x))
     ax.set_ylabel(_EMPTY_BRACKETS.sub("", y))
     if title:
-        ax.set_title(title, fontsize="medium", loc="left")
+        ax.set_title(title, **TITLE)
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 

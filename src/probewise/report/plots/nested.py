@@ -70,7 +70,7 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
         trace.scatter(depth[shown], values[shown], s=5, linewidths=0, rasterized=True, **colours)
         canvas.label_axes(trace, x="", y=_parameter_label(result.names[i]))
         centres, density = _centres_and_smoothed_density(values, result.weight, span, result.n_eff)
-        side.fill_betweenx(centres, density, color=canvas.BLUE, alpha=0.25, lw=0)
+        side.fill_betweenx(centres, density, **canvas.FILLED)
         side.plot(density, centres, color=canvas.BLUE, linewidth=1.2)
         side.set_xlim(left=0)
         side.set_ylim(span)
@@ -171,7 +171,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     ax.axhline(n / n_bars, color=canvas.BLACK, linewidth=0.9, label="uniform")
     ax.set(xlim=(0, 1), ylim=(0, 1.3 * max(high, counts.max())))  # room for the text above every bar
     ax.legend(frameon=False, fontsize=canvas.SMALL_PT, loc="upper right", ncols=2)
-    ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", fontsize="medium", loc="left")
+    ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", **canvas.TITLE)
     return ax
 
 
@@ -210,7 +210,7 @@ def run_plot(result: NestedResult) -> canvas.AxesGrid:
 
 
 def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray, *, linewidth: float) -> None:
-    ax.fill_between(depth, mass, color=canvas.BLUE, alpha=0.25, lw=0)
+    ax.fill_between(depth, mass, **canvas.FILLED)
     ax.plot(depth, mass, color=canvas.BLUE, linewidth=linewidth)
     ax.set_ylim(bottom=0)
 

@@ -169,7 +169,7 @@ def quadrant_patterns(recording: Recording) -> canvas.AxesGrid:
     for ax, (name, pattern, readings) in zip(axes.flat, quadrants, strict=False):
         mean = float(readings.mean()) if readings.size else float("nan")
         _draw_quadrant(ax, pattern, number_text(mean, decimals_to_show(mean, 1)))
-        ax.set_title(f"{name.replace('_', ' ')} ({unit})", fontsize="medium", loc="left")
+        ax.set_title(f"{name.replace('_', ' ')} ({unit})", **canvas.TITLE)
     return axes
 
 
@@ -283,7 +283,7 @@ def residuals_by_scan(recording: Recording, before: FloatArray, after: FloatArra
             residual = recording.readings[rows] - predicted[rows]
             ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
             draw_running_mean(ax, along, residual, colour=colour, width=1.8)
-        ax.axhline(0.0, color=canvas.BLACK, linewidth=0.7)
+        ax.axhline(0.0, **canvas.THIN)
         scan = recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])]
         canvas.label_axes(ax, x="", y="", title=scan.replace("_", " "))
     canvas.hide_unused(axes, len(shown))

@@ -105,7 +105,7 @@ def playing_field(
         lego.set_xlabel("LEGO distance units (8 mm)", fontsize=canvas.SMALL_PT)
         lego.tick_params(labelsize=canvas.SMALL_PT)
     if title:
-        ax.set_title(title, fontsize="medium", loc="left")
+        ax.set_title(title, **canvas.TITLE)
     return ax
 
 

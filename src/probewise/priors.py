@@ -28,19 +28,15 @@ class Prior(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the columns of theta."""
-        ...
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map points of the unit cube, (n_samples, n_params), to parameters of that shape: uniform draws to draws."""
-        ...
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map parameters (n_samples, n_params) to points of the unit cube that `from_unit_cube` maps back to them."""
-        ...
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the natural log of the density, shape (n_samples,); -inf outside the support."""
-        ...
 
 
 class Coordinates(Protocol):
@@ -52,14 +48,12 @@ class Coordinates(Protocol):
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters of positive prior density to coordinates, both (n_samples, n_params)."""
-        ...
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates (n_samples, n_params) to parameters; also return the prior's log density in the coordinates.
 
         Any finite coordinates are allowed; the density, (n_samples,), is -inf where they match no parameters.
         """
-        ...
 
 
 @runtime_checkable
@@ -68,15 +62,12 @@ class Marginal(Protocol):
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Evaluate the quantile function: probability in 0..1 -> value; 0 and 1 map to the ends, infinite or not."""
-        ...
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, the inverse of `from_unit`: value -> probability."""
-        ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape; -inf outside the support."""
-        ...
 
 
 def _require_arguments(marginal: Any, kind: type[Any], holds: Callable[..., bool], allowed: str) -> None:

@@ -23,11 +23,9 @@ class Clock(Protocol):
 
     def monotonic(self) -> float:
         """Return seconds since an arbitrary time."""
-        ...
 
     def sleep(self, seconds: float, /) -> None:
         """Wait for some seconds."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -83,25 +81,21 @@ class Instrument(Protocol):
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
-        ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,).
 
         For an arm that turns its sensor only with its base, this is the only possible orientation.
         """
-        ...
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Return the seconds to move from `start` to each place, (n_places, 2), and read there: shape (n_places,)."""
-        ...
 
     def measure(self, pose: Pose) -> Reading:
         """Move to a pose, lower the sensor, read it and raise it; return the reading.
 
         Raises ReachError if the arm cannot reach the pose; LinkError if the instrument does not answer.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -139,11 +133,9 @@ class ReachablePlaces(Protocol):
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
-        ...
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""
-        ...
 
 
 class Workspace(ReachablePlaces, Protocol):
@@ -152,11 +144,9 @@ class Workspace(ReachablePlaces, Protocol):
     @property
     def rest_mm(self) -> tuple[float, float]:
         """Rest position (x, y) of the sensor."""
-        ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,)."""
-        ...
 
 
 def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:

@@ -83,35 +83,27 @@ class Machine(Protocol):
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
         """Turn a joint's motor to a count, approaching with the count rising (side 1) or falling (-1), and hold it."""
-        ...
 
     def move_near(self, joint: int, goal: int) -> None:
         """Turn a joint's motor approximately to a count, and hold it."""
-        ...
 
     def release(self) -> None:
         """Let all motors turn freely."""
-        ...
 
     def find_stop(self, joint: int, side: Side) -> None:
         """Turn a joint gently to its stop, angle rising (side 1) or falling (-1); its count becomes `stop_counts`."""
-        ...
 
     def reset(self, joints: Sequence[int]) -> None:
         """Set the counters of these joints' motors to 0."""
-        ...
 
     def read_percent(self) -> float:
         """Read the light sensor with the LED on: 0 to 100, with fractions."""
-        ...
 
     def battery_mv(self) -> float:
         """Read the battery's voltage, in mV."""
-        ...
 
     def keep_awake(self) -> None:
         """Keep the machine awake; to be called now and then during minutes of inactivity."""
-        ...
 
 
 class DryRun:

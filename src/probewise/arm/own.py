@@ -38,7 +38,6 @@ class Measures(Protocol):
 
     def measure(self, pose: Pose, /) -> Any:
         """Move to a pose and read; return a number, a dict with "value" and further numbers, or a Reading."""
-        ...
 
 
 class OwnInstrument:

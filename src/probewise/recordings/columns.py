@@ -31,11 +31,9 @@ class TableLike(Protocol):
 
     def keys(self) -> Iterable[Any]:
         """Return the names of the columns."""
-        ...
 
     def __getitem__(self, name: Any, /) -> Any:
         """Values of a column."""
-        ...
 
 
 def is_commanded(name: str, controls: Sequence[str]) -> bool:

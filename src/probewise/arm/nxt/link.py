@@ -48,19 +48,15 @@ class ByteStream(Protocol):
     @property
     def name(self) -> str:
         """Name of the connection, for messages."""
-        ...
 
     def read(self, size: int, timeout_s: float) -> bytes:
         """Return up to `size` bytes, fewer if no more come in `timeout_s`; LinkError if the connection is lost."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Send all bytes; LinkError if the connection is lost."""
-        ...
 
     def close(self) -> None:
         """Close the connection."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -318,8 +318,7 @@ class SimulatedRecorder:
     def __call__(self, number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
         """Yield the readings of a round's plan after those already taken."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        recording = self.world.simulate(plan, rng=rng)
-        yield from readings_of_recording(recording)[len(taken) :]
+        yield from readings_of_recording(self.world.simulate(plan, rng=rng))[len(taken) :]
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:

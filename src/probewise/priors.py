@@ -116,8 +116,7 @@ class LogUniform:
         return np.asarray(self.low * (self.high / self.low) ** u)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        within = np.clip(value, self.low, self.high)
-        return np.asarray(np.log(within / self.low) / math.log(self.high / self.low))
+        return np.asarray(np.log(np.clip(value, self.low, self.high) / self.low) / math.log(self.high / self.low))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         inside = (value >= self.low) & (value <= self.high)
@@ -223,8 +222,7 @@ class Joint:
     parts: tuple[Prior, ...]
 
     def __post_init__(self) -> None:
-        allowed = "priors: Joint((Product({...}), Product({...})))"
-        require_kind("parts", self.parts, (tuple, list), allowed)
+        require_kind("parts", self.parts, (tuple, list), "priors: Joint((Product({...}), Product({...})))")
         for k, part in enumerate(self.parts):
             require_prior(f"parts[{k}]", part)
         object.__setattr__(self, "parts", tuple(self.parts))
@@ -409,13 +407,11 @@ class SharedScalePrior:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         z = ndtri(np.clip(checked_columns(u, self.names), _FARTHEST_SD, 1 - _FARTHEST_SD))
-        length = np.linalg.norm(z, axis=1, keepdims=True)
-        return np.asarray(self.typical * z * self._ratios[0](length))
+        return np.asarray(self.typical * z * self._ratios[0](np.linalg.norm(z, axis=1, keepdims=True)))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         values = checked_columns(theta, self.names) / self.typical
-        size = np.linalg.norm(values, axis=1, keepdims=True)
-        return np.asarray(ndtr(values / self._ratios[1](size)))
+        return np.asarray(ndtr(values / self._ratios[1](np.linalg.norm(values, axis=1, keepdims=True))))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         values = checked_columns(theta, self.names)

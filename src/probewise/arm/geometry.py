@@ -180,8 +180,7 @@ class Geometry:
     @property
     def rest_mm(self) -> tuple[float, float]:
         """Place (x, y) of the sensor when all joints are at home."""
-        home = np.array([[joint.home_rad for joint in self.joints]])
-        x_mm, y_mm, _ = self.position_mm(home)[0]
+        x_mm, y_mm, _ = self.position_mm(np.array([[joint.home_rad for joint in self.joints]]))[0]
         return float(x_mm), float(y_mm)
 
     @property

@@ -112,8 +112,7 @@ class LegoArm:
         there = self.geometry.angles_rad(places_mm, self.geometry.travel_height_mm)
         here = self.geometry.angles_rad(np.array([[start.x_mm, start.y_mm]]), self.geometry.travel_height_mm)
         counts = np.abs(there - here) * [abs(joint.counts_per_rad) for joint in self.geometry.joints]
-        moves = np.where(counts < 1, 0.0, counts / COUNTS_S + STOP_S)
-        return np.asarray(moves.sum(axis=-1) + READ_S)
+        return np.asarray(np.where(counts < 1, 0.0, counts / COUNTS_S + STOP_S).sum(axis=-1) + READ_S)
 
     def measure(self, pose: Pose) -> Reading:
         """Move to a pose, lower the sensor, read it, and raise it.
@@ -306,8 +305,7 @@ class LegoArm:
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
         lowest_mm = [self._heights_along_mm(way).min() for way in ways]
-        end_mm = self._heights_along_mm(ways[0])[-1]
-        if max(lowest_mm) > end_mm - CLEAR_MM:
+        if max(lowest_mm) > self._heights_along_mm(ways[0])[-1] - CLEAR_MM:
             return orders[int(np.argmax(lowest_mm))]
         self._move_joint_near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
         return ELBOW, SHOULDER
@@ -338,8 +336,7 @@ class LegoArm:
         return abs(way), joint, here + min(max(far, end[0]), end[1])
 
     def _turn_joint_to(self, joint: int, goal: JointTarget) -> None:
-        with_gears = self.geometry.joints[joint].gear_ratio > 0
-        side: Side = 1 if (goal.side > 0) == with_gears else -1
+        side: Side = 1 if (goal.side > 0) == (self.geometry.joints[joint].gear_ratio > 0) else -1
         self._machine.move_to(joint, goal.counts, side)
         self._arrived[joint] = goal.side
 

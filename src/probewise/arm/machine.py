@@ -61,8 +61,7 @@ class SoftLimits:
                 f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees",
             )
         heights = self.heights_along_move_mm(self.last_counts, joint, to, here)
-        floor = min(geometry.lowest_mm, float(heights[0]))
-        if heights.min() < floor:
+        if heights.min() < min(geometry.lowest_mm, float(heights[0])):
             raise ReachError(
                 f"the sensor's height while the {JOINTS[joint]} moves",
                 f"{heights.min():.0f} mm",

@@ -173,8 +173,7 @@ class SimulatedBench:
             return self._world.read(self._table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
         make = partial(SimulatedArm, read_world, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
-        rest = make().pose
-        return make(last=Reading(math.nan, rest, start_s))
+        return make(last=Reading(math.nan, make().pose, start_s))
 
     def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
         """Return the LEGO arm over the table, on an emulated brick."""

@@ -48,8 +48,7 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
     turned, marks = read_turns_and_places(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     print_result(fitted.summary(), quiet=arguments.quiet)
-    text = text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry)
-    write_text_atomically(out, text)
+    write_text_atomically(out, text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry))
     if not is_device_or_pipe(out):
         read_geometry(out)  # check that edits by hand have not hidden a number
     print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)

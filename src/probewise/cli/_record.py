@@ -150,8 +150,7 @@ def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> 
             raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
         return []
     before = _read_unfinished_recording(out)
-    off_rad = _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD
-    difference = next(_differences(before.plan, plan, off_rad), None)
+    difference = next(_differences(before.plan, plan, _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD), None)
     if difference is not None:
         raise FileError(out, difference, "the plan and options of the session that began it; or another --out")
     return readings_of_recording(before)
@@ -163,11 +162,10 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
         return
     first = plan.take(np.arange(len(before)))
-    turned_rad = np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad))
     rows = {
         "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
         "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
-        "orientation": turned_rad > off_rad,
+        "orientation": np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad)) > off_rad,
         "scan": before.scan != first.scan,
         "pattern": np.array(_pattern_names_by_row(before)) != np.array(_pattern_names_by_row(first)),
     }

@@ -93,8 +93,7 @@ def texts_to_numbers(values: ArrayLike) -> ArrayLike:
     if isinstance(cells, str) or cells is None or cells.ndim != 1 or cells.dtype.kind not in "OUT":
         return values
     try:
-        read = [_number_or_nan(cell) for cell in cells.tolist()]
-        return np.array(read, dtype=np.float64)
+        return np.array([_number_or_nan(cell) for cell in cells.tolist()], dtype=np.float64)
     except (ValueError, OverflowError):
         return values
 

@@ -80,8 +80,7 @@ def write_recording(recording: Recording, path: PathLike) -> None:
     be written.
     """
     require_recording(recording)
-    inst = recording.plan.instrumentation
-    largest = math.inf if len(inst.declared_ends) == 2 else LARGEST
+    largest = math.inf if len(recording.plan.instrumentation.declared_ends) == 2 else LARGEST
     readings = _number_cells("readings", recording.readings, largest)
     _write_with_json(recording.plan, checked_path("path", path), plan_columns(recording.plan) | {"reading": readings})
 

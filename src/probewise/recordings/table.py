@@ -314,8 +314,7 @@ def read_table(
     if time and time not in named and time_unit == "s" and is_time:
         named = {time if name == _X_VALUE else name: cells for name, cells in named.items()}
         notes.append(f"{_X_VALUE}, in s, is {time}")
-    table = CSVTable(path, named, rows, layout.at + 1)
-    return _with_plain_numbers(table, notes, names, time, time_unit)
+    return _with_plain_numbers(CSVTable(path, named, rows, layout.at + 1), notes, names, time, time_unit)
 
 
 def _with_plain_numbers(

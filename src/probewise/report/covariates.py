@@ -126,8 +126,7 @@ class ResidualNoise:
         sd = sd * np.array([noise.get(f"values[{name}]", 1.0) for name in plan.scan_names])[plan.scan]
         if "ratio" in noise:
             level = diagnosis.after.readings
-            share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
-            sd = sd * np.sqrt(1 + noise["ratio"] * share)
+            sd = sd * np.sqrt(1 + noise["ratio"] * ((level - level.min()) / (float(np.ptp(level)) or 1.0)))
         self.sd = np.hypot(sd, noise.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
         self.rho, self.absorbed = noise.get("rho", 0.0), None
         if "sd_per_row" not in noise:  # beside a walk the readings leave the mean open, not the residuals

@@ -207,8 +207,7 @@ def window_around_runs_mm(runs: Sequence[Exploration], first: int) -> tuple[floa
     """
     grid = runs[0].experiment.grid
     drawn = [outline for run in runs for outline in outlines(run.experiment.shape.region(run.steps[first - 1].samples))]
-    places = [[r.pose.x_mm, r.pose.y_mm] for run in runs for r in run.readings]
-    points = np.concatenate([*drawn, np.array(places)])
+    points = np.concatenate([*drawn, np.array([[r.pose.x_mm, r.pose.y_mm] for run in runs for r in run.readings])])
     (left, low), (right, high) = points.min(axis=0) - _MARGIN_MM, points.max(axis=0) + _MARGIN_MM
     return max(left, 0.0), min(right, grid.width_mm), max(low, 0.0), min(high, grid.height_mm)
 
@@ -346,11 +345,10 @@ def page_html(run: DemoRun, drawn: Mapping[str, bytes], *, frames: Sequence[Sequ
 
 def _sensor_section(run: DemoRun, drawn: Mapping[str, bytes], shown: Mapping[str, Markup]) -> Section:
     sensor = run.calibration.sensor
-    fitted = calibration_report.sections(sensor, run.recording, run.prediction, drawn, seed=run.seed)
     parts = (
         Section("The arm and its sensor", (shown["arm.png"],)),
         Section("How the recording was taken", (shown["orientations.png"], shown["quadrants.png"])),
-        *fitted[:-1],
+        *calibration_report.sections(sensor, run.recording, run.prediction, drawn, seed=run.seed)[:-1],
     )
     return Section("The sensor", (_SENSOR, calibration_report.summary_sentence(sensor)), parts)
 

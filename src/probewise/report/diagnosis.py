@@ -129,10 +129,9 @@ def _walk_note(diagnosis: Diagnosis) -> str:
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
     gain, changes = diagnosis.improvement, diagnosis.repair_changes_predictions
-    found = diagnosis.reason.partition(TO_SEPARATE)[0]
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
-        ("What was found", _as_sentence(diagnosis, found)),
+        ("What was found", _as_sentence(diagnosis, diagnosis.reason.partition(TO_SEPARATE)[0])),
     ]
     if diagnosis.formula is not None:
         facts.append(("As a formula", _formula_in_words(diagnosis.formula)))
@@ -405,8 +404,7 @@ def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
         )
         for a in aliases
     )
-    header = ("aliased in these readings", "cosine", "what would separate them", "readings needed")
-    return html.table(header, rows)
+    return html.table(("aliased in these readings", "cosine", "what would separate them", "readings needed"), rows)
 
 
 def _audit_elements(audit: PlanAudit) -> Sequence[str | Mapping[str, str]]:

@@ -176,9 +176,8 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> h
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
-    header = ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ()))
     return html.table(
-        header,
+        ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ())),
         (
             (
                 words_without_unit(p.name),

@@ -207,8 +207,7 @@ class Motor:
         return self._make_limited_move(side * max(side * slow_target, least), side, self.drive.slow_power, here)
 
     def _coast_counts(self, power: int, side: Side) -> int:
-        share = power / self.drive.fast_power
-        return round(self._coast.get((power, side), share * self.drive.coast_counts))
+        return round(self._coast.get((power, side), (power / self.drive.fast_power) * self.drive.coast_counts))
 
     def _make_limited_move(self, target: int, side: Side, power: int, here: int) -> int:
         """Make one limited move to a firmware target; return the count at rest. MotorError if stuck or overrunning."""
@@ -231,8 +230,7 @@ class Motor:
         if ran_on < -self.drive.tolerance_counts:
             self._target = None  # it stopped short of the target, which must be elsewhere
             return here
-        learned = self._coast.get((power, side), ran_on)
-        self._coast[power, side] = (learned + ran_on) / 2
+        self._coast[power, side] = (self._coast.get((power, side), ran_on) + ran_on) / 2
         return here
 
     def _try_to_start_limited_move(self, target: int, side: Side, command: SetOutputState) -> bool:
@@ -261,8 +259,7 @@ class Motor:
         def has_faint_power(state: OutputState) -> bool:
             return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RUNNING, 0)
 
-        faint = SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RUNNING)
-        self._link.ask(faint)
+        self._link.ask(SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RUNNING))
         self._clock.sleep(self.drive.settle_s)
         state = self._read_confirmed_state(has_faint_power)
         if not has_faint_power(state):

@@ -260,8 +260,7 @@ def draw_map(ax: Axes, values: FloatArray, x: FloatArray, y: FloatArray, **style
     """Draw values, (n_y, n_x), lower row first, as pixels about even places, (n_x,) and (n_y,); NaN is blank."""
     dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = (float(x[0] - dx), float(x[-1] + dx), float(y[0] - dy), float(y[-1] + dy))
-    shown = np.ma.masked_invalid(values)
-    return ax.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **style)
+    return ax.imshow(np.ma.masked_invalid(values), origin="lower", extent=extent, interpolation="nearest", **style)
 
 
 def paint_out_of_reach(ax: Axes) -> None:

@@ -273,8 +273,7 @@ def residuals_by_scan(recording: Recording, before: FloatArray, after: FloatArra
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in tracks]
     shown = [tracks[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // 3), 1)
-    size = (canvas.PAGE_IN, 1.75 * n_rows + 0.7)
-    axes = canvas.grid_of_axes(n_rows, 3, size_in=size, sharex=True, sharey=True)
+    axes = canvas.grid_of_axes(n_rows, 3, size_in=(canvas.PAGE_IN, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
     models = {"calibrated model": (before, canvas.VERMILLION), "repaired model": (after, canvas.BLUE)}
     for ax, track in zip(axes.flat, shown, strict=False):
         ok = recording.usable[track.rows]

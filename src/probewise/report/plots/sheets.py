@@ -297,8 +297,7 @@ def _draw_raster(ax: Axes, pattern: Pattern, low_mm: Any, high_mm: Any, place: A
     n_x, n_y = (max(round((high - low) / _PIXEL_MM), 1) for low, high in zip(low_mm, high_mm, strict=True))
     x = low_mm[0] + (np.arange(n_x) + 0.5) * (high_mm[0] - low_mm[0]) / n_x
     y = low_mm[1] + (np.arange(n_y) + 0.5) * (high_mm[1] - low_mm[1]) / n_y
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    shades = region_of(pattern).albedo(points)[0].reshape(n_y, n_x)
+    shades = region_of(pattern).albedo(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[0].reshape(n_y, n_x)
     (left, bottom), (right, top) = place(np.array([low_mm, high_mm], dtype=np.float64))
     ax.imshow(
         np.clip(shades, 0.0, 1.0),

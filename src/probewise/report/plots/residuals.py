@@ -203,9 +203,7 @@ def recorded_against_predicted(
     ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     ax.plot(ends, ends, color=canvas.BLACK, lw=0.9, label="as predicted")
-    canvas.label_axes(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
-    canvas.legend_above(ax)
-    return ax
+    return canvas.finish(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})", plain="")
 
 
 def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:

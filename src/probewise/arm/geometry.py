@@ -206,6 +206,14 @@ class Geometry:
         """Compute x, y and height of the sensor's face, (n, 3), lab frame, from joint angles, (n, 3)."""
         return _position_mm(self, angles_rad, self.links_mm, self.axis_mm, self.shoulder_mm)
 
+    def joints_from_side_mm(self, shoulder_rad: float, elbow_rad: float) -> list[FloatArray]:
+        """Return shoulder, elbow, wrist and sensor's face as distance from the base's axis and height, (2,) each."""
+        lower_rad = shoulder_rad + elbow_rad if self.elbow_is_relative else elbow_rad
+        joints = [np.array(self.shoulder_mm)]
+        for length_mm, turn in zip(self.links_mm, (shoulder_rad, lower_rad), strict=True):
+            joints.append(joints[-1] + length_mm * np.array([np.cos(turn), np.sin(turn)]))
+        return [*joints, joints[-1] + [self.sensor_mm[0], -self.sensor_mm[1]]]
+
     def height_slopes_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
         """Return the derivative of the sensor's height by each joint angle, (n, 3), at joint angles, (n, 3)."""
         _, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)

@@ -141,21 +141,25 @@ def read_description(path: Path) -> tuple[Instrumentation, dict[str, Pattern], t
 
 def _parse_instrumentation(top: _Object) -> Instrumentation:
     reading, sensor = (_Object(top.path, name, top.content.get(name, {})) for name in ("reading", "sensor"))
-    places = {name: (reading, name) for name in ("unit", "min", "max", "step")}
-    places |= {"sensor": (sensor, "name"), "height_mm": (sensor, "height_mm")}
-    places |= {name: (top, name) for name in ("description", "controls")}
-    values: dict[str, Any] = {}
-    for field, (where, name) in places.items():
-        if field == "controls" and name in top.content:
-            allowed = "a list of texts"
-            values[field] = tuple(top.value(name, allowed, lambda v: isinstance(v, list) and all(map(_is_text, v))))
-        elif field != "controls" and where.content.get(name) is not None:
-            text = field in ("unit", "sensor", "description")
-            values[field] = where.value(name, *(("a text", _is_text) if text else ("a finite number", _is_number)))
+    number, text = ("a finite number", _is_number), ("a text", _is_text)
+    texts = ("a list of texts", lambda v: isinstance(v, list) and all(map(_is_text, v)))
+    places: dict[str, tuple[_Object, str, str, Callable[[Any], bool]]] = {
+        "unit": (reading, "unit", *text),
+        **{name: (reading, name, *number) for name in ("min", "max", "step")},
+        "sensor": (sensor, "name", *text),
+        "height_mm": (sensor, "height_mm", *number),
+        "description": (top, "description", *text),
+        "controls": (top, "controls", *texts),
+    }
+    values = {
+        field: where.value(name, allowed, fits)
+        for field, (where, name, allowed, fits) in places.items()
+        if name in where.content and (field == "controls" or where.content[name] is not None)
+    }
     try:
         return Instrumentation(**{"unit": "", **values})
     except ParameterError as error:
-        where, name = places[error.name]
+        where, name, *_ = places[error.name]
         raise where.error(name, error.allowed) from error
 
 

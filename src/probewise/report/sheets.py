@@ -171,10 +171,7 @@ def arm_home_jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     """Return two sheets that show an arm at its home angles: its links from the side, and its base from above."""
     base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
     turns = (shoulder, shoulder + elbow if geometry.elbow_is_relative else elbow)
-    joints = [np.array(geometry.shoulder_mm)]
-    for length, angle in zip(geometry.links_mm, turns, strict=True):
-        joints.append(joints[-1] + length * np.array([math.cos(angle), math.sin(angle)]))
-    face = joints[-1] + [geometry.sensor_mm[0], -geometry.sensor_mm[1]]
+    *joints, face = geometry.joints_from_side_mm(shoulder, elbow)
     return _links_from_side_sheet(geometry, joints, face, turns), _base_from_above_sheet(geometry, base, float(face[0]))
 
 

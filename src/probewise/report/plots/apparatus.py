@@ -57,7 +57,7 @@ def draw_arm_lengths(geometry: Geometry) -> Axes:
     ax = canvas.axes_or_new(None, size_in=(8.2, 5.4))
     _draw_arm_from_side(ax, geometry, shoulder, elbow, named=False)
     _draw_lengths(ax, geometry, shoulder, elbow)
-    joint, knee, *_ = _joints_from_side(geometry, shoulder, elbow)
+    joint, knee, *_ = geometry.joints_from_side_mm(shoulder, elbow)
     motors = (
         ("base", geometry.base, np.array([0.0, joint[1] + 110.0]), (-12, 16), "right"),
         ("shoulder", geometry.shoulder, joint, (40, -22), "left"),
@@ -72,7 +72,7 @@ def draw_arm_lengths(geometry: Geometry) -> Axes:
 
 def _draw_lengths(ax: Axes, geometry: Geometry, shoulder: float, elbow: float) -> None:
     """Draw a dimension line for each length of the arm, named as in a geometry file."""
-    joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
+    joint, knee, wrist, eye = geometry.joints_from_side_mm(shoulder, elbow)
     (forward, height), (upper_mm, lower_mm), (out_mm, drop_mm) = (
         geometry.shoulder_mm,
         geometry.links_mm,
@@ -134,17 +134,8 @@ def draw_sensor_face(
         ax.add_patch(part)
 
 
-def _joints_from_side(geometry: Geometry, shoulder: float, elbow: float) -> list[FloatArray]:
-    """Return shoulder, elbow, wrist and sensor's face as distance from the base's axis and height, (2,) each, in mm."""
-    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
-    joint = np.array(geometry.shoulder_mm)
-    knee = joint + geometry.links_mm[0] * np.array([np.cos(shoulder), np.sin(shoulder)])
-    wrist = knee + geometry.links_mm[1] * np.array([np.cos(lower), np.sin(lower)])
-    return [joint, knee, wrist, wrist + np.array([geometry.sensor_mm[0], -geometry.sensor_mm[1]])]
-
-
 def _draw_arm_from_side(ax: Axes, geometry: Geometry, shoulder: float, elbow: float, *, named: bool = True) -> None:
-    joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
+    joint, knee, wrist, eye = geometry.joints_from_side_mm(shoulder, elbow)
     ax.axhline(0.0, color=canvas.BLACK, linewidth=1.2)
     ax.add_patch(Rectangle((-45, 0), 90, joint[1] - 12, fc="#e3e3e3", ec=canvas.GREY, zorder=1))
     ax.plot([0, 0], [-25, knee[1] + 70], color=canvas.BLACK, linewidth=1.0, linestyle=(0, (6, 3)), zorder=2)

@@ -52,8 +52,8 @@ def interval_table_lines(rows: Sequence[tuple[str, float, tuple[float, float]]])
 def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
     """Return read-only copies of samples (n_samples, n_params) and noise sds (n_samples,); `names` has n_params names.
 
-    Raises ShapeError or ParameterError if the shapes do not fit, a name is no text, there are fewer than 500 samples, a
-    value is not finite, or an sd is not positive.
+    ShapeError or ParameterError if the shapes do not fit, a name is no text, there are fewer than 500 samples, a value
+    is not finite, or an sd is not positive.
     """
     checked_texts("names", names, "names of the columns of samples")
     samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)
@@ -64,8 +64,7 @@ def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
         raise ShapeError(f"noise_sd has shape {noise_sd.shape}; allowed: ({len(samples)},), one per sample")
     require_finite("samples", samples)
     require_finite("noise_sd", noise_sd)
-    if not (noise_sd > 0).all():
-        raise ParameterError("noise_sd", float(noise_sd.min()), "greater than 0")
+    require((noise_sd > 0).all(), "noise_sd", float(noise_sd.min()), "greater than 0")
     return samples, noise_sd
 
 

@@ -20,12 +20,12 @@ import numpy as np
 
 from probewise._arrays import own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import checked_number, checked_whole, require_accepts_positional, require_kind, require_rng
+from probewise._kinds import checked_number, checked_whole, require_accepts, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import VOCABULARY, LightEffect
-from probewise.errors import FileError, ParameterError, did_you_mean
+from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.progress import Progress, silent
 from probewise.recordings import (
     parse_json_file_text,
@@ -78,31 +78,15 @@ def investigate(
     A round, a recording and its diagnosis, is carried out only when it is asked for; the last has a `stop_reason`. An
     explanation is settled if it has probability 0.95 and the verdict is not `cannot_tell`.
 
-    Parameters
-    ----------
-    record
-        Function that takes the readings: of a round's number, its plan and the plan in words; returns the recording.
-    plan
-        The first plan.
-    sensor
-        An earlier calibration, whose posterior becomes the prior; without it each diagnosis calibrates its own.
-    effects
-        The vocabulary: classes of effects, by name.
-    budget
-        Budget beyond `plan`; default: 400 readings.
-    rounds
-        Largest number of rounds, including the first.
-    hands
-        Whether a person can turn or exchange sheets; if not, plans only scan the sheet in place.
-    rng
-        Each round has its own child of it, so that a resumed investigation is reproducible.
-
-    Raises
-    ------
-    ParameterError
-        If an argument is invalid; see also `diagnose`.
+    `record` takes the readings: of a round's number, its plan and the plan in words; returns the recording. `plan` is
+    the first plan; `sensor` an earlier calibration, whose posterior becomes the prior, without which each diagnosis
+    calibrates its own; `effects` the vocabulary, by name; `budget` what may be spent beyond `plan`, by default 400
+    readings; `rounds` the largest number of rounds, including the first; `hands` whether a person can turn or exchange
+    sheets; if not, plans only scan the sheet in place. Each round has its own child of `rng`, so that a resumed
+    investigation is reproducible. ParameterError if an argument is invalid; see also `diagnose`.
     """
-    require_accepts_positional("record", record, 3, "a function of a round's number, its plan and the plan in words")
+    takes = "a function of a round's number, its plan and the plan in words"
+    require_accepts("record", record, takes, None, None, None)
     require_plan(plan)
     require_rng(rng)
     if budget is not None:
@@ -159,8 +143,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("readings", "minutes"):
-            if not checked_number(name, getattr(self, name)) >= 0:
-                raise ParameterError(name, getattr(self, name), "0 or more")
+            require(checked_number(name, getattr(self, name)) >= 0, name, getattr(self, name), "0 or more")
 
     def affordable_scans(self, plan: Plan, after_s: float) -> Plan | None:
         """Return the plan's first scans that fit the budget, in minutes from the time `after_s`; None if none does."""
@@ -252,8 +235,8 @@ _KEPT_AGAIN_S = 0.5  # an arm takes longer per reading, so that none of its read
 class RoundsFolder:
     """The folder of one investigation: plan and readings of each round; made with the first round.
 
-    `settings`, as JSON takes them, determine the investigation. Raises FileError if the folder holds an investigation
-    and `resume` is False, or holds none, or one with other settings, and `resume` is True.
+    `settings`, as JSON takes them, determine the investigation. FileError if the folder holds an investigation and
+    `resume` is False, or holds none, or one with other settings, and `resume` is True.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
@@ -322,10 +305,7 @@ _LARGEST = 1e9  # largest magnitude of a parameter of an effect
 
 @dataclass(frozen=True)
 class SimulatedRecorder:
-    """A `Take` function (for `RoundsFolder`) that simulates a round's plan in a world.
-
-    The noise of a round follows from the seed and the round's number.
-    """
+    """A `Take` function that simulates a plan in a world, with noise by the seed and the round's number."""
 
     world: World
     seed: int
@@ -333,14 +313,13 @@ class SimulatedRecorder:
     def __call__(self, number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
         """Yield the readings of a round's plan after those already taken."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        recording = self.world.simulate(plan, rng=rng)
-        yield from readings_of_recording(recording)[len(taken) :]
+        yield from readings_of_recording(self.world.simulate(plan, rng=rng))[len(taken) :]
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:
     """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing" for none.
 
-    Raises ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
+    ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
     """
     return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 

@@ -84,8 +84,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     work, settings = partial(weigh_case, plan=options.plan), {"seed": options.seed, "plan": options.plan}
-    tasks = [Task(options.seed, number) for number in range(options.numbers)]
-    campaign = Campaign(work, tasks, settings, lambda result: None, "cases")
+    tasks = {task.key: task for task in (Task(options.seed, number) for number in range(options.numbers))}
+    campaign = Campaign(work, tasks, settings, noun="cases")
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         print(summary([*campaign.run(path=options.out, executor=pool).values()]))
 

@@ -52,15 +52,15 @@ from probewise._progress import progress_shown
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main as command_line
 from probewise.experiment import TRUST, left_out_after_step
-from probewise.proof.campaign import run_campaign
+from probewise.proof.campaign import Campaign
 from probewise.proof.concealed_study import CONCEALED
 from probewise.proof.refits import NullRefit, SystemRefit
 from probewise.proof.sensors.cases import Stratum
 from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
-from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup, EffectSizer
-from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, write_system_case
+from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
+from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, draw_system, write_system_case
 from probewise.proof.systems.cases import draw_effect_of_size as conceal_in_system
-from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, Form, family_of, forms_of
+from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, Form, SystemEffect, family_of, forms_of
 from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
 from probewise.proof.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Plan, paper_plan, two_way_plan, write_recording, write_text_atomically
@@ -113,11 +113,10 @@ def conceal_effect(what: str, plan: Plan, rng: np.random.Generator) -> tuple[Wor
     world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=1.0)
     if what not in INSIDE:
         return dataclasses.replace(world, **LEVELS.get(what, {})), None
-    setup = CleanSetup(plan, world)
-    sizer = EffectSizer(setup, NullRefit())
+    setup = CleanSetup(plan, world, NullRefit())
     for wanted in SIZES:
         with contextlib.suppress(errors.NotConvergedError):
-            hidden = conceal_in_sensor(what, wanted, sizer, rng)
+            hidden = conceal_in_sensor(what, wanted, setup, rng)
             return dataclasses.replace(world, concealed=(hidden.effect,)), hidden.size_lambda
     amplitude = math.sqrt(INSIDE[what].first * INSIDE[what].limit)
     return dataclasses.replace(world, concealed=(INSIDE[what].draw(setup, rng)(amplitude),)), None
@@ -161,8 +160,8 @@ def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
                 effects = [conceal_in_system(forms[rng.integers(len(forms))], wanted, drawn, SystemRefit(), rng)]
             elif forms:  # the parameters take it up, whatever its size
                 amplitude = min(20 * forms[0].first, forms[0].limit)
-                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)), 0.0)]
-            free = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
+                effects = [SystemEffect(forms[0], forms[0].of_amplitude(amplitude, forms[0].draw(rng)))]
+            free = drawn.simulate_all_rows(effects)
             if np.abs(free).max() < 1e3 * np.abs(drawn.true_system.readings).max():
                 break
     name = {"quantisation": "quantised"}.get(what, what if what in OTHER_NOISE else "white")
@@ -170,8 +169,6 @@ def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
     noise = noise_of_size(name, 12.0, free[seen[0]], seen[1], drawn.kind.sd, rng=rng)
     readings = noise.draw(free, drawn.table, rng)
     return SystemCase(
-        0,
-        0,
         stratum=Stratum("single", 20.0),
         drawn=drawn,
         effects=tuple(effects),
@@ -349,9 +346,10 @@ def main() -> None:
         text = asked.keys.read_text()
         cells = {key: cells[key] for key in (json.loads(text)["failing"] if text[0] == "{" else text.splitlines())}
     asked.out.mkdir(parents=True, exist_ok=True)
-    told: dict[str, Any] = {"path": asked.out / "cells.jsonl", "settings": {"seed": asked.seed}, "noun": "cells"}
+    campaign = Campaign(run_cell, cells, {"seed": asked.seed}, noun="cells")
     with ProcessPoolExecutor(asked.workers) as pool, progress_shown(quiet=False) as progress:
-        rows = run_campaign(run_cell, cells, executor=pool, progress=progress, **told)
+        found = campaign.run(path=asked.out / "cells.jsonl", executor=pool, progress=progress)
+    rows = {key: found[cell] for key, cell in cells.items()}
     if asked.cover:
         return print("\n".join(cover(rows, asked.cover)))
     named = [row["in_result"] for key, row in rows.items() if "in_result" in row and not key.endswith("nothing")]

@@ -50,7 +50,7 @@ def calibrated() -> FittedSensor:
 
 def run(sensor: FittedSensor, trial: ConcealedTrial) -> tuple[FittedSensor, dict[str, Any]]:
     """Look for the circle of a trial from a sensor; return the sensor that the run leaves, and its figures."""
-    shape = POPULATIONS[REFERENCE.population].shape
+    shape = POPULATIONS[REFERENCE.population]
     experiment = replace(
         experiment_for(sensor, shape, Field(FIELD.width_mm, FIELD.height_mm), trust=TRUST),
         grid=experiment_of(REFERENCE).grid,

@@ -18,6 +18,7 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -53,18 +54,14 @@ def campaign(
     problems: Iterable[str], samplers: Iterable[str], *, seeds: range, live: int, cap: float, out: Path
 ) -> None:
     """Make every run that is not in the file yet."""
-    samplers = list(samplers)
     seen = {tuple(line[k] for k in _KEY) for line in records.read_lines(out)}
     with records.Lines(out) as lines:
-        for problem in problems:
-            for seed in seeds:
-                for sampler in samplers:
-                    key = {"problem": problem, "sampler": sampler, "seed": seed, "live": live, "cap": cap}
-                    if tuple(key[k] for k in _KEY) in seen:
-                        continue
-                    record = {**run_one(key), "date": records.today()}
-                    lines.add(record)
-                    print(_told(record), flush=True)
+        for problem, seed, sampler in product(problems, seeds, samplers):
+            values = (problem, sampler, seed, live, cap)
+            if values not in seen:
+                record = {**run_one(dict(zip(_KEY, values, strict=True))), "date": records.today()}
+                lines.add(record)
+                print(_told(record), flush=True)
 
 
 def _told(record: dict[str, Any]) -> str:
@@ -95,8 +92,7 @@ def summarise(lines: Iterable[dict[str, Any]], truths: dict[str, tuple[float, fl
     """
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for line in lines:
-        if line["status"] != "not applicable":
-            groups.setdefault((line["problem"], line["sampler"]), []).append(line)
+        groups.setdefault((line["problem"], line["sampler"]), []).append(line)
     rows = [_row(problem, sampler, group, truths[problem]) for (problem, sampler), group in groups.items()]
     for row in rows:
         peers = [r for r in rows if r["problem"] == row["problem"] and not r["sampler"].startswith("ours")]
@@ -117,9 +113,8 @@ def _row(problem: str, sampler: str, group: list[dict[str, Any]], truth: tuple[f
         "n_done": len(done),
         "statuses": sorted({line["status"] for line in group}),
     }
-    names: tuple[str, ...] = ("offset", "claimed", "actual", "n_evaluations", "cpu_s", "compiling_s")
-    names += ("work", "work_claimed", "per_nat", "worst_check")
-    row |= dict.fromkeys(names)
+    names = "offset claimed actual n_evaluations cpu_s work work_claimed per_nat worst_check"
+    row |= dict.fromkeys(names.split())
     row["correct"] = False
     if not done:
         return row
@@ -136,7 +131,6 @@ def _row(problem: str, sampler: str, group: list[dict[str, Any]], truth: tuple[f
         "actual": actual,
         "n_evaluations": n_evaluations,
         "cpu_s": statistics.median(line["cpu_s"] for line in done),
-        "compiling_s": statistics.median(line["compiling_s"] for line in done),
         "work": n_evaluations * actual**2 if actual is not None else None,
         "work_claimed": n_evaluations * claimed**2,
         "per_nat": n_evaluations / (n_live * nats) if n_live and nats > 0 else None,
@@ -164,7 +158,6 @@ def table(rows: Iterable[dict[str, Any]]) -> str:
         "actual error",
         "evaluations",
         "cpu s",
-        "of it compiling",
         "evaluations × error²: actual",
         "claimed",
         "evaluations per live point and nat",
@@ -190,7 +183,6 @@ def table(rows: Iterable[dict[str, Any]]) -> str:
                 number(row["actual"], ".3f"),
                 number(row["n_evaluations"], ",.0f"),
                 number(row["cpu_s"], ".2f"),
-                number(row["compiling_s"] or None, ".1f"),
                 number(row["work"], ",.0f"),
                 number(row["work_claimed"], ",.0f"),
                 number(row["per_nat"], ".1f"),

@@ -165,35 +165,33 @@ def funnel(n_params: int = 10) -> Known:
     return Known(prior, function, _log_quad(over, -half_v, half_v, [0.0, 6.0]) - log_volume)
 
 
-def nested_scales(n_params: int = 5, n_scales: int = 6) -> Known:
-    """Spikes of sd 0.2 to 2e-4 within each other, every one with twice the mass of the one before it."""
-    sd = 0.2 * 4.0 ** -np.arange(n_scales)
-    log_mass = math.log(2) * np.arange(n_scales)
-    # Each off the centre of the greater one, so that no two share an axis of symmetry.
-    centre = np.concatenate([[0.0], 0.3 * np.cumsum(sd[:-1])])
+def gaussians(n_params: int, half: float, centre: FloatArray, sd: FloatArray, mass: FloatArray) -> Known:
+    """Gaussians of these sds and masses, (n_gaussians,), in [-half, half]^n; each centre is the same in all parameters.
+
+    Or `centre` is (n_params, n_gaussians).
+    """
 
     def function(theta: FloatArray) -> FloatArray:
         square = ((theta[:, :, None] - centre) ** 2).sum(axis=1) / sd**2
-        return np.asarray(logsumexp(log_mass - 0.5 * square - n_params * (np.log(sd) + 0.5 * LOG_2PI), axis=1))
+        return np.asarray(logsumexp(np.log(mass) - 0.5 * square - n_params * (np.log(sd) + 0.5 * LOG_2PI), axis=1))
 
-    inside = n_params * np.log(ndtr((1 - centre) / sd) - ndtr((-1 - centre) / sd))
-    return Known(box(n_params, -1, 1), function, float(logsumexp(log_mass + inside)) - n_params * math.log(2))
+    centres = np.broadcast_to(centre, (n_params, len(sd)))
+    inside = np.log(ndtr((half - centres) / sd) - ndtr((-half - centres) / sd)).sum(axis=0)
+    log_z = float(logsumexp(np.log(mass) + inside)) - n_params * math.log(2 * half)
+    return Known(box(n_params, -half, half), function, log_z)
+
+
+def nested_scales(n_params: int = 5, n_scales: int = 6) -> Known:
+    """Spikes of sd 0.2 to 2e-4 within each other, every one with twice the mass of the one before it."""
+    sd = 0.2 * 4.0 ** -np.arange(n_scales)
+    # Each off the centre of the greater one, so that no two share an axis of symmetry.
+    centre = np.concatenate([[0.0], 0.3 * np.cumsum(sd[:-1])])
+    return gaussians(n_params, 1.0, centre, sd, 2.0 ** np.arange(n_scales))
 
 
 def spike_on_slab(n_params: int = 20) -> Known:
     """Skilling's change of phase: a Gaussian of sd 0.1 and one of 0.01 with a hundred times its mass, 20-D."""
-    sd, log_mass = np.array([0.1, 0.01]), np.array([0.0, math.log(100)])
-    centre = np.array([0.0, 0.031])
-
-    def function(theta: FloatArray) -> FloatArray:
-        square = ((theta[:, :, None] - centre) ** 2).sum(axis=1) / sd**2
-        return np.asarray(logsumexp(log_mass - 0.5 * square - n_params * (np.log(sd) + 0.5 * LOG_2PI), axis=1))
-
-    return Known(
-        box(n_params, -0.5, 0.5),
-        function,
-        float(logsumexp(log_mass + n_params * np.log(ndtr((0.5 - centre) / sd) - ndtr((-0.5 - centre) / sd)))),
-    )
+    return gaussians(n_params, 0.5, np.array([0.0, 0.031]), np.array([0.1, 0.01]), np.array([1.0, 100.0]))
 
 
 # ------------------------------------------------------------------ several modes
@@ -219,28 +217,13 @@ def stripes(n_params: int = 4, n_stripes: int = 7) -> Known:
 
 def mixture(n_params: int = 12) -> Known:
     """Three Gaussians of different sds and places in [-5, 5]^n."""
-    sd = np.array([0.3, 0.26, 0.22])
-    log_mass = np.log([0.2, 0.3, 0.5])
-    centre = np.stack([np.full(n_params, -2.0), np.full(n_params, 1.0), np.where(np.arange(n_params) % 2, 3.0, -1.0)])
-
-    def function(theta: FloatArray) -> FloatArray:
-        square = np.stack([((theta - c) ** 2).sum(axis=1) for c in centre], axis=1) / sd**2
-        return np.asarray(logsumexp(log_mass - 0.5 * square - n_params * (np.log(sd) + 0.5 * LOG_2PI), axis=1))
-
-    return Known(box(n_params, -5, 5), function, -n_params * math.log(10))
+    places = (np.full(n_params, -2.0), np.full(n_params, 1.0), np.where(np.arange(n_params) % 2, 3.0, -1.0))
+    return gaussians(n_params, 5.0, np.stack(places, axis=1), np.array([0.3, 0.26, 0.22]), np.array([0.2, 0.3, 0.5]))
 
 
 def needle_beside_hill(n_params: int = 6) -> Known:
     """A hill of sd 0.15 and, far from it, a peak half as wide with ninety times its mass, in [-1, 1]^n."""
-    sd, log_mass = np.array([0.15, 0.075]), np.array([0.0, math.log(90)])
-    centre = np.array([-0.25, 0.6])
-
-    def function(theta: FloatArray) -> FloatArray:
-        square = ((theta[:, :, None] - centre) ** 2).sum(axis=1) / sd**2
-        return np.asarray(logsumexp(log_mass - 0.5 * square - n_params * (np.log(sd) + 0.5 * LOG_2PI), axis=1))
-
-    inside = n_params * np.log(ndtr((1 - centre) / sd) - ndtr((-1 - centre) / sd))
-    return Known(box(n_params, -1, 1), function, float(logsumexp(log_mass + inside)) - n_params * math.log(2))
+    return gaussians(n_params, 1.0, np.array([-0.25, 0.6]), np.array([0.15, 0.075]), np.array([1.0, 90.0]))
 
 
 def von_mises(n_params: int = 6, kappa: float = 30.0) -> Known:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -24,14 +25,9 @@ def ours_result(
         return run(problem, rng=np.random.default_rng(seed), n_live=n_live, move=move, max_cost=max_cost)
 
 
-def ours(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
-    """Run this project's sampler."""
-    return outcome_of(ours_result(problem, seed, n_live), problem.n_evaluations)
-
-
-def ours_checked(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
-    """Run it with the check of its evidence, as users get it."""
-    return outcome_of(ours_result(problem, seed, n_live, max_cost=5.0), problem.n_evaluations)
+def ours(problem: Counted, seed: int, n_live: int | None = None, max_cost: float = 1.0) -> Outcome:
+    """Run this project's sampler; with a `max_cost` of 5 as users get it, with the check of its evidence."""
+    return outcome_of(ours_result(problem, seed, n_live, max_cost=max_cost), problem.n_evaluations)
 
 
 def ours_refined(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
@@ -73,7 +69,7 @@ def outcome_of(result: NestedResult, n_evaluations: int) -> Outcome:
 
 SAMPLERS = {
     "ours": Sampler((), ours),
-    "ours-checked": Sampler((), ours_checked),
+    "ours-checked": Sampler((), partial(ours, max_cost=5.0)),
     "ours-refined": Sampler((), ours_refined),
     "ours-quick": Sampler((), ours_quick),
 }

@@ -1,8 +1,7 @@
 """Problems whose evidence and posterior are known by another route, for tests and benchmarks.
 
 `PROBLEMS` has them by name; `problem(name)` also makes "Gaussian 7-D" or "shells 3-D" in any number of
-dimensions. Every analytic likelihood is written for an array module `xp` (numpy, or jax.numpy), so that
-samplers that trace their likelihood are given the same function as the others.
+dimensions.
 """
 
 from __future__ import annotations
@@ -44,14 +43,6 @@ class Check:
 
 
 @dataclass(frozen=True, eq=False)
-class Traceable:
-    """A likelihood and a prior transform for any array module: functions of the last axis and of `xp`."""
-
-    from_unit: Callable[[Any, Any], Any]
-    log_likelihood: Callable[[Any, Any], Any]
-
-
-@dataclass(frozen=True, eq=False)
 class Known:
     """A problem, with the log of its evidence (and that number's own error), and posterior means to check.
 
@@ -64,7 +55,6 @@ class Known:
     log_z: float
     log_z_error: float = 0.0
     checks: tuple[Check, ...] = ()
-    traceable: Traceable | None = None
     n_live: int | None = None
 
     @property
@@ -86,22 +76,12 @@ def in_box(
     n_params: int,
     low: float,
     high: float,
-    function: Callable[[Any, Any], Any],
+    function: Function,
     log_z: float,
     checks: Sequence[Check] = (),
 ) -> Known:
-    """Pose an analytic problem in a cube; `function(theta, xp)` reduces the last axis."""
-
-    def from_unit(u: Any, xp: Any) -> Any:
-        return low + (high - low) * u
-
-    return Known(
-        box(n_params, low, high),
-        lambda theta: np.asarray(function(theta, np)),
-        log_z,
-        checks=tuple(checks),
-        traceable=Traceable(from_unit, function),
-    )
+    """Pose an analytic problem in a cube; `function(theta)` reduces the last axis."""
+    return Known(box(n_params, low, high), function, log_z, checks=tuple(checks))
 
 
 def _coordinates(n_params: int, mean: Sequence[float]) -> list[Check]:
@@ -131,11 +111,11 @@ def shells(n_params: int) -> Known:
     """Two Gaussian shells of radius 2 and width 0.1, centres 3.5 to either side; by radial quadrature."""
     width, radius, shift = 0.1, 2.0, 3.5
 
-    def function(theta: Any, xp: Any) -> Any:
-        rest = xp.sum(theta[..., 1:] ** 2, axis=-1)
-        left, right = (xp.sqrt((theta[..., 0] + side * shift) ** 2 + rest) for side in (1, -1))
+    def function(theta: FloatArray) -> FloatArray:
+        rest = np.sum(theta[..., 1:] ** 2, axis=-1)
+        left, right = (np.sqrt((theta[..., 0] + side * shift) ** 2 + rest) for side in (1, -1))
         heights = (-0.5 * ((r - radius) / width) ** 2 for r in (left, right))
-        return xp.logaddexp(*heights) - (0.5 * LOG_2PI + math.log(width))
+        return np.logaddexp(*heights) - (0.5 * LOG_2PI + math.log(width))
 
     def moment(power: int) -> float:
         """Radial integral of r^(n_params - 1 + power)."""
@@ -165,8 +145,8 @@ def shells(n_params: int) -> Known:
 def eggbox() -> Known:
     """Eighteen equal peaks; the midpoint rule converges at once for a periodic function."""
 
-    def function(theta: Any, xp: Any) -> Any:
-        return (2 + xp.cos(theta[..., 0] / 2) * xp.cos(theta[..., 1] / 2)) ** 5
+    def function(theta: FloatArray) -> FloatArray:
+        return (2 + np.cos(theta[..., 0] / 2) * np.cos(theta[..., 1] / 2)) ** 5
 
     grid = (np.arange(2000) + 0.5) / 2000 * 10 * math.pi
     values = (2 + np.cos(grid[:, None] / 2) * np.cos(grid / 2)) ** 5
@@ -191,8 +171,8 @@ def gaussian(n_params: int = 10, correlation: float = 0.9, half_width: float = 5
     inverse = np.linalg.inv(covariance)
     constant = float(-0.5 * (n_params * LOG_2PI + np.linalg.slogdet(covariance)[1]))
 
-    def function(theta: Any, xp: Any) -> Any:
-        return constant - 0.5 * xp.sum((theta @ xp.asarray(inverse)) * theta, axis=-1)
+    def function(theta: FloatArray) -> FloatArray:
+        return constant - 0.5 * np.sum((theta @ inverse) * theta, axis=-1)
 
     checks = _coordinates(n_params, [0.0] * n_params)
     checks.append(Check("square of p0", partial(_squares, 0), 1.0))
@@ -222,9 +202,9 @@ def rosenbrock_reference(n_params: int, n_grid: int = 4000) -> tuple[float, Floa
 def rosenbrock(n_params: int) -> Known:
     """A curved valley in [-5, 5]^n_params; its reference is in `references.json` for 2 and 5 parameters."""
 
-    def function(theta: Any, xp: Any) -> Any:
+    def function(theta: FloatArray) -> FloatArray:
         a, b = theta[..., :-1], theta[..., 1:]
-        return -xp.sum(100 * (b - a**2) ** 2 + (1 - a) ** 2, axis=-1)
+        return -np.sum(100 * (b - a**2) ** 2 + (1 - a) ** 2, axis=-1)
 
     stored = reference(f"Rosenbrock {n_params}-D")
     log_z, mean = (stored["log_z"], stored["mean"]) if stored else rosenbrock_reference(n_params)
@@ -235,17 +215,17 @@ def log_gamma(n_params: int = 20) -> Known:
     """Four modes with heavy tails: products of log-gamma and normal densities (Beaujean & Caldwell 2013)."""
     s, half = 1 / 30, (n_params + 2) // 2
 
-    def tail(z: Any, xp: Any) -> Any:
-        return z - xp.exp(z) - math.log(s)
+    def tail(z: FloatArray) -> FloatArray:
+        return z - np.exp(z) - math.log(s)
 
-    def bell(z: Any) -> Any:
+    def bell(z: FloatArray) -> FloatArray:
         return -0.5 * z * z - (0.5 * LOG_2PI + math.log(s))
 
-    def function(theta: Any, xp: Any) -> Any:
+    def function(theta: FloatArray) -> FloatArray:
         low, high = (theta - 1 / 3) / s, (theta - 2 / 3) / s
-        out = xp.logaddexp(tail(low[..., 0], xp), tail(high[..., 0], xp))
-        out = out + xp.logaddexp(bell(low[..., 1]), bell(high[..., 1])) - 2 * math.log(2)
-        return out + xp.sum(tail(high[..., 2:half], xp), axis=-1) + xp.sum(bell(high[..., half:]), axis=-1)
+        out = np.logaddexp(tail(low[..., 0]), tail(high[..., 0]))
+        out = out + np.logaddexp(bell(low[..., 1]), bell(high[..., 1])) - 2 * math.log(2)
+        return out + np.sum(tail(high[..., 2:half]), axis=-1) + np.sum(bell(high[..., half:]), axis=-1)
 
     def share(distribution: Any, centre: float) -> float:
         return float(distribution.cdf((1 - centre) / s) - distribution.cdf(-centre / s))
@@ -279,9 +259,9 @@ def log_gamma(n_params: int = 20) -> Known:
 def plateau() -> Known:
     """Three flat terraces and a peak in the unit square: 0.6 of the volume at 0, 0.3 at 2, the rest a cone from 4."""
 
-    def function(theta: Any, xp: Any) -> Any:
+    def function(theta: FloatArray) -> FloatArray:
         x = theta[..., 0]
-        return xp.where(x < 0.6, 0.0, xp.where(x < 0.9, 2.0, 4.0 + 20.0 * (x - 0.9)))
+        return np.where(x < 0.6, 0.0, np.where(x < 0.9, 2.0, 4.0 + 20.0 * (x - 0.9)))
 
     peak = math.exp(4) * (math.exp(2) - 1) / 20
     z = 0.6 + 0.3 * math.exp(2) + peak
@@ -297,11 +277,11 @@ def slab_and_spike(n_params: int = 5) -> Known:
     """A Gaussian of sd 0.1 and one of sd 0.01 with a hundred times its mass, around one centre."""
     wide, narrow = 0.1, 0.01
 
-    def function(theta: Any, xp: Any) -> Any:
-        square = xp.sum((theta - 0.5) ** 2, axis=-1)
+    def function(theta: FloatArray) -> FloatArray:
+        square = np.sum((theta - 0.5) ** 2, axis=-1)
         slab = -0.5 * square / wide**2 - n_params * (0.5 * LOG_2PI + math.log(wide))
         spike = -0.5 * square / narrow**2 - n_params * (0.5 * LOG_2PI + math.log(narrow)) + math.log(100)
-        return xp.logaddexp(slab, spike)
+        return np.logaddexp(slab, spike)
 
     inside = (1 - 2 * norm.sf(0.5 / wide)) ** n_params
     # The slab's variance in the box, five of its sd to either side, is its own but for 1.5e-5.
@@ -320,12 +300,12 @@ def naive_steps() -> Known:
     places = np.array([[0.45, 0.5], [0.75, 0.5], [0.6, 0.2], [0.2, 0.9]])
     seen = np.array([1.0, 1.0, 0.0, 0.0])
 
-    def function(theta: Any, xp: Any) -> Any:
-        inside = xp.sum((theta[..., None, :] - xp.asarray(places)) ** 2, axis=-1) < 0.04
-        return -0.5 * xp.sum(((inside - xp.asarray(seen)) / 0.2) ** 2, axis=-1)
+    def function(theta: FloatArray) -> FloatArray:
+        inside = np.sum((theta[..., None, :] - places) ** 2, axis=-1) < 0.04
+        return -0.5 * np.sum(((inside - seen) / 0.2) ** 2, axis=-1)
 
     square = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-    height = function(square, np)
+    height = function(square)
     log_z = float(logsumexp(height))
     mean = np.exp(height - log_z) @ square
     return in_box(2, 0, 1, function, log_z - math.log(len(square)), _coordinates(2, list(mean)))
@@ -335,10 +315,10 @@ def mixture_of_far_peaks(n_params: int = 5) -> Known:
     """Two peaks of masses 1 and 3, twenty sd apart: a sampler that loses one is wrong by ln 4 or ln 4/3."""
     low, high, sd = 0.3, 0.7, 0.02
 
-    def function(theta: Any, xp: Any) -> Any:
+    def function(theta: FloatArray) -> FloatArray:
         constant = -n_params * (0.5 * LOG_2PI + math.log(sd))
-        a, b = (-0.5 * xp.sum(((theta - centre) / sd) ** 2, axis=-1) for centre in (low, high))
-        return xp.logaddexp(a + math.log(0.25), b + math.log(0.75)) + constant
+        a, b = (-0.5 * np.sum(((theta - centre) / sd) ** 2, axis=-1) for centre in (low, high))
+        return np.logaddexp(a + math.log(0.25), b + math.log(0.75)) + constant
 
     checks = [
         Check("share of the greater peak", lambda t: (t[:, 0] > 0.5).astype(float), 0.75),
@@ -404,7 +384,6 @@ def ssf(n_gaussians: int) -> Known:
     """Estimate an SSF of so many Gaussians: the likelihood that `probewise calibrate` uses; see `ssf.py`."""
     name = ssf_name(n_gaussians)
     problem = ssf_problem.problem(n_gaussians)
-    direct = ssf_problem.Direct(problem.recording)
     stored = reference(name)
     means: dict[str, Sequence[float]] = stored.get("mean", {})
     checks = [
@@ -418,7 +397,6 @@ def ssf(n_gaussians: int) -> Known:
         float(stored.get("log_z", math.nan)),
         float(stored.get("log_z_error", math.nan)),
         tuple(checks),
-        Traceable(partial(ssf_problem.from_unit, n_gaussians), direct.log_likelihood),
         n_live=300,
     )
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+from nested_sampling import one_thread
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
@@ -42,6 +47,40 @@ class Lines:
         self._stream.write(json.dumps(record).encode() + b"\n")
         self._stream.flush()
         os.fsync(self._stream.fileno())
+
+
+def complete(
+    out: Path, jobs: Mapping[tuple[Any, ...], tuple[Any, ...]], keys: Iterable[str], one: Any, n_workers: int
+) -> None:
+    """Make every run that is not in the file yet.
+
+    `jobs`: the arguments of `one`, a function of a module, which returns a line, by the values that the line has at
+    `keys`. Several workers are fresh interpreters: their libraries read the thread variables at their start.
+    """
+    seen = {tuple(line[key] for key in keys) for line in read_lines(out)}
+    left = [arguments for key, arguments in jobs.items() if key not in seen]
+    with Lines(out) as lines:
+        if n_workers == 1:
+            for arguments in left:
+                lines.add(one(*arguments))
+            return
+        with ProcessPoolExecutor(n_workers, get_context("spawn"), initializer=one_thread.settle) as pool:
+            for done in as_completed([pool.submit(one, *arguments) for arguments in left]):
+                lines.add(done.result())
+
+
+def summarise(arguments: list[str], summary_of: Any, table: Any) -> None:
+    """Sum files up, as the arguments say: print the table of their entries, and write these where `--out` is given."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("files", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args(arguments)
+    entries = summary_of(options.files)
+    print(table(entries))
+    if options.out:
+        from probewise import __version__
+
+        write_json(options.out, {"version": __version__, "date": today(), "problems": entries})
 
 
 def write_json(path: Path, value: Any) -> None:

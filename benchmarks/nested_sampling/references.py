@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.special import gammaln, logsumexp
 
 from nested_sampling import one_thread, records, ssf
@@ -178,17 +179,12 @@ def tempered(name: str, seed: int, *, n_particles: int, n_moves: int) -> Replica
 def _next_step(height: FloatArray, most: float) -> float:
     """Find the step of the power that leaves `_KEPT_SHARE` of the particles' effective number."""
 
-    def share(step: float) -> float:
-        weight = np.exp(step * (height - height.max()))
-        return float(weight.sum() ** 2 / (weight @ weight) / len(height))
+    def surplus(log_step: float) -> float:
+        weight = np.exp(math.exp(log_step) * (height - height.max()))
+        return float(weight.sum() ** 2 / (weight @ weight) / len(height)) - _KEPT_SHARE
 
-    if share(most) >= _KEPT_SHARE:
-        return most
-    low, high = math.log(1e-12), math.log(most)
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if share(math.exp(middle)) > _KEPT_SHARE else (low, middle)
-    return math.exp(low)
+    high = math.log(most)
+    return most if surplus(high) >= 0 else math.exp(brentq(surplus, math.log(1e-12), high))
 
 
 def _proposed(u: FloatArray, others: FloatArray, rng: np.random.Generator) -> FloatArray:

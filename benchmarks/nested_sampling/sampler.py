@@ -17,8 +17,7 @@ class Outcome:
     """What a sampler says of a problem.
 
     `theta` (n, n_params) with `log_weight` (n,), normalised or not. `doubts`: what the sampler itself says against its
-    result. `n_live`: live points it ran with; None where its live points mean another thing. `compiling_s`: cpu time of
-    a compiler, part of the run's.
+    result. `n_live`: live points it ran with; None where its live points mean another thing.
     """
 
     log_z: float
@@ -29,7 +28,6 @@ class Outcome:
     n_live: int | None = None
     insertion_p_value: float | None = None
     doubts: tuple[str, ...] = ()
-    compiling_s: float = 0.0
 
     @property
     def n_eff(self) -> float:
@@ -92,4 +90,3 @@ class Sampler:
 
     libraries: tuple[str, ...]
     run: Run
-    needs_traceable: bool = False

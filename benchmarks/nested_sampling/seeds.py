@@ -16,9 +16,7 @@ import math
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -50,28 +48,12 @@ def limits(n: int) -> tuple[float, float, float]:
     return float(norm.isf(_CHANCE / 2) / math.sqrt(n)), float(spread[0]), float(spread[1])
 
 
-def document(
-    module: str, argv: Sequence[str] | None, n_seeds: int, rows: Sequence[dict[str, Any]], **settings: int
-) -> dict[str, Any]:
-    """Put the rows of a campaign together with what made them, and the limits that the mean and sd of z keep to."""
-    most, least_sd, most_sd = limits(n_seeds)
-    return {
-        "date": records.today(),
-        "command": f"python -m nested_sampling.{module} {shlex.join(argv if argv is not None else sys.argv[1:])}",
-        "seeds": n_seeds,
-        **settings,
-        "mean_limit": round(most, 2),
-        "sd_limits": [round(least_sd, 2), round(most_sd, 2)],
-        "problems": list(rows),
-    }
-
-
 @cache
 def _problem(name: str) -> Known:
     return problem(name)
 
 
-def run_seed(name: str, seed: int, n_live: int | None) -> dict[str, Any]:
+def run_seed(name: str, seed: int, n_live: int) -> dict[str, Any]:
     """Run one seed; a function of the module, so that another process can."""
     known = _problem(name)
     counted = Counted(known)
@@ -93,22 +75,6 @@ def run_seed(name: str, seed: int, n_live: int | None) -> dict[str, Any]:
         "doubts": list(found.doubts),
         "checks": {key: [round(mean, 8), round(sd, 8)] for key, (mean, sd) in checks.items()},
     }
-
-
-def campaign(name: str, *, seeds: range, n_live: int | None, workers: int, out: Path) -> None:
-    """Run every seed that is not in the file yet."""
-    wanted = n_live or 300
-    seen = {line["seed"] for line in records.read_lines(out) if (line["problem"], line["n_live"]) == (name, wanted)}
-    left = [seed for seed in seeds if seed not in seen]
-    with records.Lines(out) as lines:
-        if workers == 1:
-            for seed in left:
-                lines.add(run_seed(name, seed, n_live))
-            return
-        # Fresh interpreters: their libraries read the thread variables at their start.
-        with ProcessPoolExecutor(workers, get_context("spawn"), initializer=one_thread.settle) as pool:
-            for done in as_completed([pool.submit(run_seed, name, seed, n_live) for seed in left]):
-                lines.add(done.result())
 
 
 def summarise(lines: Sequence[dict[str, Any]], known: Known) -> dict[str, Any]:
@@ -204,8 +170,7 @@ def summary_of(files: Iterable[Path]) -> list[dict[str, Any]]:
 
 def table(entries: Iterable[dict[str, Any]]) -> str:
     """Lay out the summary as markdown."""
-    head: tuple[str, ...] = ("problem", "seeds", "mean z (limit)", "sd z (limits)", "held", "claimed, actual error")
-    head += ("insertion KS p", "doubtful", "worst posterior bias z", "evaluations", "cpu s")
+    head = ("problem", "seeds", "mean z (limit)", "sd z (limits)", "held", "claimed, actual error", "insertion KS p")
     rows = []
     for e in entries:
         worst = max((abs(c["bias_z"]) for c in e["checks"]), default=None)
@@ -224,25 +189,14 @@ def table(entries: Iterable[dict[str, Any]]) -> str:
                 f"{e['cpu_s']:.2f}",
             )
         )
-    return records.markdown_table(head, rows)
+    return records.markdown_table((*head, "doubtful", "worst posterior bias z", "evaluations", "cpu s"), rows)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run seeds, or sum files up."""
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["summarise"]:
-        parser = argparse.ArgumentParser(
-            prog="python -m nested_sampling.seeds summarise", description=summarise.__doc__
-        )
-        parser.add_argument("files", nargs="+", type=Path)
-        parser.add_argument("--out", type=Path)
-        options = parser.parse_args(given[1:])
-        entries = summary_of(options.files)
-        print(table(entries))
-        if options.out:
-            from probewise import __version__
-
-            records.write_json(options.out, {"version": __version__, "date": records.today(), "problems": entries})
+        records.summarise(given[1:], summary_of, table)
         return
     parser = argparse.ArgumentParser(prog="python -m nested_sampling.seeds", description=__doc__)
     parser.add_argument("--problem", required=True)
@@ -252,9 +206,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(given)
-    problem(options.problem)
+    name, n_live = options.problem, options.live or 300
+    problem(name)
     seeds = range(options.first, options.first + options.seeds)
-    campaign(options.problem, seeds=seeds, n_live=options.live or None, workers=options.workers, out=options.out)
+    jobs = {(name, seed, n_live): (name, seed, n_live) for seed in seeds}
+    records.complete(options.out, jobs, ("problem", "seed", "n_live"), run_seed, options.workers)
     print(table(summary_of([options.out])))
 
 

@@ -2,12 +2,11 @@
 
 Priors, all uniform: a 0 to 1; u, v -10 to 10 mm; A, B 0.003 to 0.5 mm^-2; C within 0.98 sqrt(A B); I_min 0 to 20,
 I_max 40 to 80. No ordering: N! labellings of each footprint. `problem` is what `probewise calibrate` samples;
-`Direct` writes the same likelihood down a second time, from the formulas, for any array module.
+`Direct` writes the same likelihood down a second time, from the formulas.
 """
 
 from __future__ import annotations
 
-import importlib
 import math
 from dataclasses import replace
 from functools import cached_property
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
-from scipy import special
+from scipy.special import ndtr
 
 from probewise.calibration import SSFPrior, problem_for
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
@@ -75,27 +74,12 @@ def recording(n_per_scan: int = 101) -> Recording:
     theta = np.array([[1.0, U, V, a, b, c, DARK, BRIGHT]])
     noise = NOISE * np.random.default_rng(_SEED).standard_normal(len(layout))
     silent = Recording(layout, np.zeros(len(layout)))
-    return Recording(layout, Direct(silent).predicted(theta, np)[0] + noise)
+    return Recording(layout, Direct(silent).predicted(theta)[0] + noise)
 
 
 def problem(n_gaussians: int, *, n_per_scan: int = 101) -> SensorProblem:
     """Pose the calibration as `probewise.calibration.calibrate` does, with the paper's priors."""
     return problem_for(recording(n_per_scan), prior(n_gaussians))
-
-
-def from_unit(n_gaussians: int, u: Any, xp: Any) -> Any:
-    """Map the unit cube to parameters for any array module, (..., 6 N + 2) both ways."""
-
-    def spread(x: Any, bounds: tuple[float, float]) -> Any:
-        return bounds[0] + (bounds[1] - bounds[0]) * x
-
-    columns: list[Any] = []
-    for first in range(0, 6 * n_gaussians, 6):
-        a, x, y, p, q, r = (u[..., first + i] for i in range(6))
-        p, q = spread(p, PRECISION), spread(q, PRECISION)
-        columns += [a, spread(x, OFFSET), spread(y, OFFSET), p, q, MAX_CORRELATION * (2 * r - 1) * xp.sqrt(p * q)]
-    columns += [spread(u[..., -2], I_MIN), spread(u[..., -1], I_MAX)]
-    return xp.stack(columns, axis=-1)
 
 
 class Direct:
@@ -122,38 +106,37 @@ class Direct:
         self._x, self._cos, self._sin = layout.x_mm[self._edge], np.cos(turn), np.sin(turn)
         self._quadrant_x, self._quadrant_y = layout.x_mm, layout.y_mm
 
-    def predicted(self, theta: Any, xp: Any) -> Any:
+    def predicted(self, theta: Any) -> Any:
         """Readings without noise, edges first, then quadrants (the plan's order), (..., n_params) -> (..., n)."""
-        ndtr = (special if xp is np else importlib.import_module("jax.scipy.special")).ndtr
-        g = xp.reshape(theta[..., :-2], (*theta.shape[:-1], -1, 6))
+        g = np.reshape(theta[..., :-2], (*theta.shape[:-1], -1, 6))
         a, u, v, p, q, c = (g[..., i] for i in range(6))
         det = p * q - c * c
-        mass = a / xp.sqrt(det)
-        weight = mass / xp.sum(mass, axis=-1, keepdims=True)
+        mass = a / np.sqrt(det)
+        weight = mass / np.sum(mass, axis=-1, keepdims=True)
         var_u, var_v, cov = q / det / 2, p / det / 2, -c / det / 2
         # The edge stands along y; x' and y' of the sensor project on x with cos and -sin of its turn.
-        cos, sin = xp.asarray(self._cos), xp.asarray(self._sin)
+        cos, sin = self._cos, self._sin
         u1, v1, uu, vv, uv = (m[..., None] for m in (u, v, var_u, var_v, cov))
-        distance = xp.asarray(self._x) + cos * u1 - sin * v1
-        sd = xp.sqrt(cos**2 * uu + sin**2 * vv - 2 * cos * sin * uv)
-        parts = [xp.sum(weight[..., None] * ndtr(distance / sd), axis=-2)]
-        su, sv = xp.sqrt(var_u), xp.sqrt(var_v)
+        distance = self._x + cos * u1 - sin * v1
+        sd = np.sqrt(cos**2 * uu + sin**2 * vv - 2 * cos * sin * uv)
+        parts = [np.sum(weight[..., None] * ndtr(distance / sd), axis=-2)]
+        su, sv = np.sqrt(var_u), np.sqrt(var_v)
         for row, pattern in self._quadrants:
             (x, y), (to_x, to_y) = pattern.corner_mm, pattern.direction
             h = to_x * (x - self._quadrant_x[row] - u) / su
             k = to_y * (y - self._quadrant_y[row] - v) / sv
-            both = _upper_quadrant(h, k, to_x * to_y * cov / (su * sv), xp, ndtr)
-            parts.append(xp.sum(weight * both, axis=-1)[..., None])
-        seen = xp.concatenate(parts, axis=-1)
+            both = _upper_quadrant(h, k, to_x * to_y * cov / (su * sv))
+            parts.append(np.sum(weight * both, axis=-1)[..., None])
+        seen = np.concatenate(parts, axis=-1)
         dark, bright = theta[..., -2:-1], theta[..., -1:]
         return dark + (bright - dark) * seen
 
-    def log_likelihood(self, theta: Any, xp: Any) -> Any:
+    def log_likelihood(self, theta: Any) -> Any:
         """Log likelihood with every constant, (..., n_params) -> (...)."""
-        residual = self.predicted(theta, xp) - xp.asarray(self._readings[self._order])
+        residual = self.predicted(theta) - self._readings[self._order]
         total: Any = 0.0
         for rows in self._columns:
-            total = total + self._integrated(xp.sum(residual[..., rows] ** 2, axis=-1), len(rows), xp)
+            total = total + self._integrated(np.sum(residual[..., rows] ** 2, axis=-1), len(rows))
         return total
 
     @cached_property
@@ -165,29 +148,29 @@ class Direct:
         """Columns of `predicted` that belong to each scan."""
         return [np.flatnonzero(np.isin(self._order, rows)) for rows in self._scans]
 
-    def _integrated(self, square: Any, n: int, xp: Any) -> Any:
+    def _integrated(self, square: Any, n: int) -> Any:
         """Log of the integral over sigma of its 1/sigma prior and n Gaussian densities with this sum of squares."""
         low, high = math.log(self._floor), math.log(self._ceiling)
         width = 1 / math.sqrt(2 * n)
-        peak = xp.clip(0.5 * xp.log(square / n + 1e-300), low, high)
-        start, end = xp.maximum(low, peak - 12 * width), xp.minimum(high, peak + 12 * width + 20 / n)
+        peak = np.clip(0.5 * np.log(square / n + 1e-300), low, high)
+        start, end = np.maximum(low, peak - 12 * width), np.minimum(high, peak + 12 * width + 20 / n)
         half = (end - start) / 2
-        log_sigma = (start + end)[..., None] / 2 + half[..., None] * xp.asarray(_NODES)
-        height = -n * log_sigma - 0.5 * square[..., None] * xp.exp(-2 * log_sigma)
-        most = xp.max(height, axis=-1, keepdims=True)
-        integral = xp.sum(xp.exp(height - most) * xp.asarray(_WEIGHTS), axis=-1) * half
-        return most[..., 0] + xp.log(integral) - 0.5 * n * math.log(2 * math.pi) - math.log(high - low)
+        log_sigma = (start + end)[..., None] / 2 + half[..., None] * _NODES
+        height = -n * log_sigma - 0.5 * square[..., None] * np.exp(-2 * log_sigma)
+        most = np.max(height, axis=-1, keepdims=True)
+        integral = np.sum(np.exp(height - most) * _WEIGHTS, axis=-1) * half
+        return most[..., 0] + np.log(integral) - 0.5 * n * math.log(2 * math.pi) - math.log(high - low)
 
 
 _NODES, _WEIGHTS = leggauss(40)
 
 
-def _upper_quadrant(h: Any, k: Any, r: Any, xp: Any, ndtr: Any) -> Any:
+def _upper_quadrant(h: Any, k: Any, r: Any) -> Any:
     """Probability that two standard normals of correlation r exceed h and k, all of one shape."""
-    angle = xp.arcsin(r)
-    sine = xp.sin(0.5 * angle[..., None] * xp.asarray(_NODES + 1))
+    angle = np.arcsin(r)
+    sine = np.sin(0.5 * angle[..., None] * (_NODES + 1))
     exponent = (h * h + k * k)[..., None] - 2 * (h * k)[..., None] * sine
-    integral = xp.sum(xp.exp(-exponent / 2 / (1 - sine**2)) * xp.asarray(_WEIGHTS), axis=-1)
+    integral = np.sum(np.exp(-exponent / 2 / (1 - sine**2)) * _WEIGHTS, axis=-1)
     return ndtr(-h) * ndtr(-k) + angle / (4 * math.pi) * integral
 
 

@@ -81,19 +81,15 @@ __all__ = [
     "read_simulator",
 ]
 
-# Where the names come from that are not packages; all are loaded when first used.
-_HOME = {
-    "Inquiry": "inquiry",
-    "Law": "systems",
-    "Plan": "recordings",
-    "Recording": "recordings",
-    "Simulator": "systems",
-    "investigate": "investigation",
-    "read_plan": "recordings",
-    "read_recording": "recordings",
-    "read_sensor": "calibration",
-    "read_simulator": "systems",
+# What is loaded when it is first used: names by their package, and packages.
+_NAMES = {
+    "calibration": ("read_sensor",),
+    "inquiry": ("Inquiry",),
+    "investigation": ("investigate",),
+    "recordings": ("Plan", "Recording", "read_plan", "read_recording"),
+    "systems": ("Law", "Simulator", "read_simulator"),
 }
+_HOME = {name: home for home, names in _NAMES.items() for name in names}
 _PACKAGES = (
     *("arm", "calibration", "diagnosis", "effects", "emulator", "errors", "experiment", "inference", "inquiry"),
     *("investigation", "nested", "priors", "progress", "proof", "recordings", "report", "scene", "sensor", "systems"),

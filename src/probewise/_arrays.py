@@ -37,8 +37,8 @@ def own_arithmetic(function: Callable[P, T]) -> Callable[P, T]:
 def floats(values: ArrayLike, name: str = "values") -> FloatArray:
     """Convert numbers (an array, a list, a column of a table) to an array of floats; a float64 array is not copied.
 
-    None and masked values become NaN. Raises ParameterError, with the argument's `name`, for a text, a date, a complex
-    number, a set, a ragged list, or a whole number beyond floats.
+    None and masked values become NaN. ParameterError, with the argument's `name`, for a text, a date, a complex number,
+    a set, a ragged list, or a whole number beyond floats.
     """
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(np.object_), np.nan)
@@ -81,8 +81,8 @@ def frozen_int(values: ArrayLike) -> IntArray:
 def rounding_error(values: FloatArray, axis: int | None = None) -> FloatArray:
     """Return the difference up to which values are taken for equal, since they are the results of arithmetic.
 
-    It is 1e-12 of the range of the finite ones, or a few steps of the floating-point grid where they lie far from 0. It
-    is that of all values, or of those along `axis`, which is kept with length 1.
+    It is 1e-12 of the range of the finite ones, or a few steps of the floating-point grid where they lie far from 0; of
+    all values, or of those along `axis`, which is kept with length 1.
     """
     finite, kept = np.isfinite(values), axis is not None
     high = np.max(values, axis=axis, keepdims=kept, initial=-np.inf, where=finite)

@@ -134,14 +134,7 @@ def require_callable(name: str, value: object, allowed: str) -> None:
     require(callable(value), name, value, allowed)
 
 
-def require_accepts_positional(name: str, value: object, n_arguments: int, allowed: str) -> None:
-    """Raise ParameterError unless `value` can be called with `n_arguments` arguments by position."""
-    _require_accepts_call(name, value, allowed, (None,) * n_arguments, {})
-
-
-def _require_accepts_call(
-    name: str, value: object, allowed: str, arguments: tuple[None, ...], named: Mapping[str, None]
-) -> None:
+def require_accepts(name: str, value: object, allowed: str, *arguments: None, **named: None) -> None:
     """Raise ParameterError unless `value` can be called so; a function without a readable signature passes."""
     require_callable(name, value, allowed)
     try:
@@ -155,7 +148,7 @@ def _require_accepts_call(
 def require_progress(value: object, allowed: str = "a function") -> None:
     """Raise ParameterError unless `value` can be called as a `Progress`: stage, done, total, note."""
     names = dict.fromkeys(("stage", "done", "total", "note"))
-    _require_accepts_call("progress", value, f"{allowed} progress({', '.join(names)})", (), names)
+    require_accepts("progress", value, f"{allowed} progress({', '.join(names)})", **names)
 
 
 def checked_text(name: str, value: object, allowed: str = "a text") -> str:

@@ -58,10 +58,7 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
 
 @contextlib.contextmanager
 def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
-    """Yield the caller's progress function, that of a bar in a terminal or notebook (True), or a silent one (False).
-
-    Raises ParameterError if `progress` is none of these.
-    """
+    """Yield the caller's progress function, that of a bar in a terminal or notebook (True), or a silent one (False)."""
     if isinstance(progress, bool):
         with progress_shown(quiet=not progress, lines=False) as shown:
             yield shown
@@ -71,10 +68,7 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
 
 
 def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary], None]:
-    """Return a function (run, summary) that reports the state of nested sampling to a progress function.
-
-    `run` is its name or its number of Gaussians.
-    """
+    """Return a function (name of the run or number of Gaussians, summary) that reports the state of nested sampling."""
 
     def tell(what: int | str, state: RoundSummary) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"

@@ -86,7 +86,7 @@ def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) ->
 
 @contextlib.contextmanager
 def defer_signals() -> Iterator[None]:
-    """Defer signals that end the program until the block ends; another signal more than a second later acts at once.
+    """Defer signals that end the program until the block ends; another one more than a second later acts at once.
 
     For blocks that must not be interrupted: stopping motors, putting files in place.
     """

@@ -23,7 +23,7 @@ from io import FileIO
 from pathlib import Path
 
 from probewise._signals import defer_signals, raise_if_stopped, reporting_what_is_kept
-from probewise.errors import FileError, ParameterError, ProbewiseError, message_of
+from probewise.errors import FileError, ParameterError, ProbewiseError, message_of, require
 from probewise.progress import Progress, silent
 
 PAGE = "report.html"
@@ -44,11 +44,10 @@ def is_device_or_pipe(path: Path) -> bool:
 def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, named: bool = True) -> None:
     """Replace the file at `path` by `content` atomically; its permissions stay.
 
-    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary
-    files that killed processes left are removed. If a person has `named` this very file, a symbolic link is followed,
-    and a device or a named pipe is written to; one that stands where a further file goes is replaced.
-
-    Raises FileError if the folder does not exist or cannot be written to, `path` is a folder, or the disk is full.
+    The bytes are written to a temporary file in the same folder and synced to disk; then it is renamed. Temporary files
+    that killed processes left are removed. If a person has `named` this very file, a symbolic link is followed, and a
+    device or a named pipe is written to; one that stands where a further file goes is replaced. FileError if the folder
+    does not exist or cannot be written to, `path` is a folder, or the disk is full.
     """
     path = Path(path)
     with _errors_of(path), contextlib.ExitStack() as stack:
@@ -118,8 +117,8 @@ def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Itera
     """Hold an exclusive lock on a file or folder, which ends with the process, by way of a file .NAME.lock beside it.
 
     The empty lock file stays, since another process may wait for it. `path` need not exist, but its folder must.
-    Raises FileError if another process holds the lock for longer than `patience_s`, the lock file is a symbolic link or
-    cannot be written, or the file system has no locks.
+    FileError if another process holds the lock for longer than `patience_s`, the lock file is a symbolic link or cannot
+    be written, or the file system has no locks.
     """
     from filelock import FileLock, Timeout  # not needed by the help
 
@@ -149,8 +148,8 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     """Check before any work that results can be written there, and return the path.
 
     `entries` are files and folders of it that the run writes as it goes, `main` the file by which its results are
-    known. Raises ParameterError if a file is in the way, or results of another verb, FileError if no directory can be
-    made there, or one of the entries is a symbolic link, a device or a pipe.
+    known. ParameterError if a file is in the way, or results of another verb; FileError if no directory can be made
+    there, or an entry is a symbolic link, a device or a pipe.
     """
     for name, results in _MAIN_FILES.items():
         if main not in ("", name) and os.path.exists(path / name):
@@ -184,12 +183,10 @@ def _require_short_name(path: Path) -> None:
 def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out") -> Path:
     """Check before any work that a file, device or named pipe, given by an `option`, can be written; return the path.
 
-    Raises ParameterError if it is a directory, an input or below a file, FileError if its directory cannot be written
-    to.
+    ParameterError for a directory, an input or a path below a file, FileError if its directory cannot be written to.
     """
     _require_short_name(path)
-    if path.is_dir():
-        raise ParameterError(option, str(path), "a file name; this is a directory")
+    require(not path.is_dir(), option, str(path), "a file name; this is a directory")
     for taken in inputs:
         if taken is not None and path.exists() and taken.exists() and path.samefile(taken):
             raise ParameterError(option, str(path), f"another file than the input {taken}")
@@ -226,10 +223,9 @@ def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[
     """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
 
     One of the `inputs` of this run that a result would replace is copied to another name. Files of an earlier run, of
-    the patterns `outdated`, are removed unless this run writes them.
-
-    Raises FileError if `out` cannot be made or written to, another process writes there for too long, a directory has
-    the name of a result, or a symbolic link that of a directory of results.
+    the patterns `outdated`, are removed unless this run writes them. FileError if `out` cannot be made or written to,
+    another process writes there for too long, a directory has the name of a result, or a symbolic link that of a
+    directory.
     """
     folder = out / _STAGED
     with _errors_of(out, "made", "a directory you may write to"):
@@ -256,10 +252,7 @@ def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[
 
 
 def _complete(out: Path, stage: StagedFiles, inputs: set[str], outdated: Sequence[str]) -> None:
-    """Add to the results copies of the inputs (real paths) that they replace, `kept`, and marks of outdated files.
-
-    Raises FileError if a directory has the name of a file, or a symbolic link that of a directory.
-    """
+    """Add to the results copies of the inputs (real paths) that they replace, `kept`, and marks of outdated files."""
     names = _files_in(stage.folder)
     for name in names:
         _require_ordinary((out / name).parents[: name.count("/")])

@@ -20,12 +20,12 @@ import numpy as np
 
 from probewise._arrays import own_arithmetic
 from probewise._display import ShowsItself
-from probewise._kinds import checked_number, checked_whole, require_accepts_positional, require_kind, require_rng
+from probewise._kinds import checked_number, checked_whole, require_accepts, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import VOCABULARY, LightEffect
-from probewise.errors import FileError, ParameterError, did_you_mean
+from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.progress import Progress, silent
 from probewise.recordings import (
     parse_json_file_text,
@@ -78,31 +78,15 @@ def investigate(
     A round, a recording and its diagnosis, is carried out only when it is asked for; the last has a `stop_reason`. An
     explanation is settled if it has probability 0.95 and the verdict is not `cannot_tell`.
 
-    Parameters
-    ----------
-    record
-        Function that takes the readings: of a round's number, its plan and the plan in words; returns the recording.
-    plan
-        The first plan.
-    sensor
-        An earlier calibration, whose posterior becomes the prior; without it each diagnosis calibrates its own.
-    effects
-        The vocabulary: classes of effects, by name.
-    budget
-        Budget beyond `plan`; default: 400 readings.
-    rounds
-        Largest number of rounds, including the first.
-    hands
-        Whether a person can turn or exchange sheets; if not, plans only scan the sheet in place.
-    rng
-        Each round has its own child of it, so that a resumed investigation is reproducible.
-
-    Raises
-    ------
-    ParameterError
-        If an argument is invalid; see also `diagnose`.
+    `record` takes the readings: of a round's number, its plan and the plan in words; returns the recording. `plan` is
+    the first plan; `sensor` an earlier calibration, whose posterior becomes the prior, without which each diagnosis
+    calibrates its own; `effects` the vocabulary, by name; `budget` what may be spent beyond `plan`, by default 400
+    readings; `rounds` the largest number of rounds, including the first; `hands` whether a person can turn or exchange
+    sheets; if not, plans only scan the sheet in place. Each round has its own child of `rng`, so that a resumed
+    investigation is reproducible. ParameterError if an argument is invalid; see also `diagnose`.
     """
-    require_accepts_positional("record", record, 3, "a function of a round's number, its plan and the plan in words")
+    takes = "a function of a round's number, its plan and the plan in words"
+    require_accepts("record", record, takes, None, None, None)
     require_plan(plan)
     require_rng(rng)
     if budget is not None:
@@ -135,11 +119,13 @@ def _rounds_until_stop(
         elif reason is None and number == len(rngs):
             reason = f"the limit of {number} rounds is reached"
         elif reason is None and following is not None and affordable is None:
-            reason = f"the budget of {budget.exhausted_part(following.plan)} is spent"
+            first = next((rows for rows in following.plan.rows_by_scan() if rows.size), ())
+            reason = f"the budget of {'readings' if len(first) > budget.readings else 'minutes'} is spent"
         yield Round(number, recordings[-1], in_words, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:
             return
-        budget = budget.minus(affordable, over_s)
+        minutes = max(budget.minutes - _minutes_of_plan(affordable, over_s), 0.0)
+        budget = Budget(max(budget.readings - len(affordable), 0), minutes)
         plan, in_words = affordable, following.description
         if affordable is not following.plan:
             in_words = f"{in_words.rstrip('.')}; the budget allows {len(affordable)} of {len(following.plan)} readings"
@@ -157,12 +143,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("readings", "minutes"):
-            if not checked_number(name, getattr(self, name)) >= 0:
-                raise ParameterError(name, getattr(self, name), "0 or more")
-
-    def minus(self, plan: Plan, after_s: float) -> Budget:
-        """Return the budget without the cost of a plan, at least 0; minutes count from time `after_s` to its end."""
-        return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes_of_plan(plan, after_s), 0.0))
+            require(checked_number(name, getattr(self, name)) >= 0, name, getattr(self, name), "0 or more")
 
     def affordable_scans(self, plan: Plan, after_s: float) -> Plan | None:
         """Return the plan's first scans that fit the budget, in minutes from the time `after_s`; None if none does."""
@@ -175,11 +156,6 @@ class Budget:
         if len(kept) == len(plan):
             return plan
         return plan.take(kept) if kept.size else None
-
-    def exhausted_part(self, plan: Plan) -> str:
-        """Return which part of the budget a plan's first scan exceeds: "readings", otherwise "minutes"."""
-        first = next((rows for rows in plan.rows_by_scan() if rows.size), ())
-        return "readings" if len(first) > self.readings else "minutes"
 
 
 def _minutes_of_plan(plan: Plan, after_s: float) -> float:
@@ -259,26 +235,25 @@ _KEPT_AGAIN_S = 0.5  # an arm takes longer per reading, so that none of its read
 class RoundsFolder:
     """The folder of one investigation: plan and readings of each round; made with the first round.
 
-    `settings`, as JSON takes them, determine the investigation. Raises FileError if the folder holds an investigation
-    and `resume` is False, or holds none, or one with other settings, and `resume` is True.
+    `settings`, as JSON takes them, determine the investigation. FileError if the folder holds an investigation and
+    `resume` is False, or holds none, or one with other settings, and `resume` is True.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
         self.path = path
-        file, wanted = path / _SETTINGS, dict(settings)
-        if resume:
-            if not file.exists():
-                raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")
-            before = parse_json_file_text(file, read_text(file, _ALLOWED), _ALLOWED)
-            if not isinstance(before, dict):
-                raise FileError(file, "no JSON object", _ALLOWED)
-            for name, value in wanted.items():
-                if before.get(name) != value:
-                    had = f"an investigation with {name} {before.get(name)!r}"
-                    raise FileError(file, had, f"{value!r}, as asked now")
-        elif file.exists():
+        file, self._settings = path / _SETTINGS, dict(settings)
+        if not resume and file.exists():
             raise FileError(file, "an investigation is in this folder", "--resume to continue it, or another --out")
-        self._settings = wanted
+        if not resume:
+            return
+        if not file.exists():
+            raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")
+        before = parse_json_file_text(file, read_text(file, _ALLOWED), _ALLOWED)
+        if not isinstance(before, dict):
+            raise FileError(file, "no JSON object", _ALLOWED)
+        for name, value in self._settings.items():
+            if before.get(name) != value:
+                raise FileError(file, f"an investigation with {name} {before.get(name)!r}", f"{value!r}, as asked now")
 
     def record_round(
         self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent
@@ -291,9 +266,8 @@ class RoundsFolder:
         if not planned.exists():
             self.path.mkdir(parents=True, exist_ok=True)
             if not (self.path / _SETTINGS).exists():
-                write_text_atomically(
-                    self.path / _SETTINGS, json.dumps(self._settings, indent=1, allow_nan=False) + "\n"
-                )
+                text = json.dumps(self._settings, indent=1, allow_nan=False) + "\n"
+                write_text_atomically(self.path / _SETTINGS, text)
             write_plan(plan, planned)
         plan = read_plan(planned)
         readings = readings_of_recording(read_recording(readings_file)) if readings_file.exists() else []
@@ -331,10 +305,7 @@ _LARGEST = 1e9  # largest magnitude of a parameter of an effect
 
 @dataclass(frozen=True)
 class SimulatedRecorder:
-    """A `Take` function (for `RoundsFolder`) that simulates a round's plan in a world.
-
-    The noise of a round follows from the seed and the round's number.
-    """
+    """A `Take` function that simulates a plan in a world, with noise by the seed and the round's number."""
 
     world: World
     seed: int
@@ -342,38 +313,30 @@ class SimulatedRecorder:
     def __call__(self, number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
         """Yield the readings of a round's plan after those already taken."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        recording = self.world.simulate(plan, rng=rng)
-        yield from readings_of_recording(recording)[len(taken) :]
+        yield from readings_of_recording(self.world.simulate(plan, rng=rng))[len(taken) :]
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:
     """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing" for none.
 
-    Raises ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
+    ParameterError if an effect is unknown, or its values are too few, too many, or no numbers up to 1e9.
     """
     return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 
 
 def _parse_one_effect(text: str) -> Concealed:
     name, _, numbers = text.partition(":")
-    kinds = {own: kind for own, kind in KINDS.items() if _is_of_numbers(kind)}
+    names_of = {own: inspect.signature(kind).parameters for own, kind in KINDS.items()}
+    kinds = {own for own, taken in names_of.items() if {each.annotation for each in taken.values()} == {"float"}}
     if name not in kinds:
-        meant = did_you_mean(name, kinds)
-        raise ParameterError(
-            "--truth", name, f"{NOTHING}, or an effect of probewise.world.concealed with its values{meant}"
-        )
-    kind = kinds[name]
-    wanted = ",".join(inspect.signature(kind).parameters)
-    allowed = f"{name}:{wanted}, all of them numbers of magnitude up to {_LARGEST:g}"
+        allowed = f"{NOTHING}, or an effect of probewise.world.concealed with its values{did_you_mean(name, kinds)}"
+        raise ParameterError("--truth", name, allowed)
+    allowed = f"{name}:{','.join(names_of[name])}, all of them numbers of magnitude up to {_LARGEST:g}"
     try:
         values = [float(number) for number in numbers.split(",")]
-        effect: Concealed = kind(*values)
+        effect: Concealed = KINDS[name](*values)
     except (TypeError, ValueError) as error:
         raise ParameterError("--truth", text, allowed) from error
     if not all(abs(value) <= _LARGEST for value in values):  # nor NaN
         raise ParameterError("--truth", text, allowed)
     return effect
-
-
-def _is_of_numbers(kind: Callable[..., Concealed]) -> bool:
-    return {parameter.annotation for parameter in inspect.signature(kind).parameters.values()} == {"float"}

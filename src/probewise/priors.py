@@ -18,17 +18,7 @@ from probewise._arrays import FloatArray, floats
 from probewise._kinds import checked_number, require_kind, require_like
 from probewise.errors import ParameterError, ShapeError, require
 
-__all__ = [
-    "Joint",
-    "LogNormal",
-    "LogUniform",
-    "Marginal",
-    "Normal",
-    "Prior",
-    "Product",
-    "Uniform",
-    "require_prior",
-]
+__all__ = ["Joint", "LogNormal", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform", "require_prior"]
 
 
 @runtime_checkable
@@ -38,19 +28,15 @@ class Prior(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the columns of theta."""
-        ...
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map points of the unit cube, (n_samples, n_params), to parameters of that shape: uniform draws to draws."""
-        ...
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map parameters (n_samples, n_params) to points of the unit cube that `from_unit_cube` maps back to them."""
-        ...
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the natural log of the density, shape (n_samples,); -inf outside the support."""
-        ...
 
 
 class Coordinates(Protocol):
@@ -62,14 +48,12 @@ class Coordinates(Protocol):
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters of positive prior density to coordinates, both (n_samples, n_params)."""
-        ...
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates (n_samples, n_params) to parameters; also return the prior's log density in the coordinates.
 
         Any finite coordinates are allowed; the density, (n_samples,), is -inf where they match no parameters.
         """
-        ...
 
 
 @runtime_checkable
@@ -78,15 +62,12 @@ class Marginal(Protocol):
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Evaluate the quantile function: probability in 0..1 -> value; 0 and 1 map to the ends, infinite or not."""
-        ...
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, the inverse of `from_unit`: value -> probability."""
-        ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape; -inf outside the support."""
-        ...
 
 
 def _require_arguments(marginal: Any, kind: type[Any], holds: Callable[..., bool], allowed: str) -> None:
@@ -135,8 +116,7 @@ class LogUniform:
         return np.asarray(self.low * (self.high / self.low) ** u)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        within = np.clip(value, self.low, self.high)
-        return np.asarray(np.log(within / self.low) / math.log(self.high / self.low))
+        return np.asarray(np.log(np.clip(value, self.low, self.high) / self.low) / math.log(self.high / self.low))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         inside = (value >= self.low) & (value <= self.high)
@@ -220,21 +200,19 @@ class Product:
         return tuple(self.marginals)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        u = checked_columns(u, self.names)
-        columns = [m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())]
-        return np.stack(columns, axis=-1) if columns else u
+        return self._mapped(u, "from_unit")
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        theta = checked_columns(theta, self.names)
-        columns = [m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())]
-        return np.stack(columns, axis=-1) if columns else theta
+        return self._mapped(theta, "to_unit")
+
+    def _mapped(self, values: FloatArray, method: str) -> FloatArray:
+        values = checked_columns(values, self.names)
+        columns = [getattr(m, method)(values[:, i]) for i, m in enumerate(self.marginals.values())]
+        return np.stack(columns, axis=-1) if columns else values
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         theta = checked_columns(theta, self.names)
-        total = np.zeros(len(theta))
-        for i, marginal in enumerate(self.marginals.values()):
-            total = total + marginal.log_prob(theta[:, i])
-        return total
+        return sum((m.log_prob(theta[:, i]) for i, m in enumerate(self.marginals.values())), np.zeros(len(theta)))
 
 
 @dataclass(frozen=True)
@@ -244,8 +222,7 @@ class Joint:
     parts: tuple[Prior, ...]
 
     def __post_init__(self) -> None:
-        allowed = "priors: Joint((Product({...}), Product({...})))"
-        require_kind("parts", self.parts, (tuple, list), allowed)
+        require_kind("parts", self.parts, (tuple, list), "priors: Joint((Product({...}), Product({...})))")
         for k, part in enumerate(self.parts):
             require_prior(f"parts[{k}]", part)
         object.__setattr__(self, "parts", tuple(self.parts))
@@ -255,24 +232,19 @@ class Joint:
         return tuple(name for part in self.parts for name in part.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        u = checked_columns(u, self.names)
         columns = [p.from_unit_cube(c) for p, c in self._parts_with_columns(u)]
-        return np.concatenate(columns, axis=-1) if columns else u
+        return np.concatenate([np.empty((len(u), 0)), *columns], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        theta = checked_columns(theta, self.names)
         columns = [p.to_unit_cube(c) for p, c in self._parts_with_columns(theta)]
-        return np.concatenate(columns, axis=-1) if columns else theta
+        return np.concatenate([np.empty((len(theta), 0)), *columns], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        theta = checked_columns(theta, self.names)
-        total = np.zeros(len(theta))
-        for part, columns in self._parts_with_columns(theta):
-            total = total + part.log_prob(columns)
-        return total
+        return sum((part.log_prob(c) for part, c in self._parts_with_columns(theta)), np.zeros(len(theta)))
 
     def _parts_with_columns(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
         """Return pairs of a part and its columns, (n_samples, n_params of the part)."""
+        columns = checked_columns(columns, self.names)
         ends = np.cumsum([len(p.names) for p in self.parts])
         return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]
 
@@ -308,9 +280,8 @@ SMALLEST_AND_LARGEST = (0.05, 25.0)
 class HeavyTailedPrior:
     """Scale mixture of normal distributions about zero, by default with sds from 0.05 to 25 times a typical size.
 
-    The weights are equal, so the density falls about as 1/abs(x) between the smallest and the largest sd and is
-    proper. With `positive` the distribution is folded onto x >= 0. `smallest` and `largest` are the smallest and the
-    largest sd, in typical sizes.
+    The weights are equal, so the density falls about as 1/abs(x) between the sds `smallest` and `largest`, in typical
+    sizes, and is proper. With `positive` the distribution is folded onto x >= 0.
     """
 
     typical: float
@@ -409,14 +380,12 @@ class LogHeavyTailedPrior:
 
 @dataclass(frozen=True)
 class SharedScalePrior:
-    """Values that are normal about zero with the same sd, log-uniform over the sds of `each`.
+    """Values that are normal about zero with the same sd, log-uniform over the sds of `each`; `names` are two or more.
 
-    Independent heavy-tailed priors ask of every value anew how large it is. Where one has told, here the others are
-    expected to be as large. The distribution depends on the root of the sum of squares alone, so that standard-normal
-    coordinates have the direction of the values, and their length is that of equal probability.
-
-    `names`: names of the values, two or more; `each`: the prior of one value, about: a heavy-tailed prior with sds over
-    the same range.
+    Independent heavy-tailed priors, such as `each`, of one value, leave the size of every value open. Where one is
+    known, here the others are expected to be as large. The distribution depends on the root of the sum of squares
+    alone, so that standard-normal coordinates have the direction of the values, and their length is that of equal
+    probability.
     """
 
     names: tuple[str, ...]
@@ -432,19 +401,17 @@ class SharedScalePrior:
         """Sds of the normal distributions of equal weight that it mixes, (n_components,)."""
         return self.typical * _sds(len(self.names), self.each.smallest, self.each.largest)
 
-    @cached_property
-    def _radii(self) -> _Radii:
-        return _tabulated_radii(len(self.names), self.each.smallest, self.each.largest)
+    @property
+    def _ratios(self) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
+        return _ratios_of_lengths(len(self.names), self.each.smallest, self.each.largest)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         z = ndtri(np.clip(checked_columns(u, self.names), _FARTHEST_SD, 1 - _FARTHEST_SD))
-        length = np.linalg.norm(z, axis=1, keepdims=True)
-        return np.asarray(self.typical * z * self._radii.ratio(length))
+        return np.asarray(self.typical * z * self._ratios[0](np.linalg.norm(z, axis=1, keepdims=True)))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         values = checked_columns(theta, self.names) / self.typical
-        size = np.linalg.norm(values, axis=1, keepdims=True)
-        return np.asarray(ndtr(values / self._radii.ratio_at_size(size)))
+        return np.asarray(ndtr(values / self._ratios[1](np.linalg.norm(values, axis=1, keepdims=True))))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         values = checked_columns(theta, self.names)
@@ -454,35 +421,6 @@ class SharedScalePrior:
         return np.asarray(logsumexp(terms, axis=1) - math.log(len(sds)) - 0.5 * n * math.log(2 * math.pi))
 
 
-@dataclass(frozen=True, eq=False)
-class _Radii:
-    """Lengths of standard-normal vectors and of vectors of values (typical size one), with the same probability.
-
-    Both are increasing, (n_sizes,), and their logarithms rise alike beyond the ends.
-    """
-
-    normal: FloatArray
-    values: FloatArray
-
-    @cached_property
-    def _splines(self) -> tuple[Any, Any]:
-        """The logarithm of either as a function of that of the other: of `normal`, then of `values`."""
-        from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
-
-        normal, values = np.log(self.normal), np.log(self.values)
-        return CubicSpline(normal, values), CubicSpline(values, normal)
-
-    def ratio(self, length: FloatArray) -> FloatArray:
-        """Return values per standard-normal coordinate at a length of the latter, in its shape."""
-        at = np.log(np.clip(length, self.normal[0], self.normal[-1]))
-        return np.asarray(np.exp(self._splines[0](at) - at))
-
-    def ratio_at_size(self, size: FloatArray) -> FloatArray:
-        """Return values per standard-normal coordinate at a length of the values, in its shape."""
-        at = np.log(np.clip(size, self.values[0], self.values[-1]))
-        return np.asarray(np.exp(at - self._splines[1](at)))
-
-
 def _sds(n_values: int, smallest: float, largest: float) -> FloatArray:
     """Return sds, evenly spaced in their logarithm, so close that lengths of vectors of neighbouring ones overlap."""
     spread_of_log_length = 1 / math.sqrt(2 * n_values)
@@ -490,7 +428,16 @@ def _sds(n_values: int, smallest: float, largest: float) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def _tabulated_radii(n_values: int, smallest: float, largest: float) -> _Radii:
+def _ratios_of_lengths(
+    n_values: int, smallest: float, largest: float
+) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
+    """Return functions of lengths of standard-normal vectors and of vectors of values (typical size one), any shape.
+
+    Both give values per standard-normal coordinate at lengths of the same probability; their logarithms rise alike, and
+    the ratios beyond the ends of the table are those at the ends.
+    """
+    from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
+
     sds, half = _sds(n_values, smallest, largest), 0.5 * n_values
     near, far = (math.sqrt(2 * inverse(half, _LEAST_TAIL)) for inverse in (gammaincinv, gammainccinv))
     values = np.geomspace(sds[0] * max(near, 1e-6), sds[-1] * far, _N_SIZES)
@@ -500,4 +447,15 @@ def _tabulated_radii(n_values: int, smallest: float, largest: float) -> _Radii:
     lower = gammaincinv(half, np.where(near_zero, below, 0.5))
     normal = np.sqrt(2 * np.where(near_zero, lower, gammainccinv(half, np.where(near_zero, 0.5, above))))
     kept = (below > _LEAST_TAIL) & (above > _LEAST_TAIL) & (np.diff(normal, prepend=0.0) > 0)
-    return _Radii(normal[kept], values[kept])
+    normal, values = normal[kept], values[kept]
+    to_values, to_normal = (CubicSpline(np.log(x), np.log(y)) for x, y in ((normal, values), (values, normal)))
+
+    def at_length(length: FloatArray) -> FloatArray:
+        at = np.log(np.clip(length, normal[0], normal[-1]))
+        return np.asarray(np.exp(to_values(at) - at))
+
+    def at_size(size: FloatArray) -> FloatArray:
+        at = np.log(np.clip(size, values[0], values[-1]))
+        return np.asarray(np.exp(at - to_normal(at)))
+
+    return at_length, at_size

@@ -9,7 +9,6 @@ import pytest
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import (
     MarksDisagreeError,
-    TouchedMark,
     fit_geometry,
     read_turns_and_places,
     spread_mark_places,
@@ -151,11 +150,11 @@ def test_a_number_that_cannot_be_replaced_in_its_file_is_refused(line, instead, 
 
 
 def test_marks_come_back_from_their_file(tmp_path):
-    marks = [TouchedMark((0.1, -0.2, 0.3), (100.0, 60.0, 32.0)), TouchedMark((0.4, 0.5, -0.6), (520.0, 60.0, math.nan))]
+    marks = [[0.1, -0.2, 0.3, 100.0, 60.0, 32.0], [0.4, 0.5, -0.6, 520.0, 60.0, math.nan]]
     write_marks(marks, tmp_path / "m.csv")
     turned, places = read_turns_and_places(tmp_path / "m.csv")
-    np.testing.assert_allclose(turned, [mark.turned_rad for mark in marks], atol=1e-6)
-    np.testing.assert_array_equal(places, [mark.place_mm for mark in marks])
+    np.testing.assert_allclose(turned, [mark[:3] for mark in marks], atol=1e-6)
+    np.testing.assert_array_equal(places, [mark[3:] for mark in marks])
     (tmp_path / "m.csv").write_text("x_mm,y_mm\n1,2\n")
     with pytest.raises(FileError, match="base_turned_deg"):
         read_turns_and_places(tmp_path / "m.csv")

@@ -11,13 +11,13 @@ from probewise.arm.nxt import telegram as t
 from probewise.arm.nxt.telegram import MEANINGS
 from probewise.errors import ParameterError
 
-LED_ON, LED_OFF = t.SensorType.LIGHT_ACTIVE, t.SensorType.LIGHT_INACTIVE
+LED_ON, LED_OFF = t.LED_ON, t.LED_OFF
 
 # Command, whether it wants an answer, the frame sent (length first), the frame that comes back, what that says.
 VECTORS = [
     (t.SetInputMode(1, LED_ON, 0x80), False, "05 00 80 05 01 05 80", None, None),
     (t.SetInputMode(1, LED_ON, 0x80), True, "05 00 00 05 01 05 80", "03 00 02 05 00", None),
-    (t.SetInputMode(1, LED_OFF, t.SensorMode.RAW), False, "05 00 80 05 01 06 00", None, None),
+    (t.SetInputMode(1, LED_OFF, t.RAW), False, "05 00 80 05 01 06 00", None, None),
     (
         t.GetInputValues(1),
         True,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from probewise._signals import Stopped
 from probewise._writing import Drawings, NotDrawnError
-from probewise.cli import demo, main
+from probewise.cli import _demo, main
 from probewise.proof import concealed_study
 from probewise.report.html import figure
 from probewise.systems import run_table_csv
@@ -57,9 +57,10 @@ class InThisProcess(Executor):
 @pytest.fixture
 def short_demo(monkeypatch):
     """A demo of few readings, and a study of few concealed effects."""
-    monkeypatch.setattr("probewise.cli._executor.worker_pool", lambda n: InThisProcess())
+    for module in ("_executor", "_demo"):
+        monkeypatch.setattr(f"probewise.cli.{module}.worker_pool", lambda n: InThisProcess())
     for name, n in (("N_LIVE", 80), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
-        monkeypatch.setattr(demo, name, n)
+        monkeypatch.setattr(_demo, name, n)
     few = partial(concealed_study.concealed_study, effects=("backlash", "saturation"))
     monkeypatch.setattr(concealed_study, "concealed_study", few)
 

@@ -13,7 +13,7 @@ from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main, parser
 from probewise.cli._bench import InstrumentWithCallbacks
-from probewise.cli._explore import read_checked_inputs
+from probewise.cli._explore import Run
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -102,7 +102,7 @@ def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept
 @pytest.mark.usefixtures("at_14_mm")
 def test_the_lego_arms_own_height_may_be_named(sensor_file, tmp_path):
     words = ("explore", "--sensor", sensor_file, "--out", tmp_path, "--heights", "14", "--arm", "nxt:/dev/null")
-    assert read_checked_inputs(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
+    assert Run(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
 
 
 def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behind(sensor_file, tmp_path, capsys):

@@ -100,9 +100,9 @@ def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     with arm:
         met = bring_to_mark(arm, (520.0, 260.0), 32.0, lambda: next(answers), said.append)
     homes = np.array([joint.home_rad for joint in geometry.joints])
-    x, y, height = geometry.position_mm((np.array(met.turned_rad) + homes)[None, :])[0]
+    x, y, height = geometry.position_mm((np.array(met[:3]) + homes)[None, :])[0]
     assert (x, y, height) == pytest.approx((524, 258, 60 - 5 + 3), abs=1.0)
-    assert met.place_mm == (520.0, 260.0, 32.0)
+    assert met[3:] == [520.0, 260.0, 32.0]
     assert any("'sideways' says nothing" in text for text in said)
     assert any("8 mm or more" in text for text in said)  # the guard refused 55 mm down
 

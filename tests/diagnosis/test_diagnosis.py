@@ -47,7 +47,7 @@ def test_the_field_of_a_next_plan_is_described_as_it_is_believed_to_be():
     known = {"field": Uniform(0.0), "card": Uniform(0.5)}
     plan = Plan.from_arrays(x_mm=[0.0, 5.0], y_mm=0.0, pattern=["field", "card"], patterns=known, unit="V")
     plan = replace(plan, patterns={"card": Uniform(0.5)})
-    asked = NextMeasurement(plan, "read again", 1.0, 9.0, ("a", "b"), ((), ("lag",)), np.full(2, 0.5), np.eye(2))
+    asked = NextMeasurement(plan, "read again", 1.0, 9.0, ("a", "b"), ((), ("lag",)), np.eye(2))
     names = ("sd", "x_mm", "y_mm", "radius_mm")
     model = SimpleNamespace(chain=SimpleNamespace(names=names), theta=np.array([[1.0, 90.0, 40.0, 50.0]] * 3))
     diagnosis = replace(FOUND, repaired=model, next_measurement=asked)

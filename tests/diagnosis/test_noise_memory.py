@@ -12,7 +12,13 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.held_out import predictive_log_densities
-from probewise.diagnosis.noise import NoiseLaw, innovations_given_rest, walk_given_readings, with_known_wide_readings
+from probewise.diagnosis.noise import (
+    NoiseLaw,
+    innovations_given_rest,
+    walk_given_readings,
+    whiten_under_each,
+    with_known_wide_readings,
+)
 
 _N = 40
 
@@ -134,7 +140,7 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
     for case in range(8):
         law = replace(_law(share, times, step), lost=lost if case % 2 else np.zeros(N, dtype=bool))
         residuals = 0.3 * _draw(law, rng)
-        known = with_known_wide_readings(law, residuals)
+        known = with_known_wide_readings([law], residuals)[0]
         whitened = known(residuals)[:, None]
         sigma = known.likeliest_sigma(whitened)
         log_density = -float(known.minus_log_likelihood(whitened, sigma)[0]) - 0.5 * known.n_kept * math.log(
@@ -145,9 +151,28 @@ def test_the_evidence_is_the_sum_over_all_sets_of_wide_readings(share, times, st
         np.testing.assert_allclose(known.wide, wide, atol=0.05)
 
 
+def test_many_distributions_are_worked_out_together_as_each_alone():
+    """Those of a tail beside a walk, which settle after different numbers of rounds, and whitening by each."""
+    rng = np.random.default_rng(6)
+    sd, lost = rng.uniform(0.5, 2.0, _N), np.arange(_N) == 4
+    walked = np.cumsum(rng.normal(size=_N)) + sd * rng.normal(size=_N) * np.where(np.arange(_N) % 9 == 0, 15.0, 1.0)
+    laws = [_law(share, times, step, sd) for share in (0.01, 0.2) for times in (3.0, 30.0) for step in (0.1, 1.0)]
+    laws += [replace(law, lost=lost) for law in laws]
+    together = with_known_wide_readings(laws, walked)
+    for law, own in zip(laws, together, strict=True):
+        (alone,) = with_known_wide_readings([law], walked)
+        np.testing.assert_array_equal(own.wide, alone.wide)
+        np.testing.assert_array_equal(own.sd, alone.sd)
+        assert own.log_extra == alone.log_extra
+    columns = rng.normal(size=(_N, 3))
+    ar = [_laws()[name][0] for name in ("ar", "white")]
+    for some in (together[:8], together, ar, [_laws()["ar in two runs"][0], ar[1]]):
+        np.testing.assert_array_equal(whiten_under_each(some, columns), [law(columns) for law in some])
+
+
 @pytest.mark.parametrize("far", [1e200, np.inf, np.nan])
 def test_predictions_that_ran_away_are_no_error(far):
-    law = with_known_wide_readings(_law(0.05, 10.0, 0.5), np.full(N, far))
+    law = with_known_wide_readings([_law(0.05, 10.0, 0.5)], np.full(N, far))[0]
     assert law.whitened_density.is_normal
 
 
@@ -157,7 +182,7 @@ def test_a_held_out_reading_is_wide_or_narrow_by_prior_not_by_what_it_reads():
     law = _law(0.05, 20.0, 0.6)
     residuals = np.cumsum(0.6 * rng.normal(size=N)) + law.sd * rng.normal(size=N)
     residuals[5] += 30.0
-    known = with_known_wide_readings(law, residuals)
+    known = with_known_wide_readings([law], residuals)[0]
     out = np.arange(N) == 5
     slopes = np.zeros((N, 1))
     own = predictive_log_densities(known, out, residuals, slopes, np.zeros(1), np.eye(1), 1.0)

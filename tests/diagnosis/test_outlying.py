@@ -14,7 +14,7 @@ from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Fit, Model, fit
 from probewise.diagnosis.held_out import held_out_gain
-from probewise.diagnosis.locate import Covariate, significant_places, window_columns_and_bounds
+from probewise.diagnosis.locate import Covariate, significant_places, window_columns
 from probewise.diagnosis.noise import NoiseLaw, white_noise
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.recordings import Recording, paper_plan
@@ -92,7 +92,7 @@ def test_the_evidence_is_that_of_two_beta_binomials_against_one():
     """Of given numbers in and out of a window, the order within each being even."""
     far_out = np.zeros(N_OF_OUTLYING)
     far_out[[3, 5, 8, 70]] = 1.0
-    columns, _ = window_columns_and_bounds(PLACE, N_OF_OUTLYING)
+    columns, _ = window_columns(PLACE, N_OF_OUTLYING)
     one = betabinom(N_OF_OUTLYING, 0.5, 0.5).logpmf(4) - np.log(_choose(N_OF_OUTLYING, 4))
     expected = []
     for column in columns.T:

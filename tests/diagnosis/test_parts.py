@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +18,9 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
-from probewise.diagnosis.sensors import default_sensor, sensor_from_posterior, theta_to_natural, with_free_form
+from probewise.diagnosis.sensors import default_sensor, sensor_from_samples, theta_to_natural, with_free_form
 from probewise.diagnosis.templates import EffectTemplates, TemplateBank, log_bayes_factors_of_pairs, templates_of_effect
-from probewise.diagnosis.verdict import Hypothesis, credible_labels, verdict_and_combination
+from probewise.diagnosis.verdict import Hypothesis, Judged, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
 from probewise.effects.reference import candidate_scan_groups
@@ -80,11 +81,11 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
     theta = sensor.theta(0.02 * rng.normal(size=(4000, sensor.n_params)))
     names = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max", "backlash.width_mm")
     theta = np.concatenate([theta, np.ones((4000, 1))], axis=1)
-    prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
+    prior = sensor_from_samples(SimpleNamespace(names=names, samples=theta))
     drawn = prior.theta(rng.normal(size=(4000, 7)))
     np.testing.assert_allclose(drawn[:, 1:].std(axis=0), theta[:, 1:8].std(axis=0), rtol=0.06)
     with pytest.raises(ParameterError, match=r"sensor\.names"):
-        sensor_from_posterior(("x",), np.zeros(1), np.eye(1))
+        sensor_from_samples(SimpleNamespace(names=("x",), samples=np.zeros((2, 1))))
 
 
 def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
@@ -94,7 +95,7 @@ def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     theta = free.theta(z)
     np.testing.assert_allclose(free.z(theta), z, atol=1e-8)
     names = (*mixture_parameter_names(free.n_gaussians), "I_min", "I_max")
-    prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
+    prior = sensor_from_samples(SimpleNamespace(names=names, samples=theta))
     assert prior.is_free_form
     drawn = prior.theta(rng.normal(size=(4000, free.n_params)))
     spread = theta.std(axis=0)
@@ -457,4 +458,4 @@ def test_verdicts_follow_the_probabilities(probability, verdict, combination):
 
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():
     found = hypotheses(clean=0.02, backlash=0.7, backlash__lag=0.26, glint=0.02)
-    assert credible_labels(found) == ("backlash", "backlash+lag")
+    assert Judged("named", ("backlash",), 0.0, found).credible == ("backlash", "backlash+lag")

@@ -9,10 +9,10 @@ import pytest
 
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.posterior import (
-    QuadraticPredictions,
     draw_by_annealing,
     importance_resample,
     log_likelihood_marginal_over_sigma,
+    quadratic_predictions,
     surrogate_log_density,
 )
 
@@ -91,7 +91,8 @@ def curve(z):
 
 
 def predicted(quadratic, e):
-    return quadratic.center + quadratic.change_coefficients(e) @ quadratic.changes
+    center, coefficients, changes = quadratic
+    return center + coefficients(e) @ changes
 
 
 CARRY = np.where(np.arange(40) % 20 > 0, 0.4, 0.0)
@@ -121,26 +122,26 @@ def test_what_is_quadratic_is_met_everywhere():
         return 2.0 + e @ slopes + np.einsum("ni,nj,ijk->nk", e, e, bends)
 
     e = rng.standard_normal((50, 3))
-    np.testing.assert_allclose(predicted(QuadraticPredictions.of(predict, 3, 1e-9), e), predict(e), atol=1e-8)
+    np.testing.assert_allclose(predicted(quadratic_predictions(predict, 3, 1e-9), e), predict(e), atol=1e-8)
 
 
 @pytest.mark.parametrize("sd", [0.01, 1.0])
 def test_what_makes_no_difference_is_left_out(sd):
     """All readings together, what is left out is less than a fiftieth of the noise for each of the nine terms."""
-    full, thin = QuadraticPredictions.of(about_the_center, 3, 1e-9), QuadraticPredictions.of(about_the_center, 3, sd)
-    assert thin.changes.shape[0] < full.changes.shape[0] <= 9
+    full, thin = quadratic_predictions(about_the_center, 3, 1e-9), quadratic_predictions(about_the_center, 3, sd)
+    assert len(thin[2]) < len(full[2]) <= 9
     one = np.eye(3)
     assert np.linalg.norm(predicted(full, one) - predicted(thin, one), axis=1).max() < 9 * 0.02 * sd
 
 
 def test_the_density_is_that_of_its_predictions():
     """Route two: readings predicted one by one and whitened; it looks at a few sums alone."""
-    quadratic, readings = QuadraticPredictions.of(about_the_center, 3, 1e-9), noisy(0.05)
+    quadratic, readings = quadratic_predictions(about_the_center, 3, 1e-9), noisy(0.05)
     e = np.random.default_rng(5).standard_normal((30, 3))
     z = CENTER + e @ STEPS
     residuals = (readings - predicted(quadratic, e)).T
     expected = log_likelihood_marginal_over_sigma(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
-    near = surrogate_log_density(quadratic, CENTER, STEPS, readings, LAW)
+    near = surrogate_log_density(curve, CENTER, STEPS, readings, LAW, 1e-9)
     np.testing.assert_allclose(near(e), expected, rtol=1e-9)
     assert near(np.full((1, 3), 100.0))[0] == -np.inf
 
@@ -149,11 +150,11 @@ def test_under_a_tail_the_density_falls_off_as_it_should():
     """By the mean of the true fall over the noise: one reading's says little, and thousands differ by chance."""
     tailed = dataclasses.replace(LAW, share=0.1, times=5.0)
     e = 0.3 * np.random.default_rng(6).standard_normal((20, 3))
-    quadratic = QuadraticPredictions.of(about_the_center, 3, 1e-9)
+    quadratic = quadratic_predictions(about_the_center, 3, 1e-9)
     falls = []
     for seed in range(60):
         readings = noisy(0.1, seed, tailed)
-        near = surrogate_log_density(quadratic, CENTER, STEPS, readings, tailed)
+        near = surrogate_log_density(curve, CENTER, STEPS, readings, tailed, 1e-9)
         true = [
             log_likelihood_marginal_over_sigma(tailed, tailed((readings - predicted(quadratic, at)).T))
             for at in (e, np.zeros((1, 3)))

@@ -17,7 +17,7 @@ import pytest
 from arm_faults import SENSOR
 
 from probewise.arm.nxt import Brick
-from probewise.arm.nxt.telegram import GetInputValues, GetOutputState, RunState, SensorType
+from probewise.arm.nxt.telegram import IDLE, NO_SENSOR, GetInputValues, GetOutputState
 from probewise.calibration import write_sensor
 
 pytestmark = [
@@ -88,9 +88,9 @@ def test_nothing_stays_on_whatever_stops_which_command_when(
         motors = [brick.link.ask(GetOutputState(port)) for port in range(3)]
         lights = [brick.link.ask(GetInputValues(port)) for port in range(4)]
         brick.link.close()
-        assert [(motor.power, motor.run_state) for motor in motors] == [(0, RunState.IDLE)] * 3
+        assert [(motor.power, motor.run_state) for motor in motors] == [(0, IDLE)] * 3
         assert not any(motor.mode for motor in motors)  # neither braked nor held
-        assert [light.type for light in lights] == [SensorType.NONE] * 4
+        assert [light.type for light in lights] == [NO_SENSOR] * 4
         assert took_s < PROMPT_S
 
 

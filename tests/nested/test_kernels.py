@@ -16,7 +16,7 @@ def cloud(n=300, seed=0):
 
 def test_the_density_of_kernels_is_the_sum_of_their_gaussians():
     """scipy's multivariate normal about every centre, half of the weight at a third of the width; up to a constant."""
-    kernels = Kernels.at_points(cloud(40), rng=np.random.default_rng(1))
+    kernels = Kernels(cloud(40), rng=np.random.default_rng(1))
     points = kernels.draw(200, rng=np.random.default_rng(2))
     centres = kernels.mean + kernels.centre_rows @ kernels.root.T
     metric = kernels.root @ kernels.root.T * kernels.width**2
@@ -32,7 +32,7 @@ def test_the_density_of_kernels_is_the_sum_of_their_gaussians():
 
 
 def test_far_points_do_not_underflow():
-    kernels = Kernels.at_points(cloud(), rng=np.random.default_rng(3))
+    kernels = Kernels(cloud(), rng=np.random.default_rng(3))
     far = kernels.log_density(np.array([[40.0, -30.0], [4000.0, 0.0]]))
     assert np.isfinite(far).all()
     assert far[1] < far[0] < -100

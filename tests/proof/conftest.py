@@ -1,5 +1,6 @@
-"""Results of cases made by hand: what `run_case` returns, with all said rightly unless a test says otherwise."""
+"""Results made by hand: of cases, with all said rightly unless a test says otherwise, and of runs of a study."""
 
+import numpy as np
 import pytest
 
 
@@ -47,6 +48,38 @@ def case(kind="clean", size=0.0, *, truth=(), hides=(), said=None, p=0.97, **oth
     }
 
 
+def system_case(kind="clean", size=0.0, *, truth=(), gains=(40.0, 40.0), **others):
+    """Return a case of a system, with gains in nats over the null, of the repaired and of the right model."""
+    repaired, right = (-100.0 + gain / 2 for gain in gains)
+    run = {"null": -100.0, "repaired": repaired, "right": right, "true": right}
+    of_system = {"system": "tank", "law": True, "formula": False, "held_out": {"inside": run, "beyond": dict(run)}}
+    hypotheses = {"hypotheses": [[list(others.get("said", truth)), others.get("p", 0.97)], [["lag"], 0.03]]}
+    return case(kind, size, truth=truth, **(of_system | hypotheses | others))
+
+
+def system_single(name="offset_drift", size=12.0, *, hide=None, **others):
+    return system_case("single", size, truth=[name], hides=[hide or hidden(name, size, cosines={})], **others)
+
+
+def search(readings=3, *, reached=True, **others):
+    """Return a run of a study."""
+    return {
+        "reached": reached,
+        "readings": readings,
+        "error_mm": 1.0,
+        "chance_wrong": 1e-4,
+        "held": [True, True, True],
+        "first_white": 2,
+        "bits": 22.0,
+        "bits_at_white": 9.0,
+        "arm_s": 4.0 * readings,
+        "cpu_s": 0.2,
+        "widest_mm": np.geomspace(300.0, 3.0, readings).round(2).tolist(),
+        "p_value": 0.4,
+        **others,
+    }
+
+
 def single(name="lag", size=8.0, *, hide=None, **others):
     return case("single", size, truth=[name], hides=[hide or hidden(name, size)], **others)
 
@@ -58,11 +91,11 @@ def outside(size=12.0, *, name="chirp", cosines=None, **others):
 
 @pytest.fixture
 def make():
-    """Return the makers: `make.case`, `make.single`, `make.outside`, `make.hidden`."""
+    """Return the makers by their names, such as `make.case`."""
 
     class Make:
         pass
 
-    for maker in (case, single, outside, hidden):
+    for maker in (case, single, outside, hidden, system_case, system_single, search):
         setattr(Make, maker.__name__, staticmethod(maker))
     return Make

@@ -12,10 +12,16 @@ import pytest
 
 import probewise
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError
-from probewise.proof.campaign import read_campaign, run_campaign
+from probewise.proof.campaign import Campaign, read_campaign
 
 TASKS = {f"task {k}": k for k in range(12)}
 SETTINGS = {"seed": 1, "rows": ["a", "b"]}
+
+
+def run_campaign(work, tasks, *, path, settings, executor=None):
+    """Run a campaign; return its results by key."""
+    found = Campaign(work, tasks, settings).run(path=path, executor=executor)
+    return {key: found[task] for key, task in tasks.items()}
 
 
 def square(k: int) -> dict[str, float]:

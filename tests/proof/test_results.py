@@ -13,9 +13,10 @@ from probewise.proof.configurations import REFERENCE
 from probewise.proof.results import CONCEALED_TRIAL, SENSOR_CASE, TRIAL, misfit, misfit_of_case
 from probewise.proof.trial import Trial
 
+from .conftest import search
+
 RUN = {"readings": 3, "error_mm": 1.0, "chance_wrong": 0.01, "held": [True, True, False]}
-SEARCH = RUN | {"reached": True, "first_white": 2, "bits": 9.0, "bits_at_white": 4.0, "arm_s": 30.0, "cpu_s": 0.1}
-SEARCH |= {"widest_mm": [50.0, 20.0, 3.0], "p_value": None}
+SEARCH = search(3, p_value=None)
 HIDDEN = RUN | {"known": True, "p_truth": 0.9, "credible": ["clean"], "noticed": False, "cpu_s": [0.1, 0.2]}
 
 

@@ -15,26 +15,14 @@ from probewise.proof.study import summaries
 from probewise.proof.trial import Trial
 from probewise.report.html import draw_or_raise
 
+from .conftest import search
+
 ROWS = [REFERENCE, SearchConfiguration(model="naive")]
 
 
 def trial(rng, mean):
     n = int(rng.poisson(mean)) + 2
-    reached = bool(n < 40)
-    return {
-        "reached": reached,
-        "readings": n if reached else 40,
-        "first_white": 2,
-        "bits": 22.0,
-        "bits_at_white": 9.0,
-        "error_mm": float(rng.exponential(1.0)),
-        "chance_wrong": 1e-4,
-        "held": [True, True, True],
-        "arm_s": 4.0 * n,
-        "cpu_s": 0.2,
-        "widest_mm": np.geomspace(300.0, 3.0, n).round(2).tolist(),
-        "p_value": 0.4,
-    }
+    return search(min(n, 40), reached=n < 40, error_mm=float(rng.exponential(1.0)))
 
 
 @pytest.fixture(scope="module")

@@ -66,6 +66,6 @@ def test_the_band_of_chance_is_as_wide_as_each_readings_own_noise():
         repaired=SimpleNamespace(noise_sd=np.array([0.5])),
         null=SimpleNamespace(theta=np.zeros((3, 1)), chain=chain, noise_sd=np.array([0.5])),
     )
-    np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, [0.5, 0.5, 1.0, 3.0])
+    np.testing.assert_allclose(ResidualNoise(diagnosis).sd, [0.5, 0.5, 1.0, 3.0])
     diagnosis.noise.parameters.append(SimpleNamespace(name="step", mean=12**0.5))
-    np.testing.assert_allclose(ResidualNoise.of_diagnosis(diagnosis).sd, np.hypot([0.5, 0.5, 1.0, 3.0], 1.0))
+    np.testing.assert_allclose(ResidualNoise(diagnosis).sd, np.hypot([0.5, 0.5, 1.0, 3.0], 1.0))

@@ -10,7 +10,8 @@ from PIL import Image
 
 import probewise
 from probewise.arm import Pose, SimulatedArm
-from probewise.cli import demo, main
+from probewise.cli import main
+from probewise.cli._demo import diagnose_shipped_recording
 from probewise.errors import ParameterError
 from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
@@ -75,7 +76,7 @@ def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(m
     monkeypatch.setattr("probewise.diagnosis.diagnose", diagnose)
     recording = shipped("concealed")
     with pytest.raises(ParameterError, match="rehearsal"):
-        demo._diagnose_shipped_recording(2013)
+        diagnose_shipped_recording(2013)
     with pytest.raises(ParameterError, match="rehearsal"):
         probewise.diagnose(read_recording(recording), rng=np.random.default_rng(2013), progress=False)
     assert main(["diagnose", str(recording), "--out", str(tmp_path / "out"), "--quiet"]) == 2

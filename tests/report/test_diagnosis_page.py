@@ -139,8 +139,10 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     found = SimpleNamespace(verdict="unknown", unknown_shares=shares, where=tuple(where), apparatus=apparatus)
     monkeypatch.setattr(covariates, "covariate_values", lambda d, place: np.arange(3.0))
     monkeypatch.setattr(covariates, "views_of_place", lambda d, place: [place])
-    chance = SimpleNamespace(largest_mean_in_sds=lambda d, view: sizes[view.covariate])
-    ordered = covariates.ranked_places_with_visibility(found, chance)
+    sized = SimpleNamespace(
+        diagnosis=found, means_in=lambda view: SimpleNamespace(largest_mean_in_sds=sizes[view.covariate])
+    )
+    ordered = covariates.ResidualNoise.ranked_places(sized)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
 
 
@@ -157,7 +159,7 @@ def test_an_effect_that_is_there_twice_has_the_name_of_diagnosis_json_in_the_tab
 def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
     effects = (("lag",), ("delay",), ("settling",))
     plan = NextMeasurement(
-        range(8), "scan again", 1.2, 12.3, ("lag", "delay", "settling"), effects, np.full(3, 1 / 3),
+        range(8), "scan again", 1.2, 12.3, ("lag", "delay", "settling"), effects,
         np.array([[0.0, 0.1, 20.0], [0.1, 0.0, 20.0], [20.0, 20.0, 0.0]]),
     )  # fmt: skip
     found = SimpleNamespace(

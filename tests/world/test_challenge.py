@@ -18,8 +18,6 @@ from probewise.proof.sensors.effects import (
     SINGLES,
     CleanSetup,
     CovariateRegion,
-    EffectSizer,
-    region_of_effect,
 )
 from probewise.proof.sensors.sensors import (
     NOISE_LEVELS,
@@ -153,9 +151,9 @@ def test_the_recording_does_not_tell(tmp_path):
     made = case(number_of("single", size=8.0, skip=SINGLES.index("scan_angle_error")))
     (hidden,) = made.hidden
     assert hidden.name == "scan_angle_error"
-    assert set(hidden.parameters) == {"deg", "scans"}
-    assert hidden.residual_covariates == ("scan", "orientation")
-    assert hidden.region.scans == hidden.parameters["scans"]
+    assert set(hidden.effect.parameters) == {"deg", "scans"}
+    assert hidden.covariates == ("scan", "orientation")
+    assert hidden.region.scans == hidden.effect.parameters["scans"]
     path = tmp_path / "case.csv"
     write_recording(made.recording, path)
     assert fingerprint(read_recording(path)) == fingerprint(made.recording)
@@ -201,16 +199,13 @@ def test_every_ssf_is_about_as_large_as_a_lego_sensors(ssf):
 @pytest.fixture(scope="module", params=list(PLANS))
 def setup(request):
     rng = np.random.default_rng(5)
-    return CleanSetup(
-        draw_plan_with_displaced_patterns(request.param, rng=rng), draw_sensor("gaussian", "middle", rng=rng)
-    )
+    plan = draw_plan_with_displaced_patterns(request.param, rng=rng)
+    return CleanSetup(plan, draw_sensor("gaussian", "middle", rng=rng), left_by_levels)
 
 
 def test_a_local_effect_is_found_where_it_is(setup):
-    sizer = EffectSizer(setup, left_by_levels)
-
     def region(name, amplitude):
-        return region_of_effect(INSIDE[name].draw(setup, np.random.default_rng(8))(amplitude), sizer)
+        return setup.region(INSIDE[name].draw(setup, np.random.default_rng(8))(amplitude))
 
     glint = INSIDE["glint"].draw(setup, np.random.default_rng(8))(2.0).parameters
     found = region("glint", 2.0)

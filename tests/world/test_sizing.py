@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.effects import CleanSetup, EffectSizer, amplitude_of_size
+from probewise.proof.sensors.effects import CleanSetup, amplitude_of_size
 from probewise.world import World, gaussian_spot
 from probewise.world import concealed as known
 from probewise.world.spots import Blob
@@ -22,7 +22,7 @@ def left_by_levels(clean, changed):
 
 @pytest.fixture(scope="module")
 def sizer(plan):
-    return EffectSizer(CleanSetup(plan, World(SPOT, noise_sd=0.5)), left_by_levels)
+    return CleanSetup(plan, World(SPOT, noise_sd=0.5), left_by_levels)
 
 
 CURVES = {

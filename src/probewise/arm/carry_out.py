@@ -24,14 +24,10 @@ BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 
 
 class RequestToPerson(str):
-    """A request to the person at the bench: a sentence for the person, and attributes for a simulated bench.
+    """A request to the person at the bench: a sentence, and attributes for a simulated bench.
 
-    Attributes
-    ----------
-    pattern
-        Name of the pattern to be laid under the arm; None: unchanged.
-    turned_rad
-        Angle to which the sensor is to be turned on its mount, anticlockwise from its usual one; None: unchanged.
+    `pattern` is the name of the pattern to be laid under the arm, `turned_rad` the angle to which the sensor is to be
+    turned on its mount, anticlockwise from its usual one; None: unchanged.
     """
 
     __slots__ = ("pattern", "turned_rad")
@@ -63,26 +59,11 @@ def carry_out(
     turned it before, the person is asked too, unless the plan neither turns the sensor nor has a pattern that looks
     different to a turned one.
 
-    Raises ReachError if a row is out of the arm's reach; nothing moves; ParameterError if the plan needs the LED off,
-    or a height at which this arm does not read.
-
-    Parameters
-    ----------
-    arm
-        The arm, entered already; or any object with a `measure(pose)`, see `as_instrument`.
-    plan
-        The plan.
-    origin_mm
-        Place of the plan's origin on the field, lab frame.
-    ask
-        Function that shows a `RequestToPerson` (a str) to a person and returns when it is done.
-    first
-        First row to read; earlier rows have been taken.
-
-    Yields
-    ------
-    A reading for each row, in the plan's frame, at the place and orientation that the arm measured; at the planned ones
-    if the arm does not measure them.
+    `arm` is entered already, or any object with a `measure(pose)`, see `as_instrument`; `origin_mm` the place of the
+    plan's origin on the field, lab frame; `ask` shows a `RequestToPerson` (a str) to a person and returns when it is
+    done; rows before `first` have been taken. Yields a reading for each row, in the plan's frame, at the place and
+    orientation that the arm measured, or at the planned ones. Raises ReachError if a row is out of the arm's reach
+    (nothing moves); ParameterError if the plan needs the LED off, or a height at which this arm does not read.
     """
     arm = as_instrument(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)

@@ -43,18 +43,10 @@ LEAST_P = 1e-3  # p-value below which the marks disagree
 MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # largest sds of a geometry that counts as determined by the marks
 
 
-@dataclass(frozen=True)
-class TouchedMark:
-    """A mark: angles of base, shoulder, elbow from home; x, y, height of the sensor's face (NaN: not measured)."""
-
-    turned_rad: tuple[float, float, float]
-    place_mm: tuple[float, float, float]
-
-
 def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
     """Read marks: joint angles from home in radians, and x, y, height in mm, both (n_marks, 3).
 
-    Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty, which gives NaN.
+    FileError for a missing column or a cell that is no number; only `height_mm` may be empty, which gives NaN.
     """
     table = read_table(path, wanted=(*_TURNED, *_PLACE))
     table.require_columns(*_TURNED, *_PLACE)
@@ -63,19 +55,18 @@ def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
     return np.radians(np.stack(turned, axis=-1)), np.stack(place, axis=-1)
 
 
-def write_marks(marks: Sequence[TouchedMark], path: Path) -> None:
-    """Write marks for `read_turns_and_places`, angles in degrees and places in mm, atomically."""
-    turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
-    place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)
-    columns = dict(zip((*_TURNED, *_PLACE), np.concatenate([turned, place], axis=1).T.tolist(), strict=True))
-    write_text_atomically(path, csv_text({name: [number_text(v) for v in cells] for name, cells in columns.items()}))
+def write_marks(marks: Sequence[Sequence[float]], path: Path) -> None:
+    """Write marks for `read_turns_and_places`, a row each: angles from home (rad), x, y, height (mm); atomically."""
+    cells = np.array(marks).reshape(-1, 6)
+    cells = np.concatenate([np.degrees(cells[:, :3]), cells[:, 3:]], axis=1).round(4)
+    columns = dict(zip((*_TURNED, *_PLACE), cells.T.tolist(), strict=True))
+    write_text_atomically(path, csv_text({name: [number_text(v) for v in values] for name, values in columns.items()}))
 
 
 def spread_mark_places(geometry: Geometry) -> FloatArray:
-    """Choose places spread over the arm's reach on the field, in whole steps of 10 mm.
+    """Choose five to eight places spread over the arm's reach on the field, in whole steps of 10 mm, in order of use.
 
-    Returns five to eight places, shape (n_marks, 2), in mm, in the order of use. Raises ReachError if fewer than five
-    are within reach.
+    Returns shape (n_marks, 2), in mm. Raises ReachError if fewer than five are within reach.
     """
     width, height = geometry.field_mm
     # Every second place of a grid, as on a chessboard, so that no two rows have the same base angles.
@@ -134,19 +125,11 @@ def fit_geometry(
 ) -> FittedGeometry:
     """Fit home angles, links and base to marks; return the fitted geometry with its errors.
 
+    The current geometry is start of the fit and its prior mean. `turned_rad`, (n_marks, 3), are the angles of base,
+    shoulder and elbow from home, `marks_mm`, (n_marks, 3), the places of the sensor's face: x, y (lab frame) and height
+    (NaN: not measured); `touch_mm` is a mark's sd of place and height, from positioning by eye and from the motors.
     Raises ParameterError if there are fewer than five marks, or they do not determine the geometry; MarksDisagreeError
     if the best fit has a p-value below 0.001.
-
-    Parameters
-    ----------
-    geometry
-        The current geometry: start of the fit, and its prior mean.
-    turned_rad
-        Angle of each joint from home at each mark, (n_marks, 3): base, shoulder, elbow.
-    marks_mm
-        Place of the sensor's face at each mark, (n_marks, 3): x, y (lab frame) and height; NaN: height not measured.
-    touch_mm
-        Sd of a mark's place and height, from positioning by eye and from the motors.
     """
     turned, marks = floats(turned_rad, "turned_rad"), floats(marks_mm, "marks_mm")
     require(len(marks) >= LEAST_MARKS, "marks", len(marks), f"{LEAST_MARKS} or more")

@@ -180,16 +180,15 @@ class Geometry:
     @property
     def rest_mm(self) -> tuple[float, float]:
         """Place (x, y) of the sensor when all joints are at home."""
-        home = np.array([[joint.home_rad for joint in self.joints]])
-        x_mm, y_mm, _ = self.position_mm(home)[0]
+        x_mm, y_mm, _ = self.position_mm(np.array([[joint.home_rad for joint in self.joints]]))[0]
         return float(x_mm), float(y_mm)
 
     @property
     def max_height_error_mm(self) -> float:
         """Largest amount by which the sensor may be lower than commanded.
 
-        Two sds of the height if the geometry was fitted; otherwise the effect of an error of two degrees in both
-        links' home angles.
+        Two sds of the height if the geometry was fitted; otherwise that of two degrees of error in both links' home
+        angles.
         """
         if self.accuracy is not None:
             return 2 * self.accuracy.height_sd_mm
@@ -207,6 +206,14 @@ class Geometry:
         """Compute x, y and height of the sensor's face, (n, 3), lab frame, from joint angles, (n, 3)."""
         return _position_mm(self, angles_rad, self.links_mm, self.axis_mm, self.shoulder_mm)
 
+    def joints_from_side_mm(self, shoulder_rad: float, elbow_rad: float) -> list[FloatArray]:
+        """Return shoulder, elbow, wrist and sensor's face as distance from the base's axis and height, (2,) each."""
+        lower_rad = shoulder_rad + elbow_rad if self.elbow_is_relative else elbow_rad
+        joints = [np.array(self.shoulder_mm)]
+        for length_mm, turn in zip(self.links_mm, (shoulder_rad, lower_rad), strict=True):
+            joints.append(joints[-1] + length_mm * np.array([np.cos(turn), np.sin(turn)]))
+        return [*joints, joints[-1] + [self.sensor_mm[0], -self.sensor_mm[1]]]
+
     def height_slopes_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
         """Return the derivative of the sensor's height by each joint angle, (n, 3), at joint angles, (n, 3)."""
         _, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)
@@ -216,9 +223,8 @@ class Geometry:
         return np.stack([np.zeros_like(both), both, lower_rise], axis=-1)
 
     def angles_rad(self, places_mm: FloatArray, height_mm: float) -> FloatArray:
-        """Solve the inverse kinematics, elbow up.
+        """Solve the inverse kinematics, elbow up, for places, (n, 2), lab frame, and a height of the sensor's face.
 
-        `places_mm`: places, shape (n, 2), lab frame; `height_mm`: height of the sensor's face above the surface.
         Returns joint angles, shape (n, 3); NaN for places too far, too near, or beyond a joint's limits.
         """
         places = _checked_rows(places_mm, 2)
@@ -253,10 +259,7 @@ class Geometry:
             return np.asarray(((angles >= low) & (angles <= high)).all(axis=-1))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's orientation at each place, (n, 2): shape (n,), -pi to pi.
-
-        It turns with the base: mounting + base - a right angle.
-        """
+        """Return the sensor's orientation at places, (n, 2): mounting + base - a right angle, (n,), -pi to pi."""
         places = _checked_rows(places_mm, 2)
         base = np.arctan2(places[:, 1] - self.axis_mm[1], places[:, 0] - self.axis_mm[0])
         return wrapped_to_pi(self.mounting_rad + base - math.pi / 2)
@@ -333,10 +336,9 @@ def places_at_parameters(geometry: Geometry, values: FloatArray, turned_rad: Flo
 
 
 def place_jacobian(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
-    """Return the derivatives of the sensor's place and height by each parameter `FITTED`, joint angles from home fixed.
+    """Return the derivatives of x, y and height by each parameter `FITTED`, joint angles from home fixed: (n, 3, 9).
 
-    `geometry`: the nominal geometry; `places_mm`: places of the sensor by the nominal geometry, (n, 2), at the reading
-    height. Returns shape (n, 3, 9): x, y and height by the parameters of `FITTED`; NaN at a place out of reach.
+    `places_mm`, (n, 2), are places of the sensor by the geometry, at the reading height; NaN at one out of reach.
     """
     values = fitted_parameter_values(geometry)
     turned = geometry.angles_rad(places_mm, geometry.read_height_mm) - values[:3]

@@ -30,8 +30,8 @@ def shipped_geometry_path() -> Path:
 def read_geometry(path: str | Path) -> Geometry:
     """Read an arm's geometry from a TOML file of format "arm/1".
 
-    Raises FileError if the file is missing or not TOML, an entry is missing or not allowed, or a name is unknown; the
-    message gives file, entry, content and what is allowed.
+    FileError, with entry, content and what is allowed, if the file is missing or not TOML, an entry is missing or not
+    allowed, or a name is unknown.
     """
     path = checked_path("path", path)
     text = read_text(path, "an arm's geometry, TOML in UTF-8")
@@ -78,14 +78,11 @@ def read_geometry(path: str | Path) -> Geometry:
 
 
 def text_with_fitted_values(text: str, geometry: Geometry) -> str:
-    """Return the text of a geometry file with the fitted values and their accuracy replaced.
+    """Return the text of a geometry file, its comments kept, with the fitted values and their accuracy replaced.
 
-    Limits and stops of the joints, which shift with their home angles, are replaced too. The table [accuracy] is added
-    if missing; no other entry is.
-
-    `text`: text of the file before the fit; its comments are kept; `geometry`: the fitted geometry. Raises
-    ParameterError if a number is not on a line of its own below the header of its table, as in an inline table: it
-    would stay.
+    Limits and stops of the joints, which shift with their home angles, are replaced too; the table [accuracy] is added
+    if missing. Raises ParameterError if a number is not on a line of its own below the header of its table, as in an
+    inline table: it would stay.
     """
     numbers: dict[tuple[str, str], float] = {
         ("base", "x_mm"): geometry.axis_mm[0],
@@ -158,12 +155,6 @@ class _TomlTable:
     def number(self, name: str) -> float:
         return float(self.value(name, f"a number of magnitude up to {LARGEST:g}", _is_number))
 
-    def rows_of_numbers(self, name: str) -> tuple[tuple[float, ...], ...]:
-        allowed, of_numbers = "rows of numbers, [[...], [...], ...]", f"rows of numbers of magnitude up to {LARGEST:g}"
-        rows = self.value(name, allowed, lambda v: isinstance(v, list) and all(isinstance(row, list) for row in v))
-        self.value(name, of_numbers, lambda v: all(_is_number(number) for row in v for number in row))
-        return tuple(tuple(map(float, row)) for row in rows)
-
     def require_all_taken(self) -> None:
         if self._left:
             name = min(self._left)
@@ -194,4 +185,7 @@ def _parse_accuracy(table: _TomlTable) -> Accuracy:
     if "covariance" not in table.content:
         again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"
         raise FileError(table.path, "accuracy.covariance is missing", again)
-    return _built(table, Accuracy, marks, *sds, table.rows_of_numbers("covariance"))
+    allowed, of_numbers = "rows of numbers, [[...], [...], ...]", f"rows of numbers of magnitude up to {LARGEST:g}"
+    table.value("covariance", allowed, lambda v: isinstance(v, list) and all(isinstance(row, list) for row in v))
+    rows = table.value("covariance", of_numbers, lambda v: all(_is_number(number) for row in v for number in row))
+    return _built(table, Accuracy, marks, *sds, tuple(tuple(map(float, row)) for row in rows))

@@ -6,7 +6,6 @@ sensor's height there, to be compared with the height by the motors' counters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,17 +16,8 @@ from probewise.errors import ParameterError
 
 _DEGREE = 2
 _TELLS = 5.0  # sds by which readings at the lowest and at the highest height must differ
-_LEAST_P = 1e-3
+LEAST_P = 1e-3  # p-value below which the light contradicts the counters
 ROUNDING_MM = 0.2  # sd of a height that whole counts leave
-
-
-@dataclass(frozen=True)
-class HeightReading:
-    """Mean reading over white at one height (by the motors' counters), and its standard error."""
-
-    height_mm: float
-    value: float
-    error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,26 +29,25 @@ class HeightCheck:
     sd_mm: FloatArray
     p_value: float  # chi-square: the probability of larger `off_mm` if the counters are right
 
-    @property
-    def agrees(self) -> bool:
-        """Whether the heights by the light agree with those by the motors' counters: a p-value of 0.001 or more."""
-        return self.p_value >= _LEAST_P
 
-
-def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading]) -> HeightCheck:
+def check_heights(curve: FloatArray, others: FloatArray) -> HeightCheck:
     """Compare heights measured by the light with those by the motors' counters.
 
-    `curve`: readings at the first place, three heights or more; `others`: readings elsewhere over the same white, one
-    for each place. Raises ParameterError for readings at the first place that do not fall with the height by five sds
-    or more.
+    `curve`, (n, 3): height by the counters, mean reading over white and its standard error, at three heights or more of
+    the first place; `others`, (n_places, 3), the same elsewhere over the same white. Raises ParameterError for readings
+    at the first place that do not fall with the height by five sds or more.
     """
-    height, value, error = (
-        np.array([getattr(look, name) for look in curve]) for name in ("height_mm", "value", "error")
-    )
+    height, value, error = curve.T
     low, high = int(height.argmin()), int(height.argmax())
-    fall, noise = value[low] - value[high], float(np.hypot(error[low], error[high]))
-    if fall < _TELLS * noise or min(look.value for look in (*curve, *others)) <= 0:
-        raise _uninformative_readings_error(curve[low], curve[high], noise)
+    noise = float(np.hypot(error[low], error[high]))
+    uninformative = ParameterError(
+        "readings over white",
+        f"{value[low]:.3g} at {height[low]:.0f} mm and {value[high]:.3g} at {height[high]:.0f} mm",
+        f"readings that fall with the height by {_TELLS:g} sds ({_TELLS * noise:.2g}) or more: is the LED lit, the "
+        "sheet white, the room dark?",
+    )
+    if value[low] - value[high] < _TELLS * noise or min(value.min(), others[:, 1].min()) <= 0:
+        raise uninformative
     # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it
     # (the room's, and the LED's near the surface, which the sensor shades).
     lowest_mm, y = float(height.min()), np.log(value)
@@ -76,24 +65,15 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     own = error / value
     coefficients, covariance = fit_curve(np.hypot(own, ROUNDING_MM * log_slope_per_mm(fit_curve(own)[0], height)))
     if (log_slope_per_mm(coefficients, height) >= 0).any():
-        raise _uninformative_readings_error(curve[low], curve[high], noise)
-    told, read = (np.array([getattr(look, name) for look in others]) for name in ("height_mm", "value"))
+        raise uninformative
+    told, read, read_error = others.T
     steep = log_slope_per_mm(coefficients, told)
     basis = np.vander(np.log(told / lowest_mm), _DEGREE + 1)
     off = (np.log(read) - basis @ coefficients) / steep
     shared = basis / steep[:, None]
-    own = np.array([look.error for look in others]) / read / steep
+    own = read_error / read / steep
     joint = shared @ covariance @ shared.T + np.diag(own**2 + ROUNDING_MM**2)
     p_value = float(chdtrc(len(off), off @ np.linalg.solve(joint, off)))
     return HeightCheck(
         float(-log_slope_per_mm(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value
-    )
-
-
-def _uninformative_readings_error(low: HeightReading, high: HeightReading, noise: float) -> ParameterError:
-    return ParameterError(
-        "readings over white",
-        f"{low.value:.3g} at {low.height_mm:.0f} mm and {high.value:.3g} at {high.height_mm:.0f} mm",
-        f"readings that fall with the height by {_TELLS:g} sds ({_TELLS * noise:.2g}) or more: is the LED lit, the "
-        "sheet white, the room dark?",
     )

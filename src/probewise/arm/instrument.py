@@ -23,11 +23,9 @@ class Clock(Protocol):
 
     def monotonic(self) -> float:
         """Return seconds since an arbitrary time."""
-        ...
 
     def sleep(self, seconds: float, /) -> None:
         """Wait for some seconds."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -83,25 +81,21 @@ class Instrument(Protocol):
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
-        ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,).
 
         For an arm that turns its sensor only with its base, this is the only possible orientation.
         """
-        ...
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Return the seconds to move from `start` to each place, (n_places, 2), and read there: shape (n_places,)."""
-        ...
 
     def measure(self, pose: Pose) -> Reading:
         """Move to a pose, lower the sensor, read it and raise it; return the reading.
 
         Raises ReachError if the arm cannot reach the pose; LinkError if the instrument does not answer.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -139,11 +133,9 @@ class ReachablePlaces(Protocol):
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
-        ...
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""
-        ...
 
 
 class Workspace(ReachablePlaces, Protocol):
@@ -152,11 +144,9 @@ class Workspace(ReachablePlaces, Protocol):
     @property
     def rest_mm(self) -> tuple[float, float]:
         """Rest position (x, y) of the sensor."""
-        ...
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,)."""
-        ...
 
 
 def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
@@ -183,16 +173,11 @@ def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: 
 class Reach:
     """The reachable places of an arm: a ring about its axis, intersected with the field.
 
-    The axis stands beyond the middle of the field's upper long side. The default is the reach of the LEGO arm whose
+    The axis stands `axis_beyond_mm` beyond the middle of the field's upper long side; `field_mm` is width and height of
+    the field, whose lower left corner is the lab frame's origin. The default is the reach of the LEGO arm whose
     geometry ships with the package: all but 2 % of the field, at the corners farthest from the axis and nearest to the
-    axis, where the arm cannot fold.
-
-    Raises ParameterError if a length is negative or not finite, or `nearest_mm` is not below `farthest_mm`; ReachError
-    if no place on the field is within reach.
-
-    `field_mm`: width and height of the field; its lower left corner is the lab frame's origin; `axis_beyond_mm`:
-    distance of the axis from the field; `nearest_mm`, `farthest_mm`: smallest and largest distance of the sensor from
-    the axis.
+    axis, where the arm cannot fold. Raises ParameterError if a length is negative or not finite, or `nearest_mm` is not
+    below `farthest_mm`; ReachError if no place on the field is within reach.
     """
 
     field_mm: tuple[float, float] = FIELD_MM

@@ -40,10 +40,7 @@ class JointTarget:
 
 
 def percent_to_lego_units(percent: float, geometry: Geometry) -> float:
-    """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, 1 to 100, as in recordings.
-
-    With `geometry.whole_percent`, fractions are dropped; NaN stays NaN.
-    """
+    """Convert the light sensor's percent, 0 to 100, to LEGO units, 1 to 100, as in recordings; NaN stays NaN."""
     if geometry.whole_percent and math.isfinite(percent):
         percent = math.floor(percent)  # the brick truncates fractions
     return ReadingScale(step=1.0 if geometry.whole_percent else None).clip_and_round(percent)
@@ -52,13 +49,11 @@ def percent_to_lego_units(percent: float, geometry: Geometry) -> float:
 class LegoArm:
     """An instrument: an arm of two links on a turning base, with its sensor looking straight down.
 
-    `machine`: the machine that moves it; entered and exited with the arm; `geometry`: dimensions of the arm; `clock`:
-    clock for the times of readings; `start_s`: time at the start, for resuming an earlier run.
-
-    `turned_rad` is the angle by which the sensor has been turned by hand on its mount, relative to the geometry;
-    `mounted_rad` that to which a person was last asked to turn it, see `carry_out`, NaN: not known. `first_down` is
-    called with the height, in mm, after each step of the first lowering, and returns when a person has confirmed that
-    height; None: the first lowering is one move, like all later ones.
+    `machine` moves it, entered and exited with the arm; `clock` gives the times of readings, from `start_s` of an
+    earlier run on. `turned_rad` is the angle by which the sensor has been turned by hand on its mount, relative to the
+    geometry; `mounted_rad` that to which a person was last asked to turn it, see `carry_out`, NaN: not known.
+    `first_down` is called with the height, in mm, after each step of the first lowering, and returns when a person has
+    confirmed that height; None: the first lowering is one move, like all later ones.
     """
 
     # A person turns the sensor, and it reads at one height.
@@ -117,21 +112,19 @@ class LegoArm:
         there = self.geometry.angles_rad(places_mm, self.geometry.travel_height_mm)
         here = self.geometry.angles_rad(np.array([[start.x_mm, start.y_mm]]), self.geometry.travel_height_mm)
         counts = np.abs(there - here) * [abs(joint.counts_per_rad) for joint in self.geometry.joints]
-        moves = np.where(counts < 1, 0.0, counts / COUNTS_S + STOP_S)
-        return np.asarray(moves.sum(axis=-1) + READ_S)
+        return np.asarray(np.where(counts < 1, 0.0, counts / COUNTS_S + STOP_S).sum(axis=-1) + READ_S)
 
     def measure(self, pose: Pose) -> Reading:
         """Move to a pose, lower the sensor, read it, and raise it.
 
-        A KeyboardInterrupt while the sensor rises releases the motors at once, but the reading is returned: the next
-        `measure`, or the end of `with`, raises it.
+        Returns the reading, with the actual pose by the motors' counters, and the covariates `battery_mv` and
+        `height_mm`: the geometry's `read_height_mm`, as in files of recordings, from which that by the counters,
+        `position_mm[2]`, differs by some tenths of a millimetre. A KeyboardInterrupt while the sensor rises releases
+        the motors at once, but the reading is returned: the next `measure`, or the end of `with`, raises it.
 
-        Returns the reading, with the actual pose by the motors' counters, and the covariates `height_mm` and
-        `battery_mv`. In the files of recordings, `height_mm` is the commanded height, the geometry's `read_height_mm`;
-        the height by the counters, `position_mm[2]`, differs from it by some tenths of a millimetre. Raises ReachError
-        if the arm cannot reach the place, or has another orientation or height there (nothing moves); or if the sensor
-        cannot rise from where it is; LinkError if the brick does not answer, or a motor does not move, before the
-        reading is taken.
+        Raises ReachError if the arm cannot reach the place, or has another orientation or height there (nothing moves),
+        or if the sensor cannot rise from where it is; LinkError if the brick does not answer, or a motor does not move,
+        before the reading is taken.
         """
         self._raise_held_stop()
         place = np.array([[pose.x_mm, pose.y_mm]])
@@ -152,7 +145,10 @@ class LegoArm:
         value = self.read_here()
         time_s = self._clock.monotonic() - self._zero_s
         covariates = {"height_mm": self.geometry.read_height_mm, "battery_mv": battery_mv}
-        reading = Reading(value=value, pose=self._pose(), time_s=time_s, covariates=covariates)
+        angles = self.angles_rad
+        x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0].tolist()
+        turned_rad = wrapped_to_pi(self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad)
+        reading = Reading(value, Pose(x_mm, y_mm, float(turned_rad)), time_s, covariates)
         self._raise_after_reading()
         return reading
 
@@ -177,10 +173,7 @@ class LegoArm:
             raise stop
 
     def go_over(self, x_mm: float, y_mm: float) -> None:
-        """Move the sensor over a place, at about travel height.
-
-        Raises ReachError if the place is out of reach.
-        """
+        """Move the sensor over a place, at about travel height; ReachError if the place is out of reach."""
         goals = self._goals_at_place(x_mm, y_mm, self.geometry.travel_height_mm)
         self.raise_sensor()
         self._turn_joint_to(BASE, goals[BASE])
@@ -188,11 +181,9 @@ class LegoArm:
             self._move_joint_near(joint, goals[joint].counts)
 
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
-        """Move the sensor over a place and lower it, by default to reading height.
+        """Move the sensor over a place and lower it, by default to reading height; ReachError if out of reach.
 
         If `first_down` is set, the first lowering is in steps, and `first_down` is called after each.
-
-        Raises ReachError if the place is out of reach at that height.
         """
         travel_mm = self.geometry.travel_height_mm
         end_mm = self.geometry.read_height_mm if height_mm is None else height_mm
@@ -213,10 +204,7 @@ class LegoArm:
             self._turn_joint_to(joint, goals[joint])
 
     def raise_sensor(self) -> None:
-        """Raise the sensor to about travel height, if it is lower, by the link that needs the smaller turn.
-
-        Raises ReachError if neither link alone can raise it.
-        """
+        """Raise the sensor, if lower, to about travel height by the link that needs less turn; else ReachError."""
         for _ in range(N_RISES):
             if self.position_mm[2] >= self.geometry.travel_height_mm - NEAR_TRAVEL_MM:
                 break
@@ -231,10 +219,9 @@ class LegoArm:
     def home(self) -> None:
         """Move all joints home (counter 0); joints with a stop first turn to the stop, which sets their counters.
 
-        The links find their stops before the base, so that the sensor is up when the base turns.
-
-        Raises LinkError if a joint meets no stop, or the brick does not answer; ReachError if the sensor cannot rise
-        from where the links are.
+        The links find their stops before the base, so that the sensor is up when the base turns. Raises LinkError if a
+        joint meets no stop, or the brick does not answer; ReachError if the sensor cannot rise from where the links
+        are.
         """
         stopped = []
         for joint in (ELBOW, SHOULDER, BASE):
@@ -281,20 +268,10 @@ class LegoArm:
         self._machine.keep_awake()
 
     def turn_joint(self, joint: int, by_rad: float) -> None:
-        """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if this would leave the limits.
-
-        Raises ParameterError if the angle is not finite.
-        """
+        """Turn one joint (0 to 2: base, shoulder, elbow) by a finite angle; ReachError if it would leave its limits."""
         angles = self.angles_rad
         angles[joint] += checked_finite_number("by_rad", by_rad)
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
-
-    def _pose(self) -> Pose:
-        """Return the sensor's pose by the motors' counters."""
-        angles = self.angles_rad
-        x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0]
-        standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
-        return Pose(float(x_mm), float(y_mm), float(wrapped_to_pi(standing)))
 
     def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[JointTarget]:
         """Return the targets of base, shoulder and elbow for a place and height; ReachError if it is out of reach."""
@@ -323,14 +300,12 @@ class LegoArm:
     def _choose_link_order(self, goals: Sequence[JointTarget]) -> tuple[int, int]:
         """Return the two links (joint numbers) in the order of moving in which the sensor stays higher on the way.
 
-        If the sensor would go below its target height in either order, first move the upper link to the vertical, and
-        return the lower link before the upper one.
+        If it would go below its target height in either order, the upper link is first moved to the vertical.
         """
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
         lowest_mm = [self._heights_along_mm(way).min() for way in ways]
-        end_mm = self._heights_along_mm(ways[0])[-1]
-        if max(lowest_mm) > end_mm - CLEAR_MM:
+        if max(lowest_mm) > self._heights_along_mm(ways[0])[-1] - CLEAR_MM:
             return orders[int(np.argmax(lowest_mm))]
         self._move_joint_near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
         return ELBOW, SHOULDER
@@ -361,8 +336,7 @@ class LegoArm:
         return abs(way), joint, here + min(max(far, end[0]), end[1])
 
     def _turn_joint_to(self, joint: int, goal: JointTarget) -> None:
-        with_gears = self.geometry.joints[joint].gear_ratio > 0
-        side: Side = 1 if (goal.side > 0) == with_gears else -1
+        side: Side = 1 if (goal.side > 0) == (self.geometry.joints[joint].gear_ratio > 0) else -1
         self._machine.move_to(joint, goal.counts, side)
         self._arrived[joint] = goal.side
 

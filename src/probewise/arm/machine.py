@@ -18,10 +18,7 @@ N_CHECKED = 33  # points checked along a move
 
 
 class SoftLimits:
-    """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts.
-
-    `geometry`: limits of the joints, and the lowest height of the sensor.
-    """
+    """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts."""
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
@@ -50,10 +47,9 @@ class SoftLimits:
         return np.asarray(self._geometry.position_mm(way)[:, 2])
 
     def require_allowed_move(self, joint: int, here: int, to: int) -> None:
-        """Raise ReachError if a move of one joint, the others at rest, leaves the allowed range.
+        """Raise ReachError if a move of one joint from count `here` to `to` leaves the allowed range.
 
-        `here` and `to` are the counts of the joint's motor at start and end. A joint beyond its limits may move back,
-        and a sensor below the lowest height may rise.
+        The others are at rest. A joint beyond its limits may move back, and a sensor below the lowest height may rise.
         """
         geometry, mechanics = self._geometry, self._geometry.joints[joint]
         angle, start = mechanics.angle_at(to), mechanics.angle_at(here)
@@ -65,8 +61,7 @@ class SoftLimits:
                 f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees",
             )
         heights = self.heights_along_move_mm(self.last_counts, joint, to, here)
-        floor = min(geometry.lowest_mm, float(heights[0]))
-        if heights.min() < floor:
+        if heights.min() < min(geometry.lowest_mm, float(heights[0])):
             raise ReachError(
                 f"the sensor's height while the {JOINTS[joint]} moves",
                 f"{heights.min():.0f} mm",
@@ -87,42 +82,31 @@ class Machine(Protocol):
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
         """Turn a joint's motor to a count, approaching with the count rising (side 1) or falling (-1), and hold it."""
-        ...
 
     def move_near(self, joint: int, goal: int) -> None:
         """Turn a joint's motor approximately to a count, and hold it."""
-        ...
 
     def release(self) -> None:
         """Let all motors turn freely."""
-        ...
 
     def find_stop(self, joint: int, side: Side) -> None:
         """Turn a joint gently to its stop, angle rising (side 1) or falling (-1); its count becomes `stop_counts`."""
-        ...
 
     def reset(self, joints: Sequence[int]) -> None:
         """Set the counters of these joints' motors to 0."""
-        ...
 
     def read_percent(self) -> float:
         """Read the light sensor with the LED on: 0 to 100, with fractions."""
-        ...
 
     def battery_mv(self) -> float:
         """Read the battery's voltage, in mV."""
-        ...
 
     def keep_awake(self) -> None:
         """Keep the machine awake; to be called now and then during minutes of inactivity."""
-        ...
 
 
 class DryRun:
-    """A dry run: prints every commanded move, and reads nothing.
-
-    `geometry`: geometry of the arm; `say`: function called with one line per command.
-    """
+    """A dry run: `say` is called with a line per commanded move, and nothing is read."""
 
     def __init__(self, geometry: Geometry, say: Callable[[str], None]) -> None:
         self._geometry, self._say = geometry, say

@@ -38,28 +38,16 @@ class Measures(Protocol):
 
     def measure(self, pose: Pose, /) -> Any:
         """Move to a pose and read; return a number, a dict with "value" and further numbers, or a Reading."""
-        ...
 
 
 class OwnInstrument:
     """An Instrument that wraps a user's own object.
 
-    Parameters
-    ----------
-    connect
-        Function that returns the object; called once, when the instrument is entered.
-    source
-        Path of the file that the object comes from. Errors of the object become a `LinkError` of one line, with the
-        line number in the file; without `source`, these errors pass through.
-    start_s
-        Time at the start, for resuming an earlier run.
-    clock
-        Clock for readings without a time.
-
-    Attributes
-    ----------
-    mounted_rad
-        Angle to which a person was last asked to turn the sensor, see `carry_out`; NaN: not known.
+    `connect` returns the object; called once, when the instrument is entered. With a `source`, the path of the file
+    that the object comes from, its errors become a `LinkError` of one line, with the line number in the file; without,
+    they pass through. `start_s` is the time at the start, for resuming an earlier run, `clock` for readings without a
+    time. `mounted_rad` is the angle to which a person was last asked to turn the sensor, see `carry_out`; NaN: not
+    known.
     """
 
     def __init__(
@@ -188,10 +176,9 @@ class OwnInstrument:
     def measure(self, pose: Pose) -> Reading:
         """Measure and return a Reading: the object's own, or one built from its number or dict.
 
-        Where the dict does not say otherwise, its time is the clock's and its pose the commanded one.
-
-        Raises ParameterError if the result is not a valid reading; the object's own errors pass through; LinkError
-        instead of any of these errors, for an instrument with a `source`.
+        Where the dict does not say otherwise, its time is the clock's and its pose the commanded one. Raises
+        ParameterError if the result is not a valid reading; with a `source`, a LinkError instead, and of the object's
+        own errors.
         """
         with self._errors_located("measure"):
             return self._as_reading(self._own.measure(pose), pose)
@@ -231,14 +218,11 @@ class OwnInstrument:
         except BaseException as error:
             if not self.source or isinstance(error, KeyboardInterrupt):
                 raise
-            raise LinkError(self._error_message(what, error)) from error
-
-    def _error_message(self, what: str, error: BaseException) -> str:
-        frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
-        where = f"{self.source}, line {frames[-1]}" if frames else self.source
-        if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
-            return f"{where}: {error}"
-        return f"{where}: {what} raises {message_of(error)}"
+            frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
+            where = f"{self.source}, line {frames[-1]}" if frames else self.source
+            returned = isinstance(error, ParameterError | ShapeError) and not frames  # a wrong value
+            said = str(error) if returned else f"{what} raises {message_of(error)}"
+            raise LinkError(f"{where}: {said}") from error
 
 
 def as_instrument(
@@ -246,25 +230,19 @@ def as_instrument(
 ) -> OwnInstrument | LegoArm | SimulatedArm:
     """Adapt any object with `measure(pose)` to an Instrument; instruments of this package are returned unchanged.
 
-    Raises ParameterError if `own` has no method `measure`.
+    Its `measure(pose)` moves to `pose.x_mm`, `pose.y_mm`, orientation `pose.orientation_rad` and, if not None, height
+    `pose.height_mm`, and returns a number, a Reading, or a dict with "value" and optionally the true pose `x_mm`,
+    `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates. For a missing reading
+    return Reading(math.nan, pose, time_s); a number or "value" has to be finite. Optional methods:
+    `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`, seconds from a
+    pose to each place; `orientation_rad(places_mm)`, the sensor's own orientation at each place; a single value applies
+    to all places. Attributes `turns = True` and `lifts = True` declare that the sensor is turned to the pose's
+    orientation and reads at the pose's height; `read_height_mm` is the height at which it reads otherwise, if that is
+    known, so that `explore` can compare it with the calibration's. `__exit__`, or else `close()`, is always called at
+    the end.
 
-    Parameters
-    ----------
-    own
-        Its `measure(pose)` moves to `pose.x_mm`, `pose.y_mm`, orientation `pose.orientation_rad` and, if not None,
-        height `pose.height_mm`, and returns a number, a Reading, or a dict with "value" and optionally the true pose
-        `x_mm`, `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates.
-        For a missing reading return Reading(math.nan, pose, time_s); a number or "value" has to be finite. Optional
-        methods: `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`,
-        seconds from a pose to each place; `orientation_rad(places_mm)`, the sensor's own orientation at each place; a
-        single value applies to all places. Attributes `turns = True` and `lifts = True` declare that the sensor is
-        turned to the pose's orientation and reads at the pose's height; `read_height_mm` is the height at which it
-        reads otherwise, if that is known, so that `explore` can compare it with the calibration's. `__exit__`, or else
-        `close()`, is always called at the end.
-    start_s
-        Time at the start, for resuming an earlier run; without effect on instruments of this package.
-    name
-        Name for messages.
+    `start_s` is the time at the start, for resuming an earlier run, without effect on instruments of this package;
+    `name` is for messages. Raises ParameterError if `own` has no method `measure`.
     """
     if isinstance(own, OwnInstrument | LegoArm | SimulatedArm):
         return own

@@ -35,18 +35,11 @@ class Speed:
 class SimulatedArm:
     """An Instrument that simulates moving, lowering, reading and raising; `time_s` is its clock, `pose` where it is.
 
-    Parameters
-    ----------
-    light
-        Function of pose, time (s) and height (mm) that returns the reading before the conversion by `scale`.
-    reach
-        Reachable places and orientations: a `Reach`, whose sensor does not turn, or the `Geometry` of a real arm.
-    scale
-        Conversion of readings, by default to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none.
-    height_mm
-        Height of the sensor above the surface when reading, unless the pose gives one.
-    last
-        Last reading of an earlier run: the arm starts at its pose and time. None: it starts at rest, at time 0.
+    `light` is a function of pose, time (s) and height (mm) that returns the reading before the conversion by `scale`,
+    by default to LEGO units 1 to 100 (paper, "Robotic Arm Test Bed"); None: none. `reach` has the reachable places and
+    orientations: a `Reach`, whose sensor does not turn, or the `Geometry` of a real arm. `height_mm` is the sensor's
+    above the surface when reading, unless the pose gives one. The arm starts at the pose and time of `last`, the last
+    reading of an earlier run; None: at rest, at time 0.
     """
 
     # It takes the orientation and the height of every pose, so no person turns the sensor: mounted_rad is always 0.

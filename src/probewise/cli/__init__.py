@@ -127,14 +127,7 @@ def _discard_unwritable_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _write_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: object = None,
-    line: object = None,
-) -> None:
+def _write_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     if issubclass(category, RuntimeWarning) and " encountered in " in str(message):
         return  # NumPy's, of arithmetic: whether a result can be used is checked, and said in our words
     print_warning(" ".join(str(message).split()))

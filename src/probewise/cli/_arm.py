@@ -58,10 +58,7 @@ def read_or_shipped_plan(text: str, *, progress: Progress = silent) -> Plan:
 
 @dataclass(frozen=True)
 class ArmName:
-    """An arm as chosen by --arm: its `kind`, "simulated", "emulator", "nxt" or "file", and `where`.
-
-    That is its port or file, or an emulated arm's true geometry file.
-    """
+    """An arm as chosen by --arm: its `kind`, and `where`: its port or file, or an emulated arm's true geometry file."""
 
     kind: str
     where: str = ""
@@ -87,10 +84,7 @@ class ArmName:
 
 
 def parse_arm(text: str) -> ArmName:
-    """Parse the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py".
-
-    Raises ParameterError if it is none of these.
-    """
+    """Parse the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py"."""
     if text in ("simulated", "emulator"):
         return ArmName(text)
     kind, _, where = text.partition(":")

@@ -24,7 +24,8 @@ from probewise.arm import (
 )
 from probewise.arm.fitting import spread_mark_places
 from probewise.arm.geometry import JOINTS
-from probewise.arm.height_check import HeightReading, check_heights
+from probewise.arm.height_check import LEAST_P, check_heights
+from probewise.arm.nxt import percent_from_counts
 from probewise.cli import _bench
 from probewise.cli._arm import SCENE, parse_arm, parse_place
 from probewise.cli._common import (
@@ -142,9 +143,9 @@ def report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry)
         version, battery_v = brick.version(), brick.battery_mv() / 1000
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
         say(f"brick        {brick.name()}, firmware {firmware}, battery {battery_v:.2f} V")
-        light = brick.light_sensor(geometry.sensor_port).read()
-        value = percent_to_lego_units(light.fine_percent, geometry)
-        say(f"light        {value:g} {_UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts")
+        raw_counts = brick.light_sensor(geometry.sensor_port).read()
+        value = percent_to_lego_units(percent_from_counts(raw_counts), geometry)
+        say(f"light        {value:g} {_UNITS} at port {geometry.sensor_port + 1}, {raw_counts} raw counts")
         program = brick.running_program()
         if program is not None:
             raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
@@ -248,20 +249,20 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
             paper = "lay white matt paper, the same everywhere, over the field, or under each place"
             prompter_unless_dry_run(arguments, arm)(paper)
 
-        def height_reading_at(place: tuple[float, float], height_mm: float) -> HeightReading:
+        def height_reading_at(place: tuple[float, float], height_mm: float) -> tuple[float, float, float]:
             arm.go_down(*place, height_mm)
             values = np.array([arm.brightness() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
-            return HeightReading(float(arm.position_mm[2]), float(values.mean()), error)
+            return float(arm.position_mm[2]), float(values.mean()), error
 
         arm.go_over(*places[0])
         lowest_mm = geometry.read_height_mm
-        curve = [height_reading_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
+        curve = np.array([height_reading_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)])
         lights = []
         for place in places[1:]:
             lights.append(height_reading_at(place, lowest_mm))
             if not arguments.dry_run:
-                check = check_heights(curve, lights)
+                check = check_heights(curve, np.array(lights))
                 say(_height_error_in_words(place, check.off_mm[-1], check.sd_mm[-1]))
     if arguments.dry_run:
         return
@@ -270,7 +271,7 @@ def compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) 
         f"light_per_mm = {check.per_mm:.3f}); heights are relative to the first place, "
         f"({places[0][0]:g}, {places[0][1]:g}) mm"
     )
-    if check.agrees:
+    if check.p_value >= LEAST_P:
         say(f"heights      agree with the counters (p = {check.p_value:.2g})")
         return
     worst = int(np.argmax(np.abs(check.off_mm / check.sd_mm)))

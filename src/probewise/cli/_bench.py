@@ -78,7 +78,7 @@ def open_arm_and_bench(
 
     With a `geometry_file`, the simulated arm has the geometry's reach. A simulated or emulated arm has the sensor of
     the file `sensor`, the initial target `scene`, and noise of this `seed`, after the `n_taken` readings of an earlier
-    session. Raises ParameterError if the brick cannot read in the sensor's unit.
+    session.
     """
     if chosen.is_real:
         return open_real_arm(chosen, geometry, start_s=start_s), None
@@ -97,10 +97,9 @@ def open_arm_and_bench(
 def open_emulated_arm_and_bench(
     geometry: Geometry, geometry_file: Path | None, world: World, surface: Surface, *, seed: int, start_s: float = 0.0
 ) -> tuple[LegoArm, emulator.EmulatedBench]:
-    """Open the LEGO arm on an emulated brick over a simulated table; return the arm and the bench.
+    """Open the LEGO arm on an emulated brick, built as `geometry_file` says, over a simulated table; and its bench.
 
-    The clock runs as fast as possible. The emulator reads its own true geometry: `geometry_file`, or the shipped one.
-    When the arm's `with` block ends, it warns if the sensor hit the table.
+    The clock runs as fast as possible. When the arm's `with` block ends, it warns if the sensor hit the table.
     """
     clock = emulator.VirtualClock()
     numbers = emulator.read_geometry(geometry_file or emulator.shipped_geometry_path())
@@ -155,8 +154,8 @@ class InstrumentWithCallbacks:
 class SimulatedBench:
     """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
-    `scene` is the initial target, in the format of `emulate-nxt`; `scale` rounding and range of the simulated arm's
-    readings; `seed` that of the noise, which continues after the `n_taken` readings of an earlier session.
+    `scene` is the initial target, in the format of `emulate-nxt`; `scale` that of the simulated arm's readings; `seed`
+    that of the noise, which continues after the `n_taken` readings of an earlier session.
     """
 
     def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
@@ -174,8 +173,7 @@ class SimulatedBench:
             return self._world.read(self._table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
         make = partial(SimulatedArm, read_world, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
-        rest = make().pose
-        return make(last=Reading(math.nan, rest, start_s))
+        return make(last=Reading(math.nan, make().pose, start_s))
 
     def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
         """Return the LEGO arm over the table, on an emulated brick."""
@@ -187,10 +185,7 @@ class SimulatedBench:
         return arm
 
     def answer_at_mark(self, mark_mm: tuple[float, float], block_mm: float) -> str:
-        """Answer like a person who watches the emulated arm's sensor over a mark: "ok", or moves such as "x 5 down 2".
-
-        Raises ParameterError if the arm is not an emulated one.
-        """
+        """Answer like a person who watches an emulated arm's sensor over a mark: "ok", or moves, "x 5 down 2"."""
         if self._stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
         stand = self._stand()
@@ -243,10 +238,7 @@ def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> 
 def plan_for_own_instrument(
     plan: recordings.Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
 ) -> recordings.Plan:
-    """Return the plan for a user's instrument: a given unit, range ("LOW,HIGH") or step replaces the plan's own.
-
-    A new unit drops the plan's range, step and sensor. Measured covariates are left out.
-    """
+    """Return the plan for a user's instrument; a given range, step, or unit, which drops both, is the readings' own."""
     declared: dict[str, object] = {}
     if unit is not None:  # the values declared in the plan have another unit
         declared = {"unit": unit, "min": None, "max": None, "step": None, "sensor": ""}
@@ -283,19 +275,16 @@ def without_measured_covariates(plan: recordings.Plan, instrumentation: recordin
 
 def prompter(arm: Instrument) -> Callable[[str], None]:
     """Return a function that prompts a person and waits for Enter, while keeping the arm awake."""
-    answer_to = prompter_for_answer(arm)
+    return partial(press_enter, prompter_for_answer(arm))
 
-    def ask(text: str) -> None:
-        answer_to(f"{text[0].upper()}{text[1:]}, then press Enter: ")
 
-    return ask
+def press_enter(answer_to: Callable[[str], str], text: str) -> None:
+    """Prompt a person, by a function that returns the line typed, and wait for Enter."""
+    answer_to(f"{text[0].upper()}{text[1:]}, then press Enter: ")
 
 
 def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
-    """Return a function that asks a person and returns the line typed, while keeping the arm awake.
-
-    It raises CommandError if standard input has ended.
-    """
+    """Return a function that asks a person and returns the line typed, while keeping the arm awake."""
     keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
 
     def ask(text: str) -> str:

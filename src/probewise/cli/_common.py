@@ -77,10 +77,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def add(to: argparse._ActionsContainer, usage: str, about: str, **more: Any) -> None:
-    """Add an argument or option by its usage, "NAME METAVAR", and its help; `more` goes to `add_argument`.
-
-    An option without metavar and `more` is a flag.
-    """
+    """Add an argument or option by its usage, "NAME METAVAR", and its help; without metavar and `more` it is a flag."""
     name, _, metavar = usage.partition(" ")
     if metavar:
         more["metavar"] = metavar
@@ -140,22 +137,7 @@ def parse_recording(text: str) -> Path:
     return SHIPPED_RECORDINGS.get(text, path) if not path.exists() else path
 
 
-def parse_count(text: str, *, most: int = MOST) -> int:
-    """Parse an integer from 1 to `most`, for argparse."""
-    return _parse_whole_number(text, 1, most, f"from 1 to {most:,}")
-
-
-def count_up_to(most: int) -> Callable[[str], int]:
-    """Return a parser of integers from 1 to `most`, for argparse."""
-    return partial(parse_count, most=most)
-
-
-def parse_seed(text: str) -> int:
-    """Parse an integer of 0 or more, for argparse."""
-    return _parse_whole_number(text, 0, 2**128 - 1, "of 0 or more, less than 2^128")
-
-
-def _parse_whole_number(text: str, least: int, most: int, allowed: str) -> int:
+def _parse_whole_number(text: str, *, least: int, most: int, allowed: str) -> int:
     try:
         value = int(text)
     except ValueError:
@@ -163,6 +145,15 @@ def _parse_whole_number(text: str, least: int, most: int, allowed: str) -> int:
     if not least <= value <= most:
         raise argparse.ArgumentTypeError(f"{shown(text)} is not a whole number {allowed}")
     return value
+
+
+def count_up_to(most: int) -> Callable[[str], int]:
+    """Return a parser of integers from 1 to `most`, for argparse."""
+    return partial(_parse_whole_number, least=1, most=most, allowed=f"from 1 to {most:,}")
+
+
+parse_count = count_up_to(MOST)
+parse_seed = partial(_parse_whole_number, least=0, most=2**128 - 1, allowed="of 0 or more, less than 2^128")
 
 
 def positive_number_parser(unit: str) -> Callable[[str], float]:
@@ -231,10 +222,7 @@ def print_warning(text: str) -> None:
 
 
 def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
-    """Return a message: how many readings, marks or tasks (`noun`) a file holds, and the command that resumes the run.
-
-    `options` are added to the words of the command line; `of` is the total number, 1 if it is not known.
-    """
+    """Return how many of a `noun` (`of` a total) a file holds, and the command, with `options`, that resumes."""
     import shlex
     import subprocess
 

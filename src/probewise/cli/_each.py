@@ -33,17 +33,19 @@ Verb = Callable[[argparse.Namespace], int]
 
 
 def diagnose_each(arguments: argparse.Namespace, diagnose: Verb) -> int:
-    """Diagnose each recording into a folder of its own; write table.csv and a page of all; return the exit status.
+    """Diagnose each recording, by the verb `diagnose`, into a folder of its own; write table.csv and a page of all.
 
-    `diagnose` runs the verb on the arguments of one recording. One that cannot be diagnosed is a row of the table;
-    folders that are complete, of the same files and options, are not diagnosed again.
+    One that cannot be diagnosed is a row of the table; folders that are complete, of the same files and options, stay.
     """
     out = checked_output_directory(arguments.out)
     folders = {name: out / name for name in _device_names(arguments.recordings)}
     files = dict(zip(folders, arguments.recordings, strict=True))
     fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
     left = {name: file for name, file in files.items() if not _is_done(folders[name], fingerprints[name])}
-    options, refused = _options_for_each(arguments), dict[str, str]()
+    given = ((name, getattr(arguments, name)) for name in ("sensor", "simulator"))
+    options = [word for name, path in given if path is not None for word in (f"--{name}", str(path.absolute()))]
+    options += ["--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
+    refused: dict[str, str] = {}
     words = {name: [str(file.absolute()), *options] for name, file in left.items()}
 
     def kept() -> str:
@@ -110,13 +112,6 @@ def _is_done(folder: Path, fingerprint: str) -> bool:
     with contextlib.suppress(OSError):
         return (folder / _INPUTS).read_text() == fingerprint
     return False
-
-
-def _options_for_each(arguments: argparse.Namespace) -> list[str]:
-    """Return the options that the diagnosis of every recording has."""
-    given = ((name, getattr(arguments, name)) for name in ("sensor", "simulator"))
-    files = [word for name, path in given if path is not None for word in (f"--{name}", str(path.absolute()))]
-    return [*files, "--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
 
 
 def _diagnosed(diagnose: Verb, words: Sequence[str]) -> Outcome:

@@ -21,10 +21,10 @@ from probewise.errors import DoubtfulResultWarning, LinkError
 if TYPE_CHECKING:
     from concurrent.futures import Executor, ProcessPoolExecutor
 
-    from probewise.proof.campaign import Campaign, Keyed, Result
+    from probewise.proof.campaign import Campaign, Result
     from probewise.proof.pages import CampaignPage
 
-K = TypeVar("K", bound="Keyed")
+K = TypeVar("K")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -50,10 +50,7 @@ def run_and_report(
     table: str = "table.csv",
     said: str = "",
 ) -> int:
-    """Run what a campaign's `file` in --out lacks; write its table and report; return the exit status.
-
-    If it is interrupted, the message says what the file holds. The last line printed begins with `said`.
-    """
+    """Run what a campaign's `file` in --out lacks; write table and report; the last line printed begins with `said`."""
     from probewise._progress import progress_shown
     from probewise.proof.campaign import read_campaign
 
@@ -107,7 +104,7 @@ def _cluster_executor(address: str) -> Iterator[Executor]:
 def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of `n` processes with one thread of linear algebra each; if the block raises, end the processes.
 
-    Processes are spawned, not forked, for the same behaviour on every system.
+    They are spawned, not forked, for the same behaviour on every system.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
@@ -127,10 +124,7 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _start_tracker_without_hangups() -> None:
-    """Start the process that tracks shared resources so that it outlives a closed terminal, and complains of nothing.
-
-    It ignores Ctrl-C and `kill` by itself.
-    """
+    """Start the process that tracks shared resources so that it outlives a closed terminal, without complaints."""
     from multiprocessing import resource_tracker
 
     if hasattr(signal, "SIGHUP") and threading.current_thread() is threading.main_thread():

@@ -13,7 +13,7 @@ import numpy as np
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import Geometry, LegoArm, read_geometry, shipped_geometry_path
-from probewise.arm.fitting import TouchedMark, fit_geometry, read_turns_and_places, spread_mark_places, write_marks
+from probewise.arm.fitting import fit_geometry, read_turns_and_places, spread_mark_places, write_marks
 from probewise.arm.geometry_file import text_with_fitted_values
 from probewise.cli._arm import parse_arm
 from probewise.cli._arm_tasks import open_instrument
@@ -48,8 +48,7 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
     turned, marks = read_turns_and_places(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     print_result(fitted.summary(), quiet=arguments.quiet)
-    text = text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry)
-    write_text_atomically(out, text)
+    write_text_atomically(out, text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry))
     if not is_device_or_pipe(out):
         read_geometry(out)  # check that edits by hand have not hidden a number
     print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
@@ -61,11 +60,8 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         raise ParameterError("--arm", arguments.arm, "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted")
     if kept.exists() and not arguments.resume:
         raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
-    taken: list[TouchedMark] = []
-    if kept.exists():
-        rows = zip(*(array.tolist() for array in read_turns_and_places(kept)), strict=True)
-        taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
-    done = {mark.place_mm[:2] for mark in taken}
+    taken = np.concatenate(read_turns_and_places(kept), axis=1).tolist() if kept.exists() else []
+    done = {(x, y) for *_, x, y, _ in taken}
     marks = [(x, y) for x, y in spread_mark_places(geometry).tolist()]
     instrument, bench = open_instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
@@ -96,17 +92,14 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
 
 
 def bring_to_mark(
-    arm: LegoArm,
-    mark_mm: tuple[float, float],
-    block_mm: float,
-    ask: Callable[[], str],
-    tell: Callable[[str], None],
-) -> TouchedMark | None:
-    """Bring the sensor over a mark and down to the block on it, as a person directs; return the mark as touched.
+    arm: LegoArm, mark_mm: tuple[float, float], block_mm: float, ask: Callable[[], str], tell: Callable[[str], None]
+) -> list[float] | None:
+    """Bring the sensor over a mark and down to the block on it, as a person directs.
 
-    None if the mark is skipped. Every move turns the base first and then lowers, as in a reading. `mark_mm` is the
-    place on the field, `block_mm` the height of the block; `ask` returns the person's answer, "ok", "seen", "skip" or a
-    move such as "x 5"; `tell` says what can be answered, and why a move was refused.
+    Return the joints' angles from home (rad), x, y and height of the mark (mm; NaN: not known), None if it is skipped.
+
+    Every move turns the base first and then lowers, as in a reading. `ask` returns the person's answer, "ok", "seen",
+    "skip" or a move such as "x 5"; `tell` says what can be answered, and why a move was refused.
     """
     at = (*mark_mm, arm.geometry.travel_height_mm)
     arm.go_down(*at)
@@ -117,9 +110,7 @@ def bring_to_mark(
             return None
         if answer in ("ok", "seen"):
             homes = np.array([joint.home_rad for joint in arm.geometry.joints])
-            base, shoulder, elbow = (arm.angles_rad - homes).tolist()
-            height_mm = block_mm if answer == "ok" else math.nan
-            return TouchedMark((base, shoulder, elbow), (*mark_mm, height_mm))
+            return [*(arm.angles_rad - homes).tolist(), *mark_mm, block_mm if answer == "ok" else math.nan]
         moved = place_after_moves(at, answer)
         if moved is None:
             tell(f"{answer!r} says nothing that can be done. {_HELP}")
@@ -134,10 +125,7 @@ def bring_to_mark(
 
 
 def place_after_moves(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
-    """Return the sensor's place (x, y, height in mm) after the moves in an answer; None if it is no list of moves.
-
-    An answer is pairs such as "x 5 down 2", of at most 60 mm each; an empty one means one step of 5 mm down.
-    """
+    """Return the place (x, y, height in mm) after an answer's moves, such as "x 5 down 2"; None if it is none."""
     words = answer.split() or ["down", str(STEP_MM)]
     x, y, height = at_mm
     if len(words) % 2:

@@ -34,10 +34,7 @@ def refuse_journal(path: Path) -> None:
 
 
 def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
-    """Return a journal's readings as a recording by the sensor, and the shape that the run looked for.
-
-    Raises FileError if it is not a journal, has no reading, or has a shape unknown to `explore`.
-    """
+    """Return a journal's readings as a recording by the sensor, and the shape that the run looked for."""
     from probewise.experiment import read_journal
 
     journal = read_journal(path)
@@ -48,10 +45,7 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recor
 
 
 def find_journal_sensor_file(path: Path) -> Path:
-    """Return the sensor.json of a journal's run: where it was, beside the journal, or what results renamed it to.
-
-    Raises FileError if the journal names none, or that file is missing or has changed.
-    """
+    """Return the sensor.json of a journal's run: where it was, beside the journal, or what results renamed it to."""
     from probewise.calibration import read_sensor
     from probewise.experiment import read_journal, sensor_entry
 
@@ -88,10 +82,7 @@ def _instrumentation_declared_by_run(path: Path, sensor: FittedSensor, settings:
 
 
 def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
-    """Build the hypothesised shape that the journal's first line names.
-
-    Raises FileError unless it is a shape that `explore` offers, or a set of these.
-    """
+    """Build the hypothesised shape, or set of them, that the journal's first line names."""
     from probewise.experiment import as_shape
     from probewise.scene import SHAPES, Field
 

@@ -10,10 +10,10 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from probewise._arrays import BoolArray, FloatArray
 from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
@@ -33,21 +33,13 @@ from probewise.arm.carry_out import BY_HAND_S, duration_s
 from probewise.arm.geometry import wrapped_to_pi
 from probewise.cli import _bench
 from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
-from probewise.cli._arm_tasks import (
-    confirm_lowering,
-    nxt_port,
-    open_instrument,
-    prompter_unless_dry_run,
-)
+from probewise.cli._arm_tasks import confirm_lowering, nxt_port, open_instrument, prompter_unless_dry_run
 from probewise.cli._common import message_to_resume, print_result, print_warning, refuse_options
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
 from probewise.recordings.patterns import have_same_albedo
 from probewise.scene import region_of
-
-if TYPE_CHECKING:
-    from probewise._arrays import BoolArray, FloatArray
 
 _OFF_PLAN_MM = 5.0  # tolerance, since a user's own instrument may report the true place
 _OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation
@@ -101,7 +93,8 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
             ask = prompter_unless_dry_run(arguments, arm)
         else:
             arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
-            emulated = not is_own and _is_pty(nxt_port(arguments.arm))
+            # A pseudo-terminal is an emulator's.
+            emulated = not is_own and os.path.realpath(nxt_port(arguments.arm)).startswith(("/dev/pts/", "/dev/ttys"))
             ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             print_result(
@@ -151,17 +144,13 @@ def _read_unfinished_recording(path: Path) -> Recording:
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> list[Reading]:
-    """List the readings of an earlier session, from `out`; none without `resume`.
-
-    Raises FileError if the file exists without `resume`, or it was begun with another plan or another description.
-    """
+    """List the readings of an earlier session, from `out`, which was begun with this plan; none without `resume`."""
     if not resume:
         if out.exists():
             raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
         return []
     before = _read_unfinished_recording(out)
-    off_rad = _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD
-    difference = next(_differences(before.plan, plan, off_rad), None)
+    difference = next(_differences(before.plan, plan, _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD), None)
     if difference is not None:
         raise FileError(out, difference, "the plan and options of the session that began it; or another --out")
     return readings_of_recording(before)
@@ -173,11 +162,10 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
         return
     first = plan.take(np.arange(len(before)))
-    turned_rad = np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad))
     rows = {
         "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
         "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
-        "orientation": turned_rad > off_rad,
+        "orientation": np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad)) > off_rad,
         "scan": before.scan != first.scan,
         "pattern": np.array(_pattern_names_by_row(before)) != np.array(_pattern_names_by_row(first)),
     }
@@ -212,9 +200,9 @@ def person_at_bench(
 ) -> Callable[[RequestToPerson], None]:
     """Return a function that prompts a person to carry out a request of `carry_out`, and then checks the sheet.
 
-    `origin_mm` is the place of the plan's origin. With `check_sheets` a sheet is checked before it is scanned, until it
-    is right or the person overrides the check; a user's own instrument takes only the plan's readings. If `emulated`,
-    requests are carried out by typing in the emulator's terminal, and the prompt says what.
+    With `check_sheets` a sheet is checked before it is scanned, until it is right or the person overrides the check; a
+    user's own instrument takes only the plan's readings. If `emulated`, requests are carried out by typing in the
+    emulator's terminal, and the prompt says what.
     """
     answer = _bench.prompter_for_answer(arm)
 
@@ -241,7 +229,7 @@ def person_at_bench(
         return sheet_check.complaint_about_levels(name, values)
 
     def ask(request: RequestToPerson) -> None:
-        answer(f"{request[0].upper()}{request[1:]}{hint(request)}, then press Enter: ")
+        _bench.press_enter(answer, f"{request}{hint(request)}")
         if request.pattern is None or not check_sheets:
             return
         while (wrong := complaint_about_sheet(request.pattern)) is not None:
@@ -252,11 +240,6 @@ def person_at_bench(
                 break
 
     return ask
-
-
-def _is_pty(port: str) -> bool:
-    """Return whether a port is a pseudo-terminal, and hence an emulator."""
-    return os.path.realpath(port).startswith(("/dev/pts/", "/dev/ttys"))
 
 
 class SheetCheck:
@@ -277,10 +260,7 @@ class SheetCheck:
             self._shades[rows] = uniform_shades_at_places(plan.patterns[name], places[rows])
 
     def complaint_about_reading(self, row: int, value: float) -> str | None:
-        """Return a complaint if the reading of a plan's row contradicts its sheet's pattern, else None.
-
-        There is at most one complaint for each sheet and shade, white or black.
-        """
+        """Return a complaint, one a sheet and shade, if the reading of a plan's row contradicts its sheet's pattern."""
         shade = self._shades[row]
         if math.isnan(shade) or math.isnan(value):
             return None
@@ -296,10 +276,7 @@ class SheetCheck:
         return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
 
     def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
-        """Check a sheet by a reading over its white (True) and one over its black (False); return a complaint or None.
-
-        Readings that are right are kept as levels for later checks.
-        """
+        """Return a complaint about readings over a sheet's white (True) and black (False), else keep them as levels."""
         wrong = None
         if len(values) == 2:
             contrast = values[True] - values[False]
@@ -319,8 +296,8 @@ class SheetCheck:
     ) -> dict[bool, tuple[float, float]]:
         """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
 
-        Return (x, y) in mm in the plan's frame, by these keys; a key is missing if there is no such place. `allowed`
-        returns the mask, (n,), of reachable places, (n, 2), in that frame.
+        Return (x, y) in mm in the plan's frame by these keys, if there is such a place; `allowed` returns the mask
+        of reachable places, (n, 2), in that frame.
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)

@@ -47,10 +47,7 @@ def open_simulator(path: Path, n_workers: int) -> Iterator[Simulator]:
 
 
 def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
-    """Read tables of one system; return them joined, and notes on their columns.
-
-    Raises FileError for one that cannot be read or used, or lacks a column, ParameterError if two are the same.
-    """
+    """Read tables of one system, all with the reading or none; return them joined, and notes on their columns."""
     from probewise.systems import as_recording, concatenate_tables, read_table_for
 
     tables = []

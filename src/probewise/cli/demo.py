@@ -3,30 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
 
-from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import add, add_out, add_seed_and_quiet, print_result
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-    from concurrent.futures import Executor
-
-    from probewise.arm import Pose
-    from probewise.calibration import Calibration, FittedSensor
-    from probewise.diagnosis import Diagnosis
-    from probewise.experiment import Exploration, Model, Step
-    from probewise.progress import Progress
-    from probewise.report.demo import RobotSearch
-    from probewise.scene import Circle
-
-_DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
-MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
-TRUSTS = {"trusting": 1.0, "doubting": 0.9}
-N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
-N_LIVE_ROBOT = 100
-MAX_READINGS = 80
-MAX_READINGS_DOUBT = 20  # bounds the time of the demo
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,221 +17,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo, print its summary, and return the exit status."""
-    from probewise._progress import progress_shown
-
     out = checked_output_directory(arguments.out)
-    drawings = (Drawings(out), Drawings(out / _DIAGNOSIS))
+    from probewise._progress import progress_shown
+    from probewise.cli._demo import DIAGNOSIS, run_demo
+
+    drawings = (Drawings(out), Drawings(out / DIAGNOSIS))
     with progress_shown(quiet=arguments.quiet) as progress:
-        lines = _run_demo(arguments, *drawings, progress)
+        lines = run_demo(*drawings, seed=arguments.seed, full=arguments.full, progress=progress)
     for line in lines:
         print_result(line, quiet=arguments.quiet)
     for each in drawings:
         each.raise_if_any_failed()
     return 0
-
-
-def _run_demo(
-    arguments: argparse.Namespace, drawings: Drawings, drawings_of_diagnosis: Drawings, progress: Progress
-) -> tuple[str, ...]:
-    """Calibrate, search and diagnose, write all files, and return the lines to print."""
-    import json
-    import time
-    from concurrent.futures import as_completed
-    from functools import partial
-
-    from probewise.arm import read_geometry, shipped_geometry_path
-    from probewise.calibration import predict, write_sensor
-    from probewise.cli import diagnose as diagnose_verb
-    from probewise.cli._executor import worker_pool
-    from probewise.inquiry import ReadingEntropy
-    from probewise.recordings import read_recording, shipped
-    from probewise.report import demo as report
-    from probewise.report import diagnosis as diagnosis_report
-    from probewise.report.demo import search_comparison_lines
-    from probewise.world.shipped import true_world as world_behind
-
-    started, seed, out = time.monotonic(), arguments.seed, drawings.out
-    truth, doing = random_hidden_circle_mm(seed), "calibrating, searching and diagnosing"
-    with worker_pool(2) as pool:
-        progress(doing, 0, 8)
-        diagnosing = pool.submit(_diagnose_shipped_recording, seed)
-        calibration = _calibrate_shipped_recording(seed, arguments.full, pool)
-        sensor = calibration.sensor
-
-        def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
-            return pool.submit(search, sensor, truth, seed, stream, max_readings=max_readings, **options)
-
-        doubting = {name: seek(7, MAX_READINGS_DOUBT, trust=trust, saturating=True) for name, trust in TRUSTS.items()}
-        starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in MODELS.items()}
-        searching = {name: seek(2, model=model, on_circle=False) for model, name in MODELS.items()}
-        parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
-        progress(doing, 1, 8)
-        for done, future in enumerate(as_completed(parts), start=2):
-            future.result()
-            progress(doing, done, 8)
-    progress("writing the results")
-    diagnosis, recording = diagnosing.result(), read_recording(shipped("paper"))
-    prediction = predict(sensor, recording.plan, recording.readings)
-    searches, started_alike, doubted = (
-        searches_with_true_circle(sensor, ((name, run.result()) for name, run in runs.items()), truth)
-        for runs in (searching, starting, doubting)
-    )
-    found = report.DemoRun(
-        calibration,
-        recording,
-        prediction,
-        searches,
-        started_alike,
-        doubted,
-        diagnosis,
-        read_geometry(shipped_geometry_path()),
-        ", ".join(effect.name for effect in world_behind("concealed").concealed),
-        seed,
-    )
-    figures = report.figure_drawers(found)
-    figures_of_diagnosis = diagnosis_report.figure_drawers(diagnosis)
-    seconds = time.monotonic() - started
-    of_diagnosis = (f"{_DIAGNOSIS}/{name}" for name in (*figures_of_diagnosis, PAGE))
-    with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
-        write_sensor(sensor, stage / "sensor.json")
-        (stage / _DIAGNOSIS).mkdir()
-        *_, rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_files(diagnosis, StagedFiles(stage / _DIAGNOSIS), rng=rng)
-        answers = report.main_findings_by_key(found)
-        stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
-
-    def page(drawn: Mapping[str, bytes]) -> str:
-        n, frames = sum(len(search.run.steps) for search in searches), list[list[bytes]]()
-        for search in searches:
-            frames.append([])
-            for step in search.run.steps:
-                progress("drawing every step", sum(map(len, frames)), n, search.model)
-                name = f"{search.model}, step {step.number}"
-                frames[-1].append(drawings.draw(name, partial(_frame_png, search, step)))
-        return report.page_html(found, drawn, frames=frames, seconds=seconds)
-
-    drawings_of_diagnosis.write_report(
-        figures_of_diagnosis,
-        lambda drawn: diagnosis_report.page_html(diagnosis, drawn, source="concealed.csv", seed=seed),
-        progress=progress,
-    )
-    drawings.write_report(figures, page, progress=progress)
-    return (
-        *search_comparison_lines(searches),
-        report.summary_sentence(started_alike),
-        f"diagnosis of the second recording: {diagnosis.verdict}, "
-        f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {found.concealed}",
-        f"a concealed saturation: {report.doubt_sentence(doubted)}",
-        f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
-    )
-
-
-def searches_with_true_circle(
-    sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
-) -> list[RobotSearch]:
-    """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
-    import numpy as np
-
-    from probewise.report.demo import RobotSearch
-    from probewise.scene import outlines
-
-    means, circle = sensor.mean(), hypothesised_circle()
-    known = dict(zip(circle.prior.names, truth, strict=True))
-    outline_mm = outlines(circle.region(np.array([truth])))[0]
-    levels = (means["I_min"], means["I_max"])
-    return [RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
-
-
-def hypothesised_circle() -> Circle:
-    """Return the hypothesised shape: a circle entirely on the field, radius 50 to 150 mm."""
-    from probewise.scene import Circle
-
-    return Circle(radius_mm=(50.0, 150.0), inside=True)
-
-
-def random_hidden_circle_mm(seed: int) -> tuple[float, ...]:
-    """Draw the hidden circle from the prior, by the seed: x, y, radius in mm."""
-    import numpy as np
-
-    drawn = hypothesised_circle().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
-    return tuple(drawn.tolist())
-
-
-def _calibrate_shipped_recording(seed: int, full: bool, pool: Executor) -> Calibration:
-    import numpy as np
-
-    from probewise.calibration import calibrate
-    from probewise.recordings import read_recording, shipped
-
-    orders, n_live, rng = (1, 2, 3, 4) if full else (1, 2), 300 if full else N_LIVE, np.random.default_rng([seed, 1])
-    return calibrate(read_recording(shipped("paper")), orders=orders, n_live=n_live, rng=rng, executor=pool)
-
-
-def _frame_png(search: RobotSearch, step: Step) -> bytes:
-    """Draw the view of a search after a step; return a PNG."""
-    from probewise._words import count_with_noun
-    from probewise.report.plots.canvas import axes_of_frame, png
-
-    title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
-    ax = axes_of_frame((6.6, 3.45), (0.7, 0.55, 0.9, 0.3))
-    return png(search.draw_view(step.number, title=title, ax=ax), dpi=90, tight=False)
-
-
-def random_pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
-    """Draw the pose of the first reading, uniformly within the circle; it is the same for all robots compared."""
-    import numpy as np
-
-    from probewise.arm import Pose
-
-    x_mm, y_mm, radius_mm = truth
-    away, turn = np.random.default_rng([seed, 5]).random(2)
-    away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn
-    return Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
-
-
-def search(
-    sensor: FittedSensor,
-    truth: tuple[float, ...],
-    seed: int,
-    stream: int,
-    *,
-    max_readings: int,
-    on_circle: bool = True,
-    saturating: bool = False,
-    **options: Any,
-) -> Exploration:
-    """Search for the circle with a simulated arm and a model by the `options` of `experiment_for`.
-
-    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. With `saturating` the
-    sensor saturates, which its model leaves out.
-    """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from probewise.experiment import Exploration, HiddenShape, arm_over, experiment_for, explore, run_from_place
-    from probewise.report.demo import SATURATION
-    from probewise.scene import Field
-    from probewise.world import saturation
-    from probewise.world.shipped import true_world as world_behind
-
-    field, world, circle = Field(), world_behind("paper"), hypothesised_circle()
-    if saturating:
-        world = replace(world, concealed=(saturation(SATURATION),))
-    experiment = experiment_for(sensor, circle, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
-    rng = np.random.default_rng([seed, stream])
-    with arm_over(world, HiddenShape("circle", circle, np.array(truth)).surface, field, seed=seed) as arm:
-        if not on_circle:
-            return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=max_readings)))
-        first = random_pose_within_circle(truth, seed)
-        return run_from_place(first, arm, experiment, rng=rng, max_readings=max_readings)
-
-
-def _diagnose_shipped_recording(seed: int) -> Diagnosis:
-    """Diagnose the second recording, with the same result as `probewise diagnose`."""
-    from probewise.cli.diagnose import generators_of_diagnosis
-    from probewise.diagnosis import diagnose
-    from probewise.recordings import read_recording, shipped
-
-    rng, *_ = generators_of_diagnosis(seed)
-    return diagnose(read_recording(shipped("concealed")), rng=rng)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from probewise._writing import Drawings, StagedFiles, checked_output_directory
 from probewise.cli import _common as common
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from probewise.calibration import FittedSensor
-    from probewise.diagnosis import Diagnosis
+    from probewise.diagnosis import Diagnosis, PlanAudit
     from probewise.progress import Progress
     from probewise.recordings import Recording
     from probewise.scene import Shape
@@ -57,101 +58,69 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
-    from probewise._progress import progress_shown
-
     if arguments.each:
         from probewise.cli._each import diagnose_each
 
         return diagnose_each(arguments, run)
-    if arguments.simulator is not None and arguments.scheduler is None:
-        return _diagnose_simulator(arguments)
-    if arguments.workers > 1 or arguments.scheduler is not None:
+    of_simulator = arguments.simulator is not None and arguments.scheduler is None
+    if of_simulator:
+        common.refuse_options(arguments, "--simulator, which replaces it", "sensor")
+    elif arguments.workers > 1 or arguments.scheduler is not None:
         raise common.CommandError(
             "--workers and --scheduler are for --each, which diagnoses several recordings one by one"
         )
-    from probewise.diagnosis import NEXT_PLAN, SensorAndShape, audit_plan_of_diagnosis, diagnose, join, weigh_thoroughly
-    from probewise.report import diagnosis as report
-
-    drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
-    with progress_shown(quiet=arguments.quiet) as progress:
-        recordings, sensor, shape = _read_inputs(arguments, progress=progress)
-        diagnosis_rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
-        joined = join(recordings)
-        null = None
-        if sensor is not None and shape is not None:
-            progress("searching for shapes that fit")
-            null = SensorAndShape.of(sensor, shape, joined, rng=diagnosis_rng)
-        weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=progress)
-        diagnosis = diagnose(
-            joined,
-            sensor=None if shape is not None else sensor,
-            null=null,
-            thorough=weigh_again if arguments.thorough else None,
-            rng=diagnosis_rng,
-            progress=progress,
-        )
-        if null is not None:
-            diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
-        source = ", ".join(path.name for path in arguments.recordings)
-
-        def page(drawn: Mapping[str, bytes]) -> str:
-            audit = None if null is not None else audit_plan_of_diagnosis(diagnosis, sensor=sensor)
-            return report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
-
-        read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
-        renamed = drawings.write_results(
-            partial(write_files, diagnosis, rng=files_rng),
-            report.figure_drawers(diagnosis),
-            page,
-            inputs=common.inputs_and_filled_in_plan(read, drawings.out / NEXT_PLAN),
-            outdated=OF_ONE_RUN,
-            progress=progress,
-        )
-    return _finish(arguments, drawings, diagnosis, [f"note: {note}" for note in joined.notes] + renamed)
-
-
-def _diagnose_simulator(arguments: argparse.Namespace) -> int:
-    """Diagnose a user's simulator; write diagnosis.json, both models, next.csv and report; return the exit status."""
-    import numpy as np
-
+    from probewise import diagnosis as engine
     from probewise._progress import progress_shown
-    from probewise.diagnosis import diagnose_system, notes_on_calls, weigh_thoroughly
     from probewise.report import diagnosis as report
 
-    common.refuse_options(arguments, "--simulator, which replaces it", "sensor")
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
-    diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
     source = ", ".join(path.name for path in arguments.recordings)
-    with (
-        open_simulator(arguments.simulator, arguments.workers) as simulator,
-        progress_shown(quiet=arguments.quiet) as progress,
-    ):
-        table, notes = read_joined_table(simulator, arguments.recordings)
-        diagnosis = diagnose_system(
-            simulator,
-            table,
-            source=source,
-            notes=notes,
-            thorough=partial(weigh_thoroughly, rng=nested_rng, progress=progress) if arguments.thorough else None,
-            rng=diagnosis_rng,
-            progress=progress,
+    rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
+    outdated: tuple[str, ...] = OF_ONE_RUN
+    audited: Callable[[], PlanAudit] | None = None
+    with contextlib.ExitStack() as stack:
+        simulator = (
+            stack.enter_context(open_simulator(arguments.simulator, arguments.workers)) if of_simulator else None
         )
-        read = [*arguments.recordings, arguments.simulator]
+        progress = stack.enter_context(progress_shown(quiet=arguments.quiet))
+        weigh_again = partial(engine.weigh_thoroughly, rng=nested_rng, progress=progress)
+        options: dict[str, Any] = {"thorough": weigh_again if arguments.thorough else None, "rng": rng}
+        if simulator is not None:
+            table, said = read_joined_table(simulator, arguments.recordings)
+            diagnosis = engine.diagnose_system(
+                simulator, table, source=source, notes=said, progress=progress, **options
+            )
+            notes = (*diagnosis.recording.notes, *engine.notes_on_calls(diagnosis))
+            files, read = partial(_write_files_of_simulator, diagnosis), [*arguments.recordings, arguments.simulator]
+            advised, column, outdated = "next.csv", simulator.reading, _OF_ONE_RUN_OF_SIMULATOR
+        else:
+            recordings, sensor, shape = _read_inputs(arguments, progress=progress)
+            joined = engine.join(recordings)
+            null = None
+            if sensor is not None and shape is not None:
+                progress("searching for shapes that fit")
+                null = engine.SensorAndShape.of(sensor, shape, joined, rng=rng)
+            given = sensor if null is None else None
+            diagnosis = engine.diagnose(joined, sensor=given, null=null, progress=progress, **options)
+            if null is not None:
+                diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
+            else:
+                audited = partial(engine.audit_plan_of_diagnosis, diagnosis, sensor=sensor)
+            files, notes = partial(write_files, diagnosis, rng=files_rng), joined.notes
+            read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
+            advised, column = engine.NEXT_PLAN, "reading"
         renamed = drawings.write_results(
-            partial(_write_files_of_simulator, diagnosis),
+            files,
             report.figure_drawers(diagnosis),
-            lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed),
-            inputs=common.inputs_and_filled_in_plan(read, drawings.out / "next.csv", simulator.reading),
-            outdated=_OF_ONE_RUN_OF_SIMULATOR,
+            lambda drawn: report.page_html(
+                diagnosis, drawn, source=source, seed=arguments.seed, audit=None if audited is None else audited()
+            ),
+            inputs=common.inputs_and_filled_in_plan(read, drawings.out / advised, column),
+            outdated=outdated,
             progress=progress,
         )
-    said = (*diagnosis.recording.notes, *notes_on_calls(diagnosis))
-    return _finish(arguments, drawings, diagnosis, [f"note: {note}" for note in said] + renamed)
-
-
-def _finish(arguments: argparse.Namespace, drawings: Drawings, diagnosis: Diagnosis, notes: Sequence[str]) -> int:
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return common.finish(drawings, *notes, summary, quiet=arguments.quiet)
+    return common.finish(drawings, *(f"note: {n}" for n in notes), *renamed, summary, quiet=arguments.quiet)
 
 
 def _read_inputs(

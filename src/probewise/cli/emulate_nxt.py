@@ -97,10 +97,7 @@ class _TypedCommands:
         self._is_in_table = False
 
     def poll(self) -> None:
-        """Execute the lines typed so far, without waiting; report if the sensor has gone through the table or come out.
-
-        From a terminal it reads only in the foreground, as job control requires.
-        """
+        """Execute the lines typed so far, if it is in the foreground; report if the sensor went through the table."""
         stand = self._bench.arm.sensor_pose()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0
@@ -110,18 +107,13 @@ class _TypedCommands:
             typed = os.read(0, 4096)
             self._is_heard = bool(typed)
             *lines, self._typed = (self._typed + typed).split(b"\n")
-            for line in lines:
-                self._execute_line(line.decode(errors="replace"))
-
-    def _execute_line(self, line: str) -> None:
-        if line.strip() == "where":
-            print_result(_position_in_words(self._bench.arm.sensor_pose()))
-            return
-        try:
-            self._bench.table.carry_out_line(line)
-            print_result(f"done: {line}")
-        except ParameterError as error:
-            print_result(str(error))
+            for line in (line.decode(errors="replace") for line in lines):
+                try:
+                    if line.strip() != "where":
+                        self._bench.table.carry_out_line(line)
+                    print_result(_position_in_words(stand) if line.strip() == "where" else f"done: {line}")
+                except ParameterError as error:
+                    print_result(str(error))
 
 
 def _position_in_words(stand: SensorPose) -> str:

@@ -100,4 +100,4 @@ def _parse_finite_numbers(text: str) -> tuple[float, ...]:
 
 def _parse_counts(text: str) -> tuple[int, ...]:
     """Parse "N,M,...", integers above zero, each once, for argparse."""
-    return tuple(dict.fromkeys(parse_count(cell, most=1000) for cell in text.split(",")))
+    return tuple(dict.fromkeys(map(count_up_to(1000), text.split(","))))

@@ -92,7 +92,8 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     if path.suffix.lower() == ".json":
         beside = path.with_suffix(".csv")
         if not beside.exists():
-            return pattern_sheets(read_description(path).patterns)
+            _, patterns, _ = read_description(path)
+            return pattern_sheets(patterns)
         what = str(beside)
     plan = read_or_shipped_plan(what)
     return pattern_sheets(plan.patterns, plan)

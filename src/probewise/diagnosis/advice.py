@@ -1,10 +1,9 @@
 """Aliased effects, the readings that would separate them, and the next readings.
 
-The next are chosen by their mutual information with the true hypothesis. The index of the true hypothesis and the
-readings have a mutual information; between hypotheses whose predictions are normal it has a lower bound in closed form,
-from the Bhattacharyya distance of each two (Kolchinsky & Tracey 2017, "Estimating mixture entropy with pairwise
-distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2). Scans are added greedily by information per minute, as
-long as there is information to gain.
+The next are chosen by their mutual information with the index of the true hypothesis. Between hypotheses whose
+predictions are normal it has a lower bound in closed form, from the Bhattacharyya distance of each two (Kolchinsky &
+Tracey 2017, "Estimating mixture entropy with pairwise distances", Entropy 19, 361: Chernoff's divergence, alpha = 1/2).
+Scans are added greedily by information per minute, as long as there is information to gain.
 """
 
 from __future__ import annotations
@@ -12,20 +11,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import (
-    ENOUGH_NATS,
-    MOST_READINGS,
-    NOTHING_NATS,
-    SETTLED,
-    Apparatus,
-    rows_by_command,
-)
+from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, NOTHING_NATS, SETTLED, Apparatus, rows_by_command
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covariance_root
 from probewise.diagnosis.fit import Fit, Model, residual_degrees_of_freedom
 from probewise.diagnosis.locate import Place
@@ -45,8 +37,7 @@ EffectEntry: TypeAlias = tuple[Effect, FloatArray]
 """An effect, and settings of its parameters, (n_columns, n_effect_params), that make one template."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
+class _Columns(NamedTuple):
     """The columns of an effect, in noise sds: in `old` readings and `further` ones, (n_points, n_columns) each.
 
     `of_run`: whether each is the value of one run; then `further` are the columns of the mean of all runs' values.
@@ -127,8 +118,8 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
     entry of an effect's bank (its changes of readings, at a grid of its parameters).
     """
     prepared, misfit_templates = searched.prepared, searched.misfit_templates
-    telling, chosen = dict[str, FloatArray](), dict[str, EffectEntry]()
-    for name, effect in prepared.effects.items():
+    chosen, bases, pairs = dict[str, EffectEntry](), dict[str, FloatArray](), list[Alias]()
+    for name, effect in sorted(prepared.effects.items()):
         is_copy = name_of_first_copy(name) is not None
         if name in prepared.noise_effect_names or effects_out_of_vocabulary((name,)) or is_copy:
             continue
@@ -136,15 +127,12 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         blocks = OrthonormalBlocks.of(problem, templates.columns)
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
-        telling[name] = templates.columns[best]
         chosen[name] = templates.variant_of_entry(best), templates.settings[best]
-    bases = {name: _projected_basis(problem, problem.whiten(telling[name]))[0] for name in sorted(telling)}
-    pairs = []
+        bases[name] = _projected_basis(problem, problem.whiten(templates.columns[best]))[0]
     for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
         cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)
         if cosines[0] >= ALIAS_COSINE:
-            settles_nothing = prepared.apparatus.words.settles_nothing
-            pairs.append(Alias(pair, float(min(cosines[0], 1.0)), settles_nothing, 0))
+            pairs.append(Alias(pair, float(min(cosines[0], 1.0)), prepared.apparatus.words.settles_nothing, 0))
     pairs.sort(key=lambda alias: -alias.cosine)
     return pairs_with_separating_scans(pairs, problem, found, chosen, prepared.usable_rows, prepared.apparatus)
 
@@ -162,18 +150,17 @@ def pairs_with_separating_scans(
     That is the scan that adds three nats between the two in the fewest readings, at most 102, or else the one that adds
     most, if more than half a nat. All parameters are refitted to old and new readings, and the other effect with them;
     of the two cases, that the one acts or the other, the harder one counts. The effect that acts has lambda 8 in the
-    old readings. A pair that no scan separates is unchanged.
-
-    `entries`: the entry of each effect's bank that is taken for it, by name.
+    old readings. A pair that no scan separates is unchanged. `entries` has the one of each effect's bank that stands
+    for it, by name.
     """
     plan = found.model.plan
     scans = apparatus.candidate_measurements(plan, level=found.model.predict(found.z[None, :])[0])
     if not (pairs and scans):
         return list(pairs)
     everywhere = apparatus.plan_of_alternatives(scans, plan)
-    expected, slopes = replace(found.model, plan=everywhere).predict_and_differentiate(found.z)
+    expected, by_z = replace(found.model, plan=everywhere).predict_and_differentiate(found.z)
     of_run = apparatus.coordinates_of_new_run(found.model)  # a further run has values of its own of these
-    shared, own = slopes / problem.sd, slopes[:, of_run] / problem.sd
+    shared, own = by_z / problem.sd, by_z[:, of_run] / problem.sd
     shared[:, of_run] = 0.0
     further, known = np.concatenate([shared, own], axis=1), problem.whiten(found.slopes)
     before = np.concatenate([known, np.zeros((len(known), len(of_run)))], axis=1)
@@ -196,10 +183,9 @@ def pairs_with_separating_scans(
     sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
     best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
     for scan, rows in zip(scans, rows_by_command(scans), strict=True):
+        slopes = before, further[rows]
         for effects, (one, other) in sized.items():
-            gained = [
-                nats_against((before, further[rows]), true, rival, rows) for true, rival in ((one, other), (other, one))
-            ]
+            gained = [nats_against(slopes, *acting, rows) for acting in ((one, other), (other, one))]
             nats = np.min([nats - nats[0] for nats in gained], axis=0)
             if not nats[-1] > NOTHING_NATS:
                 continue
@@ -241,9 +227,8 @@ class NextMeasurement:
 
     `expected_log_bayes_factor`: of the true hypothesis over its closest rival, in nats, averaged over which one is
     true; rivals that the readings cannot tell apart count as one. `between`: each of the hypotheses, in words;
-    `effects`: the effects of each; `probabilities`: of each, as used here, (n_rivals,); `nats` (n_rivals, n_rivals):
-    expected log Bayes factor of each, if true, over each other. `minutes`: duration with breaks; of a table without a
-    time in a known unit, a guess of one second per row.
+    `effects`: the effects of each; `nats` (n_rivals, n_rivals): expected log Bayes factor of each, if true, over each
+    other. `minutes`: duration with breaks; of a table without a time in a known unit, a guess of one second per row.
     """
 
     plan: Plan
@@ -252,7 +237,6 @@ class NextMeasurement:
     expected_log_bayes_factor: float
     between: tuple[str, ...]
     effects: tuple[Names, ...]
-    probabilities: FloatArray
     nats: FloatArray
 
     def classes_among(self, hypotheses: Collection[Names]) -> list[list[int]]:
@@ -266,20 +250,16 @@ class NextMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A hypothesis about the mean readings (not their noise): label, model with best point z (n_params,), probability.
+    """A hypothesis about the mean readings (not their noise)."""
 
-    `label` is its name in words; `root` (n_params, n_params) a square root of the covariance of z: root root^T.
-    `of_run` are the indices of the coordinates of which each run has a value of its own: in a new run it is not known.
-    """
-
-    label: str
+    label: str  # its name in words
     model: Model
-    z: FloatArray
-    root: FloatArray
+    z: FloatArray  # its best point, (n_params,)
+    root: FloatArray  # a square root of the covariance of z, (n_params, n_params): root root^T
     probability: float
-    of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    of_run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # coordinates with a value per run
 
-    def predictive_distribution(self, plan: Plan, sd: float) -> PredictiveNormal:
+    def predict(self, plan: Plan, sd: float) -> PredictiveNormal:
         """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
         mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
         shared, own = slopes.copy(), np.zeros((len(slopes), 0))
@@ -291,26 +271,21 @@ class Rival:
         return PredictiveNormal(mean / sd, np.concatenate([shared @ self.root, own], axis=1) / sd)
 
 
-@dataclass(frozen=True, eq=False)
-class PredictiveNormal:
+class PredictiveNormal(NamedTuple):
     """Normal predictive distribution in noise sds: mean (n_points,), covariance of the readings I + factor factor^T."""
 
     mean: FloatArray
     factor: FloatArray
 
-    def take_readings(self, rows: IntArray) -> PredictiveNormal:
-        """Return the predictive distribution of the readings with these row numbers."""
-        return PredictiveNormal(self.mean[rows], self.factor[rows])
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the readings, (n_points, n_points).
+    def covariance_and_log_det(self) -> tuple[FloatArray, float]:
+        """Return the covariance of the readings, (n_points, n_points), and the log of its determinant.
 
         The noise counts as at least 1e-6 of the largest sd: that of readings that are exact is lost to rounding.
         """
         of_factor = self.factor @ self.factor.T
         noise_2 = max(1.0, _LEAST_NOISE_2 * float(of_factor.diagonal().max(initial=0.0)))
-        return np.asarray(noise_2 * np.eye(len(self.mean)) + of_factor)
+        covariance = noise_2 * np.eye(len(self.mean)) + of_factor
+        return covariance, float(np.linalg.slogdet(covariance)[1])
 
 
 @np.errstate(all="ignore")  # of predictions that ran away
@@ -329,7 +304,10 @@ def measurement_separating_rivals(
     if not offered:
         return None
     everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
-    predictives = [rival.predictive_distribution(everywhere, sd) for rival in rivals]
+    predictives = [rival.predict(everywhere, sd) for rival in rivals]
+
+    def of_readings(taken: IntArray) -> list[PredictiveNormal]:
+        return [PredictiveNormal(mean[taken], factor[taken]) for mean, factor in predictives]
 
     chosen: list[int] = []
     taken: IntArray = np.zeros(0, dtype=np.int64)
@@ -339,8 +317,7 @@ def measurement_separating_rivals(
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
-                taken_together = [predictive.take_readings(together) for predictive in predictives]
-                gains[k] = mutual_information_lower_bound(taken_together, weights) - told
+                gains[k] = mutual_information_lower_bound(of_readings(together), weights) - told
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
@@ -352,7 +329,7 @@ def measurement_separating_rivals(
     if not chosen:
         return None
     scans = [offered[k] for k in chosen]
-    nats = _expected_log_bayes_factors([predictive.take_readings(taken) for predictive in predictives])
+    nats = _expected_log_bayes_factors(of_readings(taken))
     return NextMeasurement(
         apparatus.plan_of_sequence(scans, plan),
         "; then ".join(scan.description for scan in scans),
@@ -360,7 +337,6 @@ def measurement_separating_rivals(
         _mean_over_closest(nats, weights),
         tuple(rival.label for rival in rivals),
         tuple(tuple(sorted(rival.model.names)) for rival in rivals),
-        weights,
         nats,
     )
 
@@ -399,9 +375,8 @@ def measurement_at_place(
         commands[best].description,
         commands[best].minutes,
         float(nats[best]),
-        (f"{apparatus.words.null} {apparatus.words.before_in_words}", NO_NAME),
+        (_null_in_words(apparatus), NO_NAME),
         ((), ("unknown",)),
-        np.full(2, 0.5),
         nats[best] * (1 - np.eye(2)),
     )
 
@@ -414,8 +389,7 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
 
     `weights`: probabilities (n_hypotheses,), which sum to one.
     """
-    covariances = [predictive.covariance for predictive in predictives]
-    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
+    covariances, log_dets = zip(*(each.covariance_and_log_det() for each in predictives), strict=True)
     distances = np.zeros((len(predictives), len(predictives)))
     for a, b in itertools.combinations(range(len(predictives)), 2):
         middle, apart = (covariances[a] + covariances[b]) / 2, predictives[a].mean - predictives[b].mean
@@ -428,9 +402,8 @@ def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weig
 
 def _expected_log_bayes_factors(predictives: Sequence[PredictiveNormal]) -> FloatArray:
     """Return the expected log Bayes factor of each hypothesis, if true, over each other, (n, n), in nats."""
-    covariances = [predictive.covariance for predictive in predictives]
+    covariances, log_dets = zip(*(each.covariance_and_log_det() for each in predictives), strict=True)
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
-    log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]
     out = np.zeros((len(predictives), len(predictives)))
     for a, b in itertools.permutations(range(len(predictives)), 2):
         apart = predictives[a].mean - predictives[b].mean
@@ -478,16 +451,13 @@ def choose_next_measurement(
     it is the verdict (`is_unknown`), or the only rival of the null, the readings go where its residuals are largest,
     `unknown_shows_in`, if anywhere.
     """
-    prepared = searched.prepared
-    plan, apparatus = prepared.recording.plan, prepared.apparatus
-    by_mean = searched.posterior.marginal_over_noise
-    unknown = by_mean.get(("unknown",), 0.0)
+    prepared, by_mean = searched.prepared, searched.posterior.marginal_over_noise
+    plan, apparatus, unknown = prepared.recording.plan, prepared.apparatus, by_mean.get(("unknown",), 0.0)
     # An unknown effect makes no prediction beyond the null.
     probabilities: dict[Names, float] = {(): by_mean.get((), 0.0) + unknown}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
-    ranked = sorted(probabilities, key=lambda names: -probabilities[names])
     found, held = list[WeighedFit](), 0.0  # those of the fewest hypotheses that hold .95, at most five
-    for names in ranked:
+    for names in sorted(probabilities, key=lambda names: -probabilities[names]):
         candidate = searched.best_refit_of(names, searched.certain) if names else null
         if candidate is not None:
             found.append(candidate)
@@ -501,17 +471,20 @@ def choose_next_measurement(
         return measurement_at_place(unknown_shows_in, null.found, prepared.everything, sd, plan, apparatus)
     if is_settled(searched) or len(found) == 1:
         return None
-    unrepaired = f"{apparatus.words.null} {apparatus.words.before_in_words}"
     rivals = []
     for fit in found:
-        label = hypothesis_in_words(fit.names, nothing=unrepaired)
-        slopes, own_sd = fit.found.slopes, fit.whitened_sd
+        label = hypothesis_in_words(fit.names, nothing=_null_in_words(apparatus))
+        slopes, own_sd, model = fit.found.slopes, fit.whitened_sd, fit.found.model
         free = residual_degrees_of_freedom(slopes, own_sd, len(slopes))
         root = covariance_root(slopes, own_sd**2 * len(slopes) / free)
-        of_run = apparatus.coordinates_of_new_run(fit.found.model)
-        rivals.append(Rival(label, fit.found.model, fit.found.z, root, probabilities[fit.names], of_run))
+        of_run = apparatus.coordinates_of_new_run(model)
+        rivals.append(Rival(label, model, fit.found.z, root, probabilities[fit.names], of_run))
     asked = measurement_separating_rivals(rivals, sd, plan, apparatus)
     return asked if asked is not None and asked.expected_log_bayes_factor >= ENOUGH_NATS else None
+
+
+def _null_in_words(apparatus: Apparatus) -> str:
+    return f"{apparatus.words.null} {apparatus.words.before_in_words}"
 
 
 def is_settled(searched: Searched) -> bool:

@@ -51,30 +51,21 @@ def rows_by_command(commands: Sequence[Command]) -> list[IntArray]:
 
 @dataclass(frozen=True)
 class Words:
-    """Words for sentences about an apparatus.
+    """Words for sentences about an apparatus."""
 
-    `null`: the calibrated model; `find_signal`: how to obtain a signal; `settles_nothing`: no reading separates two
-    aliased effects; `run`: name of a group of rows; `next_plan`, `model`: files of the next readings and of the
-    repaired model; `no_cure`: what to say where no scan to add is proposed; `covariates`: words for a table's time,
-    row, level and previous row; None: not a table. `units`: units of covariates whose names do not end with one,
-    "{reading}" for the readings'. `own_names`: what a person has named, such as columns, which no sentence
-    capitalises. `nothing_held_out`: why no part could be held out; `facts`: term and text of what else a report lists;
-    `tells_duration`: how long readings take is known.
-    """
-
-    null: str
-    find_signal: str
-    settles_nothing: str
-    run: str = "scan"
-    next_plan: str = "next_plan.csv"
-    model: str = "sensor.json"
-    no_cure: str = "no scan of this arm helps"
-    covariates: Mapping[str, str] | None = None
-    own_names: frozenset[str] = frozenset()
-    units: Mapping[str, str] = field(default_factory=dict)
+    null: str  # the calibrated model
+    find_signal: str  # how to obtain a signal
+    settles_nothing: str  # no reading separates two aliased effects
+    run: str = "scan"  # a group of rows
+    next_plan: str = "next_plan.csv"  # file of the next readings,
+    model: str = "sensor.json"  # and of the repaired model
+    no_cure: str = "no scan of this arm helps"  # where no scan to add is proposed
+    covariates: Mapping[str, str] | None = None  # time, row, level and previous row of a table; None: not a table
+    own_names: frozenset[str] = frozenset()  # what a person has named, such as columns: no sentence capitalises them
+    units: Mapping[str, str] = field(default_factory=dict)  # not at the end of a name; "{reading}" for the readings'
     nothing_held_out: str = "No scan could be held out: that takes two scans of eight readings or more."
-    facts: tuple[tuple[str, str], ...] = ()
-    tells_duration: bool = True
+    facts: tuple[tuple[str, str], ...] = ()  # term and text of what else a report lists
+    tells_duration: bool = True  # how long readings take is known
 
     @property
     def unrepaired(self) -> str:
@@ -164,12 +155,7 @@ class Apparatus(ABC):
         return ()
 
     def covariate_of_effect(
-        self,
-        effect: Effect,
-        change: FloatArray,
-        without: FloatArray,
-        plan: Plan,
-        known: Sequence[Covariate],
+        self, effect: Effect, change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
     ) -> Covariate | None:
         """Return the first of an effect's covariates that is `known`; None if none is, or `change` is 0 at every row.
 

@@ -11,7 +11,7 @@ import itertools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
@@ -26,12 +26,7 @@ from probewise.diagnosis.apparatus import ENOUGH_NATS, Command, Words
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
-from probewise.diagnosis.light_sensor import (
-    LightSensorApparatus,
-    candidate_scans,
-    scan_started_after,
-    target_swaps,
-)
+from probewise.diagnosis.light_sensor import LightSensorApparatus, candidate_scans, scan_started_after, target_swaps
 from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import (
     LEAST_READINGS,
@@ -77,20 +72,17 @@ class Seen(NamedTuple):
 class EffectBank:
     """The templates of all effects under one plan: changes of its readings, in noise sds.
 
-    `columns` (n_points, n_columns) are grouped in entries: one for each setting (parameter values) of an effect's
-    bank. `entry` (n_columns,) is the entry of each column, `owner` (n_entries,) the index of its effect in `built`,
-    `settings` its parameter values. `slopes` (n_points, n_params) are those of the model. `built`: effects by name.
+    They are grouped in entries: one for each setting (parameter values) of an effect's bank.
     """
 
-    slopes: FloatArray
-    columns: FloatArray
-    entry: IntArray
-    owner: IntArray
+    slopes: FloatArray  # of the model, (n_points, n_params)
+    columns: FloatArray  # (n_points, n_columns)
+    entry: IntArray  # of each column, (n_columns,)
+    owner: IntArray  # the index of the effect of each entry in `built`, (n_entries,)
     built: Mapping[str, Effect]
-    settings: tuple[FloatArray, ...]
+    settings: tuple[FloatArray, ...]  # the parameter values of each entry
 
-    def norms_of_entries(self, columns: FloatArray) -> FloatArray:
-        """Return the root of the sum of squares of each entry's columns, (n_points, n_columns) -> (n_entries,)."""
+    def _norms_of_entries(self, columns: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
 
     def seen_in(self, rows: IntArray, asked: Sequence[str] | None = None) -> dict[str, Seen]:
@@ -105,7 +97,7 @@ class EffectBank:
         own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
         left = -own @ (own[:n_points].T @ columns)
         left[:n_points] += columns
-        raw, kept = self.norms_of_entries(columns), self.norms_of_entries(left)
+        raw, kept = self._norms_of_entries(columns), self._norms_of_entries(left)
         out, present = dict[str, Seen](), dict[str, IntArray]()  # the entries of each effect that act on these rows
         for k in np.unique(self.owner).tolist():
             mine = np.flatnonzero(self.owner == k)
@@ -138,8 +130,10 @@ class EffectBank:
 
     def _smallest(self, name: str, entries: IntArray, left: FloatArray) -> dict[int, float | None]:
         columns = np.flatnonzero(np.isin(self.entry, entries))
-        settings = np.concatenate([self.settings[k] for k in entries])
-        lengths = np.linalg.norm(left[:, columns], axis=0)
+        settings, lengths = (
+            np.concatenate([self.settings[k] for k in entries]),
+            np.linalg.norm(left[:, columns], axis=0),
+        )
         out: dict[int, float | None] = {}
         for k in self.built[name].amplitudes:
             significant = (settings[:, k] != 0) & (lengths > 1e-3)
@@ -154,17 +148,13 @@ def _run_start_indices(codes: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """The model about which a plan is audited: a null at a point z (n_params,), and the noise sd of a reading.
-
-    `effects_under`: function of a plan, the effects scaled to it, by name, without those that cannot act there;
-    `assumed`: model and noise in words.
-    """
+    """The model about which a plan is audited."""
 
     null: Null
-    z: FloatArray
-    sd: float
-    effects_under: Callable[[Plan], Mapping[str, Effect]]
-    assumed: str
+    z: FloatArray  # its coordinates, (n_params,)
+    sd: float  # of the noise of a reading
+    effects_under: Callable[[Plan], Mapping[str, Effect]]  # scaled to a plan, without those that cannot act there
+    assumed: str  # model and noise in words
 
     def bank(self, plan: Plan, *, most: int | None = None) -> EffectBank:
         """Build the templates of the effects on the mean under a plan.
@@ -293,15 +283,17 @@ class PlanAudit(ShowsItself):
     def summary(self) -> str:
         """Return a plain-text summary of the audit."""
         n_runs = len(self.plan.scan_names)
-        lines = [f"{len(self.plan)} readings in {n_runs} {self.words.run}{'' if n_runs == 1 else 's'}; {self.assumed}"]
-        lines += _wrapped_lines("fine", [e.name for e in self.effects_with_detectability("fine")])
-        aliased = self.effects_with_detectability("aliased")
-        lines += _wrapped_lines("aliased", [f"{e.name} ({e.alike[0][0]} {e.alike[0][1]:.2f})" for e in aliased])
-        lines += _wrapped_lines("invisible", [e.name for e in self.effects_with_detectability("invisible")])
-        lines += _READING_GUIDE
+        fine, aliased, invisible = map(self.effects_with_detectability, get_args(Detectability)[::-1])
+        lines = [
+            f"{len(self.plan)} readings in {n_runs} {self.words.run}{'' if n_runs == 1 else 's'}; {self.assumed}",
+            *_wrapped_lines("fine", [e.name for e in fine]),
+            *_wrapped_lines("aliased", [f"{e.name} ({e.alike[0][0]} {e.alike[0][1]:.2f})" for e in aliased]),
+            *_wrapped_lines("invisible", [e.name for e in invisible]),
+            *_READING_GUIDE,
+        ]
         if not self.cures:
-            all_fine = len(self.effects_with_detectability("fine")) == len(self.effects)
-            return "\n".join([*lines, f"cure       {'not needed' if all_fine else self.words.no_cure}"])
+            no_cure = "not needed" if len(fine) == len(self.effects) else self.words.no_cure
+            return "\n".join([*lines, f"cure       {no_cure}"])
         minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
         lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
         for k, cure in enumerate(self.cures, start=1):
@@ -314,10 +306,8 @@ class PlanAudit(ShowsItself):
 
 def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
     """Write a list of names after a label, in lines of up to 99 characters; no lines without names."""
-    text = ", ".join(name.replace(" ", "\0") for name in names)  # a name stays in one line
-    lines = textwrap.wrap(
-        text, _LINE, initial_indent=f"{label:<10} ", subsequent_indent=" " * 11, break_on_hyphens=False
-    )
+    text, first = ", ".join(name.replace(" ", "\0") for name in names), f"{label:<10} "  # a name stays in one line
+    lines = textwrap.wrap(text, _LINE, initial_indent=first, subsequent_indent=" " * 11, break_on_hyphens=False)
     return [line.replace("\0", " ") for line in lines]
 
 
@@ -326,18 +316,16 @@ def audit_plan(
     plan: Plan | Recording,
     *,
     sensor: SensorPrior | None = None,
-    noise_sd: float | None = None,
     effects: Mapping[str, LightEffect] = VOCABULARY,
     progress: Progress = silent,
 ) -> PlanAudit:
     """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
 
-    Arguments and result, with up to five scans to add, are those of `probewise.audit`; and `noise_sd` of one reading,
-    in its unit (by default the calibrated sensor's, or a hundredth of the span between black and white), and the
-    vocabulary `effects`, by name. Raises ParameterError as that, and if units differ or the noise is not above 0.
+    Arguments and result, with up to five scans to add, are those of `probewise.audit`; and the vocabulary `effects`, by
+    name. The noise sd of a reading is the calibrated sensor's, or a hundredth of the span between black and white.
+    Raises ParameterError as that, and if units differ.
     """
-    if isinstance(plan, Recording):
-        plan = plan.plan
+    plan = plan.plan if isinstance(plan, Recording) else plan
     require_plan(plan)
     if sensor is not None:
         require_sensor_prior(sensor)
@@ -345,9 +333,7 @@ def audit_plan(
     require_patterns_described(plan)
     if sensor is not None:
         require_same_unit(sensor, plan)
-    if noise_sd is None and isinstance(sensor, FittedSensor):
-        noise_sd = float(sensor.noise_sd.mean())
-    expected, unit = _expected_sensor(plan, sensor, noise_sd, effects), plan.instrumentation.unit
+    expected, unit = _expected_sensor(plan, sensor, effects), plan.instrumentation.unit
     progress("judging the plan")
     before, cosines = audits_and_cosines(expected.bank(plan), list(effects), unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
@@ -380,12 +366,7 @@ def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, 
     return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
 
 
-def audit_plan_of_diagnosis(
-    diagnosis: Diagnosis,
-    *,
-    sensor: SensorPrior | None = None,
-    effects: Mapping[str, LightEffect] = VOCABULARY,
-) -> PlanAudit:
+def audit_plan_of_diagnosis(diagnosis: Diagnosis, *, sensor: SensorPrior | None = None) -> PlanAudit:
     """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
 
     `diagnosis` is of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...)
@@ -402,9 +383,10 @@ def audit_plan_of_diagnosis(
     else:
         null = default_sensor(extent, known.n_gaussians)
     z, sd = np.clip(null.z(own)[0], -FARTHEST, FARTHEST), float(known.noise_sd.mean())
-    scaled, assumed = partial(_effects_under, effects, _levels(known.chain.names, mean)), _AS_CALIBRATED
-    expected = Expected(null, z, sd, scaled, f"{assumed} from these readings")
-    seen, cosines = audits_and_cosines(expected.bank(plan, most=_SETTINGS), list(effects), plan.instrumentation.unit)
+    scaled = partial(_effects_under, VOCABULARY, _levels(known.chain.names, mean))
+    expected = Expected(null, z, sd, scaled, f"{_AS_CALIBRATED} from these readings")
+    bank = expected.bank(plan, most=_SETTINGS)
+    seen, cosines = audits_and_cosines(bank, list(VOCABULARY), plan.instrumentation.unit)
     return PlanAudit(plan, expected.assumed, seen, cosines, (), seen)
 
 
@@ -419,10 +401,8 @@ def _effects_under(kinds: Mapping[str, LightEffect], levels: tuple[float, float]
     return {name: effect for name, effect in maybe.items() if effect is not None}
 
 
-def _expected_sensor(
-    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None, effects: Mapping[str, LightEffect]
-) -> Expected:
-    """Return a sensor as calibrated, or a typical one, of a noise sd or that expected of it."""
+def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[str, LightEffect]) -> Expected:
+    """Return a sensor as calibrated, or a typical one, with its noise sd."""
     null: CalibratedSensor
     if sensor is not None:
         null, said = sensor_from_samples(sensor), _AS_CALIBRATED
@@ -435,8 +415,7 @@ def _expected_sensor(
         low, high = (bottom + share * span for share in _LEVELS)
         null, z = default_sensor(Extent(low, high, plan), 2), _TYPICAL.copy()
         said = f"a typical sensor of {low:g} to {high:g}"
-    sd = _NOISE * (high - low) if noise_sd is None else noise_sd
-    require(sd > 0, "noise_sd", sd, "greater than 0")
+    sd = float(sensor.noise_sd.mean()) if isinstance(sensor, FittedSensor) else _NOISE * (high - low)
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
     return Expected(null, z, sd, partial(_effects_under, effects, (low, high)), said)
 
@@ -448,27 +427,26 @@ def audits_and_cosines(bank: EffectBank, names: Sequence[str], unit: str) -> tup
     cosines, out = np.zeros((len(names), len(names))), list[EffectAudit]()
     for own, name in enumerate(names):
         effect = bank.built.get(name)
-        if effect is None:
-            out.append(EffectAudit(name, "invisible", 0.0, reason="its covariate does not vary here"))
-        elif effect.stage is Stage.NOISE:
-            enough = n_points >= LEAST_READINGS
-            reason = "" if enough else f"{n_points} readings do not show the scatter; {LEAST_READINGS} would"
-            out.append(EffectAudit(name, "fine" if enough else "invisible", float(enough), reason=reason))
-        else:
+        share, reason = 0.0, "its covariate does not vary here"
+        alike, smallest = list[tuple[str, float]](), tuple[DetectableSize, ...]()
+        if effect is not None and effect.stage is Stage.NOISE:
+            share = float(n_points >= LEAST_READINGS)
+            reason = f"{n_points} readings do not show the scatter; {LEAST_READINGS} would"
+        elif effect is not None:
             share, like, sizes = every[name]
+            reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
-            if share < LEAST_SHARE:
-                reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
-                out.append(EffectAudit(name, "invisible", share, reason=reason))
-            else:
-                alike = sorted(((other, c) for other, c in like.items() if c >= ALIAS), key=lambda pair: -pair[1])
-                smallest = tuple(
-                    DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
-                    for k, amount in sizes.items()
-                )
-                out.append(EffectAudit(name, "aliased" if alike else "fine", share, tuple(alike), smallest))
-        cosines[own, own] = out[-1].share
+            alike = sorted(((other, c) for other, c in like.items() if c >= ALIAS), key=lambda pair: -pair[1])
+            smallest = tuple(
+                DetectableSize(effect.prior.names[k], substitute_reading_unit(effect.units[k], unit), amount)
+                for k, amount in sizes.items()
+            )
+        cosines[own, own] = share
+        if share < LEAST_SHARE:
+            out.append(EffectAudit(name, "invisible", share, reason=reason))
+        else:
+            out.append(EffectAudit(name, "aliased" if alike else "fine", share, tuple(alike), smallest))
     return tuple(out), cosines
 
 
@@ -534,29 +512,20 @@ def audit_json(audit: PlanAudit) -> dict[str, Any]:
     The `amount` of a smallest size is null if no size is detectable, `cure` if there is none; `rows` and alias classes
     that were not computed are left out.
     """
-    plan = audit.cure_plan
+    plan, cure = audit.cure_plan, None
+    if plan is not None:
+        scans = [
+            {"kind": each.kind, "description": each.description, "scan": each.plan.scan_names[0]}
+            | {"readings": len(each.plan), "cures": list(each.cured)}
+            for each in audit.cures
+        ]
+        cure = {"plan": CURE_PLAN, "readings": len(plan), "minutes": audit.extra_minutes, "scans": scans}
     return {
         "format": "audit/1",
         "readings": len(audit.plan),
         "assumed": audit.assumed,
         "effects": _effects_json(audit.effects),
-        "cure": None
-        if plan is None
-        else {
-            "plan": CURE_PLAN,
-            "readings": len(plan),
-            "minutes": audit.extra_minutes,
-            "scans": [
-                {
-                    "kind": cure.kind,
-                    "description": cure.description,
-                    "scan": cure.plan.scan_names[0],
-                    "readings": len(cure.plan),
-                    "cures": list(cure.cured),
-                }
-                for cure in audit.cures
-            ],
-        },
+        "cure": cure,
         "after": _effects_json(audit.after),
         **({} if audit.classes is None else {"alias_classes": [list(names) for names in audit.classes]}),
     }
@@ -569,7 +538,7 @@ def _effects_json(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
             "sight": effect.detectability,
             "surviving_share": effect.share,
             "alike": [{"effect": name, "cosine": cosine} for name, cosine in effect.alike],
-            "smallest": [{"parameter": s.parameter, "unit": s.unit, "amount": s.amount} for s in effect.smallest],
+            "smallest": [asdict(size) for size in effect.smallest],
             "reason": effect.reason,
             **({} if effect.rows is None else {"rows": effect.rows}),
         }
@@ -689,11 +658,9 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     out |= {"hysteresis": "the readings move one way only"}
     out |= dict.fromkeys(("lag", "delay", "settling", "interference"), timeless)
     for column in own.inputs(table.covariates):
-        out |= {
-            f"sensitivity:{column}": "the column does not vary",
-            f"curve:{column}": "it has fewer than three values",
-        }
-        out |= {f"friction:{column}": "the column does not move both ways"}
+        out[f"sensitivity:{column}"] = "the column does not vary"
+        out[f"curve:{column}"] = "it has fewer than three values"
+        out[f"friction:{column}"] = "the column does not move both ways"
     for column in driving_columns(about):
         out |= {f"{kind}:{column}": nothing for kind in ("input_offset", "input_gain", "input_saturation", "dead_zone")}
         out |= {f"backlash:{column}": f"{column} does not turn back", f"input_delay:{column}": timeless}
@@ -701,8 +668,7 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     out |= {"clock_drift": timeless, noise_per_run.name: one_run}
     for name in own.parameters:
         out |= {f"drifts:{name}": timeless, f"steps:{name}": nothing}
-        if name not in own.per_run:
-            out[f"differs:{name}"] = one_run
+        out |= {} if name in own.per_run else {f"differs:{name}": one_run}
     for state in about.states:
         kinds = ("damping", "drag", "friction", "forcing", "periodic_forcing", "limit")
         out |= {f"{kind}:{state}": nothing for kind in kinds}

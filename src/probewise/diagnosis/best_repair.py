@@ -45,8 +45,7 @@ def fit_under_noise(candidate: WeighedFit, law: NoiseLaw, recording: Recording) 
     found, own = candidate.found, candidate.law
     if not (law.walk.size or own.walk.size) or law.is_practically_equal(own):
         return found
-    sensor = found.model.sensor
-    starts = [found.z]
+    sensor, starts = found.model.sensor, [found.z]
     if not law.walk.size:
         starts += [np.concatenate([start, found.z[sensor.n_params :]]) for start in sensor.starts]
     again = min(fit_each_start(found.model, recording, starts, law), key=lambda each: each.objective)
@@ -92,19 +91,15 @@ _RUIN = -1.0  # nats per held-out reading below which named effects are withdraw
 
 @dataclass(frozen=True, eq=False)
 class BestRepair:
-    """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null.
-
-    `calibrated` and `repaired`: the null and that fit as they are under the noise found, which figures show.
-    `out_of_vocabulary`: if the verdict is `unknown`, its effects with a formula but no name in the vocabulary.
-    """
+    """The fit that repairs the model, or the null's, with its noise effects, linearisation and gain over the null."""
 
     fit: WeighedFit
     noise: Names
     problem: Linearised
     improvement: Improvement
-    calibrated: Fit
-    repaired: Fit
-    out_of_vocabulary: Names = ()
+    calibrated: Fit  # the null and
+    repaired: Fit  # that fit as they are under the noise found, which figures show
+    out_of_vocabulary: Names = ()  # of the verdict `unknown`, its effects with a formula but no name in the vocabulary
 
     @classmethod
     def of(
@@ -118,24 +113,23 @@ class BestRepair:
         rng: np.random.Generator,
     ) -> BestRepair:
         """Measure the gain of a fit over the null: in evidence and, under one noise, on held-out parts, in rms."""
-        noise = fit.possible_noise(noise)
+        noise, null, apparatus = fit.possible_noise(noise), test.null, searched.prepared.apparatus
         law, recording = fit.evidence[noise].likeliest_law, searched.prepared.recording
         repaired = fit_under_noise(fit, law, recording)
-        calibrated = repaired if fit is test.null else fit_under_noise(test.null, law, recording)
+        calibrated = repaired if fit is null else fit_under_noise(null, law, recording)
         after = Linearised.of(repaired, law)
-        rms = [rms_beside_walk(found.residuals, law, recording) for found in (calibrated, repaired)]
+        rms, rms_after = (rms_beside_walk(found.residuals, law, recording) for found in (calibrated, repaired))
         held, p_after, comes_next = HeldOutGain(0.0, 0.0, 0, ()), test.p_value, None
-        if fit is not test.null:
-            apparatus = searched.prepared.apparatus
+        if fit is not null:
             # What the mean leaves out looks like memory of the noise: each model has as much as is likeliest about it.
-            own = test.null.evidence[test.null.possible_noise(noise)].likeliest_law
+            own = null.evidence[null.possible_noise(noise)].likeliest_law
             own = own if law.has_memory and np.array_equal(own.lost, law.lost) else law
             gain_on = partial(held_out_gain, calibrated, repaired, recording, law, law_of_null=own)
             held, later = gain_on(apparatus.held_out_parts(recording)), apparatus.what_comes_next(recording)
             comes_next = None if later is None else gain_on(later, each_alone=True)
             p_after = p_value_after(searched, fit, after, rng=rng)
-        log_evidence = fit.evidence[noise].log_z - test.null.evidence[searched.certain].log_z
-        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_after, comes_next)
+        log_evidence = fit.evidence[noise].log_z - null.evidence[searched.certain].log_z
+        gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms, rms_after, p_after, comes_next)
         return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
 
 
@@ -153,7 +147,7 @@ def judged_and_best_repair(
     predicts them no better than the null is none. If nothing unknown does, its odds against nothing on the mean are
     those of the prior, if the latter is credible.
     """
-    null, noise = test.null, test.noise
+    null, noise, on_noise = test.null, test.noise, searched.prepared.noise_effect_names
     if judged.verdict == "unknown":
         leading = searched.leading_combination_out_of_vocabulary()
         fit = searched.best_refit_of(leading, noise) if leading else None
@@ -165,22 +159,20 @@ def judged_and_best_repair(
         # Outlying readings that cluster change no mean: there is nothing of them to predict.
         clusters = sum(share for form, share in judged.unknown_shares.items() if form.endswith(FAR_OUT))
         if clusters < 0.5 and not best_correction(searched, best)[0].held_out.per_reading > 0:
-            on_noise, prior = searched.prepared.noise_effect_names, searched.prior
             mean_is_right = sum(h.probability for h in judged.hypotheses if {*h.effects} <= on_noise)
             if mean_is_right > 1 - SETTLED:
-                odds = prior.unknown / prior.clean_mean * mean_is_right / judged.unknown_probability
+                prior_odds = searched.prior.unknown / searched.prior.clean_mean
+                odds = prior_odds * mean_is_right / judged.unknown_probability
                 judged = judge(searched, test, unknown_weight=min(odds, 1.0))
         if judged.verdict == "unknown":
             return judged, best
-    on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
-        stated = tuple(name for name in judged.repaired_by if name in on_noise)
-        noise = searched.posterior.likeliest_noise(stated)
+        noise = searched.posterior.likeliest_noise(tuple(name for name in judged.repaired_by if name in on_noise))
     on_mean = tuple(name for name in judged.repaired_by if name not in on_noise)
     best = BestRepair.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
     if judged.verdict == "named" and predicts_far_worse(best.improvement):  # it is no repair
         judged = replace(judged, verdict="cannot_tell", combination=(), withdrawn=True, shared=(), leader=())
-        return judged, BestRepair.of(searched, test, null, noise, rng=rng)
+        best = BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best
 
 
@@ -226,13 +218,11 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
         design, rest = np.concatenate([found.slopes, columns], axis=1), law.take_readings(~out)
         kept_miss = rest((found.residuals - design @ amount)[~out])
         sigma_2 = float(kept_miss @ kept_miss) / max(rest.n_kept - design.shape[1], 1)
-        told = (law, out, found.residuals, design, amount, covariance, sigma_2)
-        return predictive_log_densities(*told, sequential=law.has_memory)
+        given = (law, out, found.residuals, design, amount, covariance, sigma_2)
+        return predictive_log_densities(*given, sequential=law.has_memory)
 
-    def gain_per_reading(out: BoolArray) -> FloatArray:
-        return log_densities(columns, out) - log_densities(columns[:, :0], out)
-
-    return Correction(change, columns, mean_gain_over_parts(part, gain_per_reading))
+    held = mean_gain_over_parts(part, lambda out: log_densities(columns, out) - log_densities(columns[:, :0], out))
+    return Correction(change, columns, held)
 
 
 def best_correction(searched: Searched, best: BestRepair) -> tuple[Correction, Parts]:
@@ -284,14 +274,15 @@ def improvement_and_correction(
         problem = Linearised.of(found, problem.law)
         before = dict(gain.heldout_by_scan)  # of blocks, none
         by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
-        gain = replace(
-            gain,
-            log_evidence=log_evidence,
-            heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
-            heldout_sd=math.hypot(gain.heldout_sd, held.sd),
-            heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
-            rms_after=rms_beside_walk(found.residuals, problem.law, recording),
-            p_value_after=p_value_after(searched, best.fit, problem, rng=rng),
+        gain = Improvement(
+            log_evidence,
+            gain.heldout_log_density_per_reading + held.per_reading,
+            math.hypot(gain.heldout_sd, held.sd),
+            tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
+            gain.rms_before,
+            rms_beside_walk(found.residuals, problem.law, recording),
+            p_value_after(searched, best.fit, problem, rng=rng),
+            gain.comes_next,
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
             break

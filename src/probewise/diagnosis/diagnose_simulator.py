@@ -35,15 +35,15 @@ from probewise.systems.all_steps import Integrations
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.binding import sorting_column
 from probewise.systems.forms.reference import note_on_row_order
-from probewise.systems.forms.stop import (
-    MeterStop,
-    is_signal_beyond,
-    meter_stops_and_masks,
-)
+from probewise.systems.forms.stop import MeterStop, is_signal_beyond, meter_stops_and_masks
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
 NEAR_END = 2.0  # noise sds from an end of the declared range to a prediction whose noise the end may cut off
 _EXPLAINED = 3.0  # noise sds from the prediction, limited to the range, to a reading that it explains
+
+
+def _without_readings(recording: RunRecording, rows: BoolArray, *notes: str) -> RunRecording:
+    return replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, *notes))
 
 
 def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
@@ -58,15 +58,12 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
     table.require_rising_time()
     whole = as_recording(simulator, table)
-    readings = whole.readings
     usable = np.flatnonzero(whole.usable)
     chosen = usable[positions_in_stretches(table.scan[usable], MOST_READINGS)]
     if len(chosen) == len(usable):
         return whole
-    kept = np.full(len(readings), np.nan)
-    kept[chosen] = readings[chosen]
     note = f"{len(chosen):,} of {len(usable):,} readings are used, in stretches of six spread over the whole table"
-    return replace(whole, readings=kept, notes=(*whole.notes, note))
+    return _without_readings(whole, ~np.isin(np.arange(len(table)), chosen), note)
 
 
 def without_unpredictable_readings(system: System, recording: RunRecording, *, every_row: bool = False) -> RunRecording:
@@ -78,37 +75,35 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     Raises ParameterError if the simulator gives no finite reading in a row where no column is missing: one with a
     reading or, if `every_row`, any, since the change by an effect would not be finite there.
     """
-    table = cast(RunTable, recording.plan)
-    tried = system.chain(table, ()).predict(system.theta(system.starts), table)
-    there = np.isfinite(tried)
+    table, law = cast(RunTable, recording.plan), system.simulator.law
+    there = np.isfinite(system.chain(table, ()).predict(system.theta(system.starts), table))
     unpredictable = ~there[there.any(axis=1)].any(axis=0) if there.any() else np.ones(len(table), dtype=np.bool_)
     lost = unpredictable & recording.usable
     if not unpredictable.any():
         return recording
-    no_inputs = system.simulator.reading, system.simulator.noise.sd
-    inputs = {name: values for name, values in table.covariates.items() if name not in no_inputs}
-    missing = np.logical_or.reduce([np.zeros(len(table), dtype=np.bool_), *(~np.isfinite(v) for v in inputs.values())])
+    inputs, missing = system.simulator.inputs(table.covariates), np.zeros(len(table), dtype=np.bool_)
+    for values in inputs.values():
+        missing |= ~np.isfinite(values)
     gaps = np.flatnonzero(missing)
-    if system.simulator.law is not None:  # what is missing once is missing to the end of its run
+    if law is not None:  # what is missing once is missing to the end of its run
         for rows in table.rows_by_scan():
             missing[rows] = np.maximum.accumulate(missing[rows])
     wrong = np.flatnonzero((unpredictable if every_row else lost) & ~missing)
     if wrong.size:
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + table.first_line}"
         allowed = "a finite reading in each row somewhere in the prior, or a table without these rows"
-        raise ParameterError("simulate" if system.simulator.law is None else "rates", where, allowed)
+        raise ParameterError("simulate" if law is None else "rates", where, allowed)
     filled = table.with_columns({name: table.interpolated_within_runs(values) for name, values in inputs.items()})
     recording = replace(recording, plan=cast(Plan, filled))
     if not lost.any():
         return recording
     why = "simulator reads is missing there"
-    if system.simulator.law is not None:
+    if law is not None:
         more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
         why = f"law reads is missing in row {gaps[0] + table.first_line}{more}, and a law ends at the first gap of its "
         why += "run; fill the gaps in to use them"
     note = f"{count_with_noun(int(lost.sum()), 'reading')} left out: a column that the {why}"
-    kept = np.where(lost, np.nan, recording.readings)
-    return replace(recording, readings=kept, notes=(*recording.notes, note))
+    return _without_readings(recording, lost, note)
 
 
 def without_readings_at_scattered_stop(
@@ -132,41 +127,36 @@ def without_readings_at_scattered_stop(
 def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolArray) -> RunRecording:
     level = f"{stop.level:.6g} {stop.unit}".rstrip()
     note = f"{count_with_noun(int(rows.sum()), 'reading')} left out, at {level}, where the meter stops"
-    return replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
+    return _without_readings(recording, rows, note)
 
 
-def readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> BoolArray:
-    """Return the mask of the readings at an end of the declared range, and of those whose noise an end cuts off.
+def without_readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> RunRecording:
+    """Leave out, with a note, readings whose noise an end of the declared range cuts off, and note those at an end.
 
-    Of the latter, the fit predicts the signal near an end or beyond, and explains the reading; (n_points,) in all.
-    There are none at an end that no reading reaches, nor where only the misfit of the simulator tells the noise sd.
+    Of the former, the fit predicts the signal near an end or beyond, and explains the reading: near an end only noise
+    away from the end is seen, so their mean is biased. There are none at an end that no reading reaches, nor where only
+    the misfit of the simulator tells the noise sd. Where too few readings would be left for a fit, all stay. The
+    recording itself is returned if no reading is near an end.
     """
-    table, own_sd = cast(RunTable, recording.plan), sd * recording.relative_sd
-    low, high = system.simulator.noise.ends
-    if not is_noise_sd_known_beside_misfit(system.simulator, table):
-        return recording.usable & recording.censored
-    at_low, at_high = masks_of_readings_at_ends(recording.readings, low, high, system.simulator.noise.step)
-    predicted = replace(system, limited=False).chain(table, ()).predict(system.theta(found.z[None, :]), table)[0]
-    is_near = at_low.any() & (predicted - low < NEAR_END * own_sd)
-    is_near |= at_high.any() & (high - predicted < NEAR_END * own_sd)
-    is_explained = np.abs(recording.readings - np.clip(predicted, low, high)) < _EXPLAINED * own_sd
-    return np.asarray(recording.usable & (recording.censored | is_near & is_explained))
-
-
-def without_readings_near_ends(system: System, recording: RunRecording, near_ends: BoolArray) -> RunRecording:
-    """Leave out, with a note, those of the readings `near_ends` that are not at an end.
-
-    Near an end only noise away from the end is seen, so the mean of these readings is biased. Where too few readings
-    would be left for a fit, all stay.
-    """
-    at_end = near_ends & recording.censored
-    cut = near_ends & ~at_end & ((recording.usable & ~near_ends).sum() >= system.least_readings)
+    table, usable = cast(RunTable, recording.plan), recording.usable
+    near = at_end = usable & recording.censored
+    if is_noise_sd_known_beside_misfit(system.simulator, table):
+        (low, high), own_sd = system.simulator.noise.ends, sd * recording.relative_sd
+        at_low, at_high = masks_of_readings_at_ends(recording.readings, low, high, system.simulator.noise.step)
+        predicted = replace(system, limited=False).chain(table, ()).predict(system.theta(found.z[None, :]), table)[0]
+        is_near = at_low.any() & (predicted - low < NEAR_END * own_sd)
+        is_near |= at_high.any() & (high - predicted < NEAR_END * own_sd)
+        is_explained = np.abs(recording.readings - np.clip(predicted, low, high)) < _EXPLAINED * own_sd
+        near = at_end | usable & is_near & is_explained
+    if not near.any():
+        return recording
+    cut = near & ~at_end & ((usable & ~near).sum() >= system.least_readings)
     words = (
         (at_end, "at an end of the declared range: used only as the statement that the signal is there or beyond"),
         (cut, "left out near an end of the declared range, which cuts off the noise"),
     )
-    said = (f"{count_with_noun(int(rows.sum()), 'reading')} {what}" for rows, what in words if rows.any())
-    return replace(recording, readings=np.where(cut, np.nan, recording.readings), notes=(*recording.notes, *said))
+    notes = [f"{count_with_noun(int(rows.sum()), 'reading')} {what}" for rows, what in words if rows.any()]
+    return _without_readings(recording, cut, *notes)
 
 
 _FAR = 4.0  # sds; if the truth is at the end of its prior, one recording in 30,000 is this far beyond it
@@ -189,18 +179,15 @@ def notes_on_prior_conflict(system: System, found: Fit, law: NoiseLaw) -> Iterat
         # Row k of the inverse without the prior of parameter k is that with it over 1 - variance (Sherman-Morrison).
         steps = (covariance @ downhill + z * variance) / (1 - variance)
         sds = np.sqrt(variance / (1 - variance))
-    for k, (name, prior) in enumerate(system.marginals.items()):
-        step, sd = float(steps[k]), float(sds[k])
+    for (name, prior), at, step, sd in zip(system.marginals.items(), z.tolist(), steps.tolist(), sds, strict=True):
         if isinstance(prior, Uniform | LogUniform):
-            end = float(ndtr(-abs(z[k])) / (np.exp(-0.5 * z[k] ** 2) / np.sqrt(2 * np.pi)))
-            if np.sign(z[k]) * step - end > _FAR * sd:
-                where, more = ("upper", "larger") if z[k] > 0 else ("lower", "smaller")
+            end = float(ndtr(-abs(at)) / (np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)))
+            if np.sign(at) * step - end > _FAR * sd:
+                where, more = ("upper", "larger") if at > 0 else ("lower", "smaller")
                 yield f"{name} is at the {where} end of its prior, {prior}, but the readings ask for a {more} value"
-        elif isinstance(prior, Normal):
-            away = z[k] + step
-            if abs(away) > _FAR * np.hypot(1, sd):
-                way = "above" if away > 0 else "below"
-                yield f"the readings ask for {name} {abs(away):.1f} sds {way} the mean of its prior, {prior}"
+        elif isinstance(prior, Normal) and abs(at + step) > _FAR * np.hypot(1, sd):
+            way = "above" if at + step > 0 else "below"
+            yield f"the readings ask for {name} {abs(at + step):.1f} sds {way} the mean of its prior, {prior}"
 
 
 def notes_on_declared_noise(simulator: Simulator, noise_sd: FloatArray) -> Iterator[str]:
@@ -314,20 +301,19 @@ def prepare_system(
         told("fitting the simulator without lost readings")
         recording = cast(RunRecording, lost.left_out_of(recording))
         system, found, sd = fit_system(plain, recording)
-    near_ends = readings_near_ends(system, found, sd, recording)
-    if near_ends.any():
-        recording = without_readings_near_ends(system, recording, near_ends)
-        known = is_noise_sd_known_beside_misfit(simulator, table)
+    beside_ends = without_readings_near_ends(system, found, sd, recording)
+    if beside_ends is not recording:
+        recording, known = beside_ends, is_noise_sd_known_beside_misfit(simulator, table)
         system = replace(system, first=found.z, slack=NEAR_END * sd if known else 0.0)
         system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
-    recording = replace(recording, notes=(*recording.notes, *conflicts))
     apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop, lost=effect)
     sorting = sorting_column(apparatus.about)
     if sorting is not None:
-        note = f"rows are sorted by {sorting}: what jumps or wanders from row to row may change with {sorting} instead"
-        recording = replace(recording, notes=(*recording.notes, note))
+        told_of = f"what jumps or wanders from row to row may change with {sorting} instead"
+        conflicts = (*conflicts, f"rows are sorted by {sorting}: {told_of}")
+    recording = replace(recording, notes=(*recording.notes, *conflicts))
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if with_effects else {}
@@ -361,11 +347,10 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     if caller.n_failed:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
     if caller.interpolated:
-        names = ", ".join(sorted(caller.interpolated))
         out.append(
-            f"simulate takes no array of {names}: each reading is interpolated between fixed values, as if the "
-            "parameter had had that row's value from the start; if earlier rows affect later ones, let simulate take "
-            "arrays, or write a law"
+            f"simulate takes no array of {', '.join(sorted(caller.interpolated))}: each reading is interpolated "
+            "between fixed values, as if the parameter had had that row's value from the start; if earlier rows affect "
+            "later ones, let simulate take arrays, or write a law"
         )
     return tuple(out)
 

@@ -10,6 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.resources import files
 from typing import Any, TypeAlias, cast
 
@@ -84,9 +85,9 @@ class PredictionAndResiduals:
     walk: FloatArray = field(default_factory=lambda: np.zeros(1))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "readings", read_only_floats(self.readings))
-        object.__setattr__(self, "residuals", read_only_floats(self.residuals))
-        object.__setattr__(self, "walk", read_only_floats(np.broadcast_to(self.walk, self.readings.shape)))
+        shaped = {"readings": self.readings, "residuals": self.residuals}
+        for name, values in {**shaped, "walk": np.broadcast_to(self.walk, np.shape(self.readings))}.items():
+            object.__setattr__(self, name, read_only_floats(values))
 
     @property
     def has_walk(self) -> bool:
@@ -106,16 +107,13 @@ def predictions_before_and_after(
 
     `change`: correction of the predictions of the readings that are used, (n_usable,), 0 if there is none.
     """
-    everything, law = prepared.everything, best.problem.law
-    used = prepared.usable_rows_of_everything
-    by_rows = np.zeros(len(everything))
+    everything, law, used = prepared.everything, best.problem.law, prepared.usable_rows_of_everything
+    readings, by_rows = np.where(everything.usable, everything.readings, np.nan), np.zeros(len(everything))
     by_rows[used] = change
-    readings = np.where(everything.usable, everything.readings, np.nan)
 
     def shown(found: Fit, added: FloatArray) -> PredictionAndResiduals:
         model = replace(found.model, plan=everything.plan) if prepared.is_thinned else found.model
-        predicted = np.asarray(model.predict(found.z[None, :])[0] + added)
-        left = found.residuals - added[used]
+        predicted, left = np.asarray(model.predict(found.z[None, :])[0] + added), found.residuals - added[used]
         # Between readings, the expected walk is straight; it begins at 0 before the first row.
         known = walk_given_readings(law, left)
         walk = np.interp(np.arange(len(everything)), np.append(-1, used), np.append(0.0, known))
@@ -150,21 +148,17 @@ def locate_effects_and_residuals(
     scans = next((c for c in covariates if c.name == "scan"), None)
     named: list[Place] = []
     for effect in sorted(found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
-        change = found.change_by_effect(effect.name, prepared.usable_rows)
+        change, size = found.change_by_effect(effect.name, prepared.usable_rows), sizes.get(effect.name, 0.0)
         shows_in = prepared.apparatus.covariate_of_effect(effect, change, found.predicted - change, plan, covariates)
         if shows_in is not None:
-            size = sizes.get(effect.name, 0.0)
-            named += places_of_effect(
-                effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size
-            )
-    scan_names = prepared.recording.plan.scan_names
-    scanned = significant_places(problem, covariates, scan_names, residuals, test.draws)
+            seen = (effect, change, shows_in, scans, plan, residuals)
+            named += places_of_effect(*seen, p_value=judged.p_value, size=size)
+    find = partial(significant_places, covariates=covariates, scan_names=prepared.recording.plan.scan_names)
+    scanned = find(problem, residuals=residuals, draws=test.draws)
     if judged.verdict == "unknown" and not (named or scanned) and law.share:
         # Under heavy-tailed noise, residuals in outlying readings only are not significant.
         white = Linearised.of(test.null.found, law.without_tail_or_rounding())
-        scanned = significant_places(
-            white, covariates, scan_names, residuals, white.draw_null_residuals(N_DRAWS, rng=rng)
-        )
+        scanned = find(white, residuals=residuals, draws=white.draw_null_residuals(N_DRAWS, rng=rng))
     first: dict[str, Place] = {}
     for place in [*named, *_controls_before_time(scanned, prepared.apparatus.controls)]:
         first.setdefault(place.figure_name, place)
@@ -370,48 +364,34 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         ],
         "unknown_probability": diagnosis.unknown_probability,
         "clean_probability": diagnosis.clean_probability,
-        "unknown_candidates": [
-            {"name": name, "probability": probability} for name, probability in diagnosis.unknown_candidates
-        ],
+        "unknown_candidates": [{"name": name, "probability": p} for name, p in diagnosis.unknown_candidates],
         "credible_set": diagnosis.credible,
         "where": [
-            {
-                "covariate": place.covariate,
-                "scan": place.scan,
-                "from": place.start,
-                "to": place.end,
-                "p_value": place.p_value,
-                "witness": place.figure_name,
-            }
+            {"covariate": place.covariate, "scan": place.scan, "from": place.start, "to": place.end}
+            | {"p_value": place.p_value, "witness": place.figure_name}
             for place in diagnosis.where
         ],
         "improvement": _as_dict(diagnosis.improvement, "heldout_by_scan", "comes_next"),
         "aliases": [asdict(a) for a in diagnosis.aliases],
         "noise": _as_dict(diagnosis.noise, "nuisances"),
-        "next_measurement": None
-        if plan is None
-        else {
+        "next_measurement": None,
+    }
+    if plan is not None:
+        document["next_measurement"] = {
             "plan": diagnosis.apparatus.words.next_plan,
             "readings": len(plan.plan),
             "minutes": plan.minutes,
             "expected_log_bayes_factor": plan.expected_log_bayes_factor,
-        },
-    }
+        }
     if remainder is not None:
         document["remainder"] = _without_empty_formula(remainder)
     if formula is not None:
         document["formula"] = asdict(formula)
     if diagnosis.weighings:
         document["thorough"] = [
-            {
-                "effects": _public_names(twice.effects),
-                "n_gaussians": twice.n_gaussians,
-                "log_evidence_laplace": twice.laplace,
-                "log_evidence_nested": twice.nested,
-                "error": twice.error,
-                "agree": twice.agree,
-                "doubts": twice.doubts,
-            }
+            {"effects": _public_names(twice.effects), "n_gaussians": twice.n_gaussians}
+            | {"log_evidence_laplace": twice.laplace, "log_evidence_nested": twice.nested}
+            | {"error": twice.error, "agree": twice.agree, "doubts": twice.doubts}
             for twice in diagnosis.weighings
         ]
     plain: dict[str, Any] = json.loads(json.dumps(document))  # with lists for tuples
@@ -454,7 +434,7 @@ def diagnose(
     Parameters
     ----------
     null
-        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape.
+        Another null model instead of a calibrated sensor: `SensorAndShape` for an unknown shape. Not with a `sensor`.
     effects
         The vocabulary of effects, by name. `RARE_EFFECTS` are tried too; they are named where hardly anything
         else out of vocabulary explains the readings.
@@ -464,11 +444,6 @@ def diagnose(
     hands
         Whether a person can exchange or turn sheets for the next readings; if not, the next scans are over the sheet in
         place.
-
-    Raises
-    ------
-    ParameterError
-        As `probewise.diagnose`, and if both a sensor and a null are given.
     """
     require_rng(rng)
     require_progress(progress)
@@ -499,53 +474,28 @@ def diagnose_prepared(
     test = run_global_test(searched, rng=rng)
     progress("testing the repair on held-out readings")
     judged, best = judged_and_best_repair(searched, test, judge(searched, test), rng=rng)
-    null_samples, best_samples, repaired = draw_models(searched, test, judged, best, rng=rng, progress=progress)
-    found = effects_found(searched, judged.hypotheses, best, best_samples, rng=rng)
+    null, samples, repaired = draw_models(searched, test, judged, best, rng=rng, progress=progress)
+    found = effects_found(searched, judged.hypotheses, best, samples, rng=rng)
     progress("locating the residuals")
     where = locate_effects_and_residuals(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
-    change = np.zeros(len(prepared.usable_rows))
-    if judged.verdict == "unknown" and not best.out_of_vocabulary:
+    change, is_unknown = np.zeros(len(prepared.usable_rows)), judged.verdict == "unknown"
+    if is_unknown and not best.out_of_vocabulary:
         improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")
-    asked = choose_next_measurement(
-        searched, test.null, unknown_shows_in=next(iter(where), None), is_unknown=judged.verdict == "unknown"
-    )
-    noise = noise_found(searched, best, best_samples, rng=rng)
+    shows_in = next(iter(where), None)
+    asked = choose_next_measurement(searched, test.null, unknown_shows_in=shows_in, is_unknown=is_unknown)
+    noise = noise_found(searched, best, samples, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
-    formula = formula_of(searched, judged, best, best_samples)
-    shares = searched.evidences.unknown_shares
-    beside = searched.likeliest_fit_beside_unknown(test.noise)
-    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
-    settles, apart = separating_readings_in_words(searched, judged, asked)
-    grounds = Grounds(
-        words=prepared.apparatus.words,
-        n_readings=len(prepared.usable_rows),
-        least_readings=prepared.least_readings,
-        form=searched.nulls[searched.likeliest_order].ssf_in_words,
-        sentences={effect.name: effect.sentence for effect in found},
-        like=tuple(sentence_from_samples(each, best_samples.effect_samples(each.name)) for each in formulas),
-        family=max(shares, key=lambda family: shares[family], default=""),
-        beside=beside.names if beside else (),
-        shows_in=tuple(place.covariate for place in where),
-        p_value_after=best.improvement.p_value_after,
-        nuisances=noise.nuisances,
-        settles=settles,
-        apart=apart,
-    )
-    reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
-    if prepared.is_thinned:
-        n_usable = int(prepared.everything.usable.sum())
-        reason += f" (From {len(prepared.usable_rows)} of {n_usable} readings, evenly spread.)"
     before, after = predictions_before_and_after(prepared, best, change)
-    return Diagnosis(
+    diagnosis = Diagnosis(
         recording=prepared.everything,
         apparatus=prepared.apparatus,
         **vars(judged),
-        reason=reason,
+        reason="",
         effects=found,
         noise=noise,
-        null=null_samples,
+        null=null,
         repaired=repaired,
         improvement=best.improvement,
         before=before,
@@ -556,43 +506,58 @@ def diagnose_prepared(
         is_settled=is_settled(searched),
         weighings=weighings,
         remainder=remainder,
-        formula=formula,
+        formula=formula_of(searched, judged, best, samples),
     )
+    return replace(diagnosis, reason=_reason(diagnosis, searched, test, best, samples))
+
+
+def _reason(diagnosis: Diagnosis, searched: Searched, test: GlobalTest, best: BestRepair, samples: ModelSamples) -> str:
+    """Return the verdict and its reason in words; `samples` are those of the best repair."""
+    prepared, shares = searched.prepared, searched.evidences.unknown_shares
+    beside = searched.likeliest_fit_beside_unknown(test.noise)
+    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
+    settles, apart = separating_readings_in_words(searched, diagnosis, diagnosis.next_measurement)
+    grounds = Grounds(
+        words=prepared.apparatus.words,
+        n_readings=len(prepared.usable_rows),
+        least_readings=prepared.least_readings,
+        form=searched.nulls[searched.likeliest_order].ssf_in_words,
+        sentences={effect.name: effect.sentence for effect in diagnosis.effects},
+        like=tuple(sentence_from_samples(each, samples.effect_samples(each.name)) for each in formulas),
+        family=max(shares, key=lambda family: shares[family], default=""),
+        beside=beside.names if beside else (),
+        shows_in=tuple(place.covariate for place in diagnosis.where),
+        p_value_after=diagnosis.improvement.p_value_after,
+        nuisances=diagnosis.noise.nuisances,
+        settles=settles,
+        apart=apart,
+    )
+    reason = sentence_with_agreement(reason_of(diagnosis, grounds), diagnosis.weighings)
+    if prepared.is_thinned:
+        n_usable = int(prepared.everything.usable.sum())
+        reason += f" (From {len(prepared.usable_rows)} of {n_usable} readings, evenly spread.)"
+    return reason
 
 
 def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
     """Fit the sensor with these effects, at the SSF order (number of Gaussians) with the largest evidence.
 
-    Parameters
-    ----------
-    recording
-        What was read.
-    names
-        Names of `EFFECTS`, in the vocabulary or out of it; empty for the calibrated sensor alone.
-    rng
-        Source of randomness, for the posterior samples.
+    `names` are of `EFFECTS`, in the vocabulary or out of it; empty for the calibrated sensor alone. The samples are
+    without any effect on the mean if the search kept no refit with all of them, and without the noise effects (but
+    those beyond doubt) if it kept no noise model of just these.
 
-    Returns
-    -------
-    ModelSamples
-        The samples; without any effect on the mean if the search kept no refit with all of them, and without the noise
-        effects (but those beyond doubt) if it kept no noise model of just these.
-
-    Raises
-    ------
-    ParameterError
-        If there is no effect of a name, or it cannot act in this recording.
+    Raises ParameterError if there is no effect of a name, or it cannot act in this recording.
     """
     require_recording(recording)
     require_rng(rng)
     names = checked_texts("names", names, "names of effects")
-    extent = Extent.of(recording)
+    extent, allowed = Extent.of(recording), "effects of the vocabulary that this recording can show"
     effects: dict[str, Effect] = {}
     for name in names:
         require_one_of("names", name, list(EFFECTS))
         effect = EFFECTS[name].for_extent(extent)
         if effect is None:
-            raise ParameterError("names", name, "effects of the vocabulary that this recording can show")
+            raise ParameterError("names", name, allowed)
         effects[name] = effect
     prepared = Prepared(recording, effects, None, LightSensorApparatus(), recording)
     found = search(prepared, max_order=MAX_ORDER, depth=max(len(names), 1))
@@ -602,5 +567,5 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     best = found.best_refit_of(on_mean, noise) or found.best_refit_of((), noise)
     assert best is not None  # the calibrated sensor is always fitted
     if not np.isfinite(best.evidence[noise].log_z):
-        raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that this recording can show")
+        raise ParameterError("names", ", ".join(noise), allowed)
     return sample_model(best.found, best.evidence[noise], recording, weights=best.weights, rng=rng)

@@ -1,4 +1,4 @@
-"""Laplace evidence of a fit under noise models, and closed-form Bayes factors of templates to add to it.
+"""Laplace evidence of a fit under noise models, and the fit linearised: what it leaves of readings and of templates.
 
 The nodes of a noise model's prior serve every fit. Many readings determine the noise better than its nodes lie apart:
 all nodes miss the peak, the evidence is too low, and the tests of the fit assume a noise that is wrong. There adaptive
@@ -16,7 +16,7 @@ from scipy.special import log_ndtr, logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, log_multiplicity, residual_degrees_of_freedom, with_prior
-from probewise.diagnosis.noise import NoiseLaw, NoiseModel, NoiseNodes, stacked_density
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, NoiseNodes, stacked_density, whiten_under_each
 from probewise.effects import NoiseEffect
 from probewise.sensor.stages import effects_with_columns
 
@@ -25,9 +25,6 @@ SCALES = np.geomspace(0.05, 25.0, 8)
 
 LEAST_VISIBLE = 4.0
 """Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
-
-_INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
-
 
 _MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noise models
 
@@ -99,8 +96,7 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
         out[nodes] = _normal_log_evidences(found, [laws[node] for node in nodes], joined)
     tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
     for node in sorted({*range(len(out))} - {*normal}):
-        law = laws[node]
-        tailed.setdefault((law.whitening_key, law.flat > 0), []).append(node)
+        tailed.setdefault((laws[node].whitening_key, laws[node].flat > 0), []).append(node)
     for nodes in tailed.values():
         out[nodes] = _tailed_log_evidences(found, [laws[node] for node in nodes], joined)
     out += np.array([law.log_extra for law in laws]) + log_multiplicity(found.model.sensor)
@@ -108,18 +104,10 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
     return out
 
 
-def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
-    """Return a square root of the Laplace covariance of a fit's coordinates, (n_params, n_params).
-
-    Arguments: whitened slopes (n_points, n_params), and the variance of a whitened reading.
-    """
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(with_prior(slopes.T @ slopes / variance))).T)
-
-
 def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
-    turned = np.stack([law(joined) for law in laws])
+    turned = np.ascontiguousarray(whiten_under_each(laws, joined))
     gram = turned.transpose(0, 2, 1) @ turned
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
     steps, least = np.zeros_like(jr), np.array([law.sigma_floor**2 for law in laws])
@@ -162,7 +150,6 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
 
 
 def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Return the Newton steps to the modes, (n_laws, n_params); `downhill` are minus the gradients."""
     return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])
 
 
@@ -171,16 +158,161 @@ def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArra
     return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))
 
 
+_RESOLVED = 0.6  # posterior sd over the distance of nodes, from which their sum is the integral to a percent
+_SAME = 1e-9  # of the prior's unit cube: nodes as close are one
+_EDGE = 1e-6  # of it too
+_ROUNDS = 6
+_REACH = math.sqrt(3)  # of the nodes on both sides of a peak, in posterior sds
+_NODES = _REACH * np.array([0.0, -1.0, 1.0])
+_LOG_WEIGHTS = np.log([2 / 3, 1 / 6, 1 / 6]) + 0.5 * _NODES**2 + 0.5 * math.log(2 * math.pi)
+
+
+def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) -> NoiseEvidence:
+    """Return the evidence of a fit with nodes about its peak, along each parameter whose nodes lie too far apart.
+
+    The other nodes of these parameters are dropped. The evidence is returned as it is if all nodes are close enough, if
+    refined nodes cannot raise it to `least` nats, or if no higher peak is found.
+    """
+    if not np.isfinite(evidence.log_z):
+        return evidence
+    columns, start, spacing, gain = _coarse_parameters(evidence)
+    if not columns.size or evidence.log_z + gain < least:
+        return evidence
+    model, best = evidence.noise, evidence.nodes.settings[int(np.argmax(evidence.log_z_nodes))]
+    parts = [(effect, part) for effect, part in effects_with_columns(model.effects) if effect.nodes_per_parameter]
+
+    def log_density(points: FloatArray) -> FloatArray:
+        settings = np.repeat(best[None, :], len(points), axis=0)
+        for effect, part in parts:
+            own = (columns >= part.start) & (columns < part.stop)
+            if own.any():
+                unit = effect.prior.to_unit_cube(settings[:, part])
+                unit[:, columns[own] - part.start] = points[:, own]
+                settings[:, part] = effect.prior.from_unit_cube(unit)
+        return log_evidence_under(found, model.laws_at(settings, found.predicted))
+
+    while columns.size:
+        peak, sd = _peak_and_sds(log_density, start, spacing)
+        inside = (peak - _REACH * sd > 0) & (peak + _REACH * sd < 1)
+        if inside.all():
+            break
+        # At an end of its prior a parameter keeps the nodes that it has.
+        columns, start, spacing = columns[inside], start[inside], spacing[inside]
+    if not columns.size:
+        return evidence
+    nodes = dict(model.likely)
+    for effect, part in parts:
+        about = {int(c) - part.start: (peak[k], sd[k]) for k, c in enumerate(columns) if part.start <= c < part.stop}
+        if about:
+            nodes[effect.name] = _nodes_about(effect, about)
+    out = laplace_evidence(found, replace(model, likely=nodes))
+    before, after = (float((e.log_z_nodes - e.nodes.log_weights).max(initial=-math.inf)) for e in (evidence, out))
+    return out if after > before else evidence
+
+
+def _coarse_parameters(evidence: NoiseEvidence) -> tuple[IntArray, FloatArray, FloatArray, float]:
+    """Find parameters of a noise model whose nodes lie further apart than a fit determines them.
+
+    Returns their numbers among the settings of the nodes, their values at the likeliest node and the distances of
+    nodes, in the unit cube of the prior, (n_coarse,) all; and the nats by which the evidence may rise between nodes.
+    """
+    weights, found = evidence.weights, []
+    for effect, part in effects_with_columns(evidence.noise.effects):
+        settings = evidence.nodes.settings[:, part]
+        if len(effect.nodes_per_parameter) != settings.shape[1] or np.all(settings == settings[0]):
+            continue  # without nodes of the prior, or known
+        unit = effect.prior.to_unit_cube(settings)
+        for k, n in enumerate(effect.nodes_per_parameter):
+            own, node_of = np.unique(np.round(unit[:, k] / _SAME), return_inverse=True)
+            marginal = np.bincount(node_of.ravel(), weights).astype(np.float64)
+            own = own * _SAME
+            spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
+            mean = float(marginal @ own)
+            if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
+                at = unit[int(np.argmax(weights)), k]
+                found.append((part.start + k, float(at), spacing, _rise_between(marginal)))
+    columns, peak, spacings, gains = zip(*found, strict=True) if found else ((), (), (), ())
+    return np.array(columns, dtype=np.int64), np.array(peak), np.array(spacings), float(sum(gains))
+
+
+def _rise_between(marginal: FloatArray) -> float:
+    """Return how many nats the peak of a parabola through the best node and its neighbours is above that node.
+
+    `marginal`: the nodes' probabilities in order, (n_nodes,). Infinity for a single node.
+    """
+    if len(marginal) < 2:
+        return math.inf
+    with np.errstate(divide="ignore"):
+        log_p = np.maximum(np.log(marginal), -700.0)
+    k = int(np.argmax(log_p))
+    before, after = log_p[max(k - 1, 0)], log_p[min(k + 1, len(log_p) - 1)]
+    bend = float(2 * log_p[k] - before - after)
+    return float(after - before) ** 2 / (8 * bend) if bend > 0 else 0.0
+
+
+def _peak_and_sds(
+    log_density: Callable[[FloatArray], FloatArray], start: FloatArray, spacing: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the peak of a density over the unit cube and its sd along each axis, (n_axes,) both.
+
+    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd.
+    """
+    center, step, eye = start, spacing, np.eye(len(start))
+    for _ in range(_ROUNDS):
+        center = np.clip(center, step + _EDGE, 1 - step - _EDGE)
+        middle, *around = log_density(center + step * np.concatenate([0 * eye[:1], -eye, eye]))
+        below, above = np.split(np.array(around), 2)
+        if not np.isfinite([middle, *around]).all():
+            break
+        slope, bend = 0.5 * (above - below), 2 * middle - above - below
+        concave = bend > 1e-3
+        bend = np.where(concave, bend, 1.0)
+        sd = step / np.sqrt(bend)
+        move = np.clip(np.where(concave, slope / bend, np.sign(slope)), -2.0, 2.0)
+        center = np.clip(center + move * step, _EDGE, 1 - _EDGE)
+        if np.all(np.abs(move) * step < 0.5 * sd) and np.all(step < 2 * sd):
+            break
+        step = np.where(concave, np.clip(sd, step / 8, step), step)
+    return center, sd
+
+
+def _nodes_about(effect: NoiseEffect, about: Mapping[int, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
+    """Return the nodes of one effect, (n_nodes, n_params), and log weights: about a peak, the prior's where not coarse.
+
+    `about` has the peak and the sd of coarse parameters, by their number, in the unit cube.
+    """
+    axes, log_weights = [], []
+    for k, n in enumerate(effect.nodes_per_parameter):
+        if k in about:
+            peak, sd = about[k]
+            axes.append(peak + sd * _NODES)
+            log_weights.append(_LOG_WEIGHTS + math.log(sd))
+        else:
+            axes.append((np.arange(n) + 0.5) / n)
+            log_weights.append(np.full(n, -math.log(n)))
+    unit = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+    return effect.prior.from_unit_cube(unit), np.sum(np.meshgrid(*log_weights), axis=0).ravel()
+
+
+def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
+    """Return a square root of the Laplace covariance of a fit's coordinates, (n_params, n_params).
+
+    Arguments: whitened slopes (n_points, n_params), and the variance of a whitened reading.
+    """
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(with_prior(slopes.T @ slopes / variance))).T)
+
+
 @dataclass(frozen=True, eq=False)
 class Linearised:
     """A fit linearised to a Gaussian problem with its parameters, including their prior, projected out.
 
     Rows are the whitened readings in units of the noise sd, then one row for each parameter's prior, and one more if
     the sd is known. Under the null every row is standard normal, so that residuals are drawn by projection alone.
+    `basis`: Q of the augmented slopes, (n_rows, n_params); `residual`: P r, (n_rows,).
     """
 
-    basis: FloatArray  # Q of the augmented slopes, (n_rows, n_params)
-    residual: FloatArray  # P r, (n_rows,)
+    basis: FloatArray
+    residual: FloatArray
     law: NoiseLaw
     sd: float
     n_points: int
@@ -188,7 +320,9 @@ class Linearised:
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, beside: FloatArray | None = None) -> Linearised:
         """Linearise a fit under noise `law`; `beside` are slopes (n_points, k) by additional coordinates of 0."""
-        law, slopes, z = law.without_readings_beyond_end(found.residuals), found.slopes, found.z
+        # A censored reading that is predicted beyond the end tells nothing, whatever small change is added.
+        beyond = law.is_censored & (found.residuals == 0)
+        law, slopes, z = replace(law, lost=law.lost | beyond) if beyond.any() else law, found.slopes, found.z
         if beside is not None:
             slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
         n_points, p = slopes.shape
@@ -294,167 +428,6 @@ def orthonormalise_groups(
     per_length = np.where(there, 1 / np.sqrt(np.maximum(squares, least)), 0.0)
     u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
     return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
-
-
-def average_over_amplitude_scales(explained: FloatArray, gain: FloatArray, n_kept: int) -> FloatArray:
-    """Average the Bayes factors of templates of one width over the `SCALES` at which each is detectable.
-
-    At smaller scales the projected template has an rms lambda below `LEAST_VISIBLE`: the Bayes factor is near one
-    whatever the readings, and would keep irrelevant effects.
-
-    `explained`: share of the residual's sum of squares along each axis, (n_templates, width, n_draws); `gain`: squared
-    length of the projection along each axis, (n_templates, width). Returns log Bayes factors, (n_templates, n_draws);
-    about -48 for a template that is detectable at no scale.
-    """
-    terms = np.empty((len(SCALES), explained.shape[0], explained.shape[2]))
-    visible = SCALES[:, None] ** 2 * gain.sum(axis=1) >= LEAST_VISIBLE**2
-    for k, scale in enumerate(SCALES):
-        ratio = scale**2 * gain
-        of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
-        np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
-        terms[k] *= -0.5 * n_kept
-        terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
-    terms[~visible] = _INVISIBLE
-    top = terms.max(axis=0)
-    n_visible = np.maximum(np.count_nonzero(visible, axis=0), 1)[:, None]
-    return np.asarray(top + np.log(np.exp(terms - top).sum(axis=0) / n_visible))
-
-
-_RESOLVED = 0.6  # posterior sd over the distance of nodes, from which their sum is the integral to a percent
-_SAME = 1e-9  # of the prior's unit cube: nodes as close are one
-_EDGE = 1e-6  # of it too
-_ROUNDS = 6
-_REACH = math.sqrt(3)  # of the nodes on both sides of a peak, in posterior sds
-_NODES = _REACH * np.array([0.0, -1.0, 1.0])
-_LOG_WEIGHTS = np.log([2 / 3, 1 / 6, 1 / 6]) + 0.5 * _NODES**2 + 0.5 * math.log(2 * math.pi)
-
-
-def _coarse_parameters(evidence: NoiseEvidence) -> tuple[IntArray, FloatArray, FloatArray, float]:
-    """Find parameters of a noise model whose nodes lie further apart than a fit determines them.
-
-    Returns their numbers among the settings of the nodes, their values at the likeliest node and the distances of
-    nodes, in the unit cube of the prior, (n_coarse,) all; and the nats by which the evidence may rise between nodes.
-    """
-    weights, found = evidence.weights, []
-    for effect, part in effects_with_columns(evidence.noise.effects):
-        settings = evidence.nodes.settings[:, part]
-        if len(effect.nodes_per_parameter) != settings.shape[1] or np.all(settings == settings[0]):
-            continue  # without nodes of the prior, or known
-        unit = effect.prior.to_unit_cube(settings)
-        for k, n in enumerate(effect.nodes_per_parameter):
-            own, node_of = np.unique(np.round(unit[:, k] / _SAME), return_inverse=True)
-            marginal = np.bincount(node_of.ravel(), weights).astype(np.float64)
-            own = own * _SAME
-            spacing = float(np.diff(own).min(initial=math.inf)) if len(own) > 1 else 1 / n
-            mean = float(marginal @ own)
-            if math.sqrt(float(marginal @ (own - mean) ** 2)) < _RESOLVED * spacing:
-                at = unit[int(np.argmax(weights)), k]
-                found.append((part.start + k, float(at), spacing, _rise_between(marginal)))
-    columns, peak, spacings, gains = zip(*found, strict=True) if found else ((), (), (), ())
-    return np.array(columns, dtype=np.int64), np.array(peak), np.array(spacings), float(sum(gains))
-
-
-def _rise_between(marginal: FloatArray) -> float:
-    """Return the height, in nats, of the peak over the best node, from the nodes' probabilities in order, (n_nodes,).
-
-    It is that of a parabola through the best node and its neighbours. Infinity for a single node.
-    """
-    if len(marginal) < 2:
-        return math.inf
-    with np.errstate(divide="ignore"):
-        log_p = np.maximum(np.log(marginal), -700.0)
-    k = int(np.argmax(log_p))
-    before, after = log_p[max(k - 1, 0)], log_p[min(k + 1, len(log_p) - 1)]
-    bend = float(2 * log_p[k] - before - after)
-    return float(after - before) ** 2 / (8 * bend) if bend > 0 else 0.0
-
-
-def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) -> NoiseEvidence:
-    """Return the evidence of a fit with nodes about its peak, along each parameter whose nodes lie too far apart.
-
-    The other nodes of these parameters are dropped. The evidence is returned as it is if all nodes are close enough, if
-    refined nodes cannot raise it to `least` nats, or if no higher peak is found.
-    """
-    if not np.isfinite(evidence.log_z):
-        return evidence
-    columns, start, spacing, gain = _coarse_parameters(evidence)
-    if not columns.size or evidence.log_z + gain < least:
-        return evidence
-    model, best = evidence.noise, evidence.nodes.settings[int(np.argmax(evidence.log_z_nodes))]
-    parts = [(effect, part) for effect, part in effects_with_columns(model.effects) if effect.nodes_per_parameter]
-
-    def log_density(points: FloatArray) -> FloatArray:
-        settings = np.repeat(best[None, :], len(points), axis=0)
-        for effect, part in parts:
-            own = (columns >= part.start) & (columns < part.stop)
-            if own.any():
-                unit = effect.prior.to_unit_cube(settings[:, part])
-                unit[:, columns[own] - part.start] = points[:, own]
-                settings[:, part] = effect.prior.from_unit_cube(unit)
-        return log_evidence_under(found, model.laws_at(settings, found.predicted))
-
-    while columns.size:
-        peak, sd = _peak_and_sds(log_density, start, spacing)
-        inside = (peak - _REACH * sd > 0) & (peak + _REACH * sd < 1)
-        if inside.all():
-            break
-        # At an end of its prior a parameter keeps the nodes that it has.
-        columns, start, spacing = columns[inside], start[inside], spacing[inside]
-    nodes = dict(model.likely)
-    for effect, part in parts:
-        about = {int(c) - part.start: (peak[k], sd[k]) for k, c in enumerate(columns) if part.start <= c < part.stop}
-        if about:
-            nodes[effect.name] = _nodes_about(effect, about)
-    out = laplace_evidence(found, replace(model, likely=nodes)) if columns.size else evidence
-    return out if _height(out) > _height(evidence) else evidence
-
-
-def _height(evidence: NoiseEvidence) -> float:
-    return float((evidence.log_z_nodes - evidence.nodes.log_weights).max(initial=-math.inf))
-
-
-def _peak_and_sds(
-    log_density: Callable[[FloatArray], FloatArray], start: FloatArray, spacing: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the peak of a density over the unit cube and its sd along each axis, (n_axes,) both.
-
-    Parabolas through three points along each axis lead to it; the points draw together from `spacing` to the sd.
-    """
-    center, step = start, spacing
-    eye = np.eye(len(start))
-    for _ in range(_ROUNDS):
-        center = np.clip(center, step + _EDGE, 1 - step - _EDGE)
-        middle, *around = log_density(center + step * np.concatenate([0 * eye[:1], -eye, eye]))
-        below, above = np.split(np.array(around), 2)
-        if not np.isfinite([middle, *around]).all():
-            break
-        slope, bend = 0.5 * (above - below), 2 * middle - above - below
-        concave = bend > 1e-3
-        sd = step / np.sqrt(np.where(concave, bend, 1.0))
-        move = np.clip(np.where(concave, slope / np.where(concave, bend, 1.0), np.sign(slope)), -2.0, 2.0)
-        center = np.clip(center + move * step, _EDGE, 1 - _EDGE)
-        if np.all(np.abs(move) * step < 0.5 * sd) and np.all(step < 2 * sd):
-            break
-        step = np.where(concave, np.clip(sd, step / 8, step), step)
-    return center, sd
-
-
-def _nodes_about(effect: NoiseEffect, about: Mapping[int, tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
-    """Return the nodes of one effect, (n_nodes, n_params), and log weights: about a peak, the prior's where not coarse.
-
-    `about` has the peak and the sd of coarse parameters, by their number, in the unit cube.
-    """
-    axes, log_weights = [], []
-    for k, n in enumerate(effect.nodes_per_parameter):
-        if k in about:
-            peak, sd = about[k]
-            axes.append(peak + sd * _NODES)
-            log_weights.append(_LOG_WEIGHTS + math.log(sd))
-        else:
-            axes.append((np.arange(n) + 0.5) / n)
-            log_weights.append(np.full(n, -math.log(n)))
-    unit = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
-    return effect.prior.from_unit_cube(unit), np.sum(np.meshgrid(*log_weights), axis=0).ravel()
 
 
 def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:

@@ -84,17 +84,16 @@ def effects_found(
     `best`, `samples`: the repair and its posterior samples, which give size and parameters of its effects; those of
     other effects are from the most probable fit that contains them or, if there is none, from the linearised null.
     """
-    prepared = searched.prepared
-    out, plan = [], prepared.everything.plan
+    prepared, out, plan = searched.prepared, [], searched.prepared.everything.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
     beside = {}
     if unknown >= _IS_UNKNOWN:
         beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()
     unit = plan.instrumentation.unit
+    ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
     drawn: dict[tuple[WeighedFit, Names], ModelSamples] = {}
 
-    def likeliest_candidate_with(name: str) -> tuple[WeighedFit | None, Names]:
-        ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
+    def likeliest_with(name: str) -> tuple[WeighedFit | None, Names]:
         fits = ((searched.best_refit_of(*key), key[1]) for key, p in ranked if p > 0 and name in (*key[0], *key[1]))
         return next(((fit, noise) for fit, noise in fits if fit is not None), (None, ()))
 
@@ -104,16 +103,14 @@ def effects_found(
             p += unknown * beside[name]
         if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)):
             continue
-        holder, noise = (best.fit, best.noise) if name in samples.effects else likeliest_candidate_with(name)
+        holder, noise = (best.fit, best.noise) if name in samples.effects else likeliest_with(name)
         if holder is None:
             effect, values, size = _samples_of_insignificant(searched, effect, rng=rng)
         else:
             effect = next((e for e in holder.found.model.effects if e.name == name), effect)
             own = samples if name in samples.effects else drawn.get((holder, noise))
             if own is None:
-                evidence, weights = holder.evidence[noise], holder.weights
-                own = sample_model(holder.found, evidence, prepared.recording, weights=weights, rng=rng, annealed=False)
-                drawn[holder, noise] = own
+                own = drawn[holder, noise] = _samples_about(searched, holder, noise, rng=rng)
             values, size = own.effect_samples(name), _lambda_of(searched, holder, name, noise)
         of_curve = name.startswith("curve:") and name in samples.effects
         formula, said = _formula_of_curve(searched, best, name, rng=rng) if of_curve else (None, "")
@@ -123,6 +120,11 @@ def effects_found(
             parameters = (*parameters, _parameter_found("scans", "scan", numbers))
         out.append(EffectFound(name, min(p, 1.0), size, said, parameters, effect.scans, formula))
     return tuple(sorted(out, key=lambda e: -e.probability))
+
+
+def _samples_about(searched: Searched, fit: WeighedFit, noise: Names, *, rng: np.random.Generator) -> ModelSamples:
+    evidence, recording = fit.evidence[noise], searched.prepared.recording
+    return sample_model(fit.found, evidence, recording, weights=fit.weights, rng=rng, annealed=False)
 
 
 def _samples_of_insignificant(
@@ -281,9 +283,9 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
     with_formula = -math.inf if fit is None else fit.evidence[best.noise].log_z
     more = max(value - log_z, with_formula - log_z, 0.0)
     named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
-    prepared, covariates = searched.prepared, searched.misfit_templates.covariates
+    prepared, residuals = searched.prepared, best.fit.found.residuals
     draws = best.problem.draw_null_residuals(_N_DRAWS_OF_REMAINDER, rng=rng)
-    scans, residuals = prepared.recording.plan.scan_names, best.fit.found.residuals
+    covariates, scans = searched.misfit_templates.covariates, prepared.recording.plan.scan_names
     found = significant_places(best.problem, covariates, scans, residuals, draws)
     where = found[0].covariate if found else None
     shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate_in_words(where)}"
@@ -301,17 +303,13 @@ def _formula_beside(
     searched: Searched, best: BestRepair, fit: WeighedFit, *, rng: np.random.Generator
 ) -> tuple[Formula, str]:
     """Return the formula that a fit adds to the best repair, with its gain over that, and a clause that tells it."""
-    prepared, evidence = searched.prepared, fit.evidence[best.noise]
+    recording, law = searched.prepared.recording, fit.evidence[best.noise].likeliest_law
     effect = next(e for e in fit.found.model.effects if e.name not in best.fit.names)
-    drawn = sample_model(fit.found, evidence, prepared.recording, weights=fit.weights, rng=rng, annealed=False)
-    values = drawn.effect_samples(effect.name)
-    parts = prepared.apparatus.held_out_parts(prepared.recording)
-    law, law_without = evidence.likeliest_law, best.fit.evidence[best.noise].likeliest_law
-    held = held_out_gain(best.fit.found, fit.found, prepared.recording, law, parts, law_of_null=law_without)
-    gained = evidence.log_z - best.fit.evidence[best.noise].log_z
-    formula = _formula_from_samples(
-        effect, values, prepared.recording.plan.instrumentation.unit, gained, held.per_reading
-    )
+    values = _samples_about(searched, fit, best.noise, rng=rng).effect_samples(effect.name)
+    parts, own = searched.prepared.apparatus.held_out_parts(recording), best.fit.evidence[best.noise]
+    held = held_out_gain(best.fit.found, fit.found, recording, law, parts, law_of_null=own.likeliest_law)
+    unit, gained = recording.plan.instrumentation.unit, fit.evidence[best.noise].log_z - own.log_z
+    formula = _formula_from_samples(effect, values, unit, gained, held.per_reading)
     return formula, f"; a formula describes it: {sentence_from_samples(effect, values)}"
 
 

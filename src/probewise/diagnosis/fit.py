@@ -216,9 +216,7 @@ class Model:
         """Return the noise-free readings of every row of a plan, its own by default, (n_samples, n_points)."""
         return self.chain.predict(self.theta(z), self.plan if plan is None else plan)
 
-    def predict_and_differentiate(
-        self, z: FloatArray, plan: Plan | None = None, *, by: IntArray | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def predict_and_differentiate(self, z: FloatArray, *, by: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Return predictions, (n_points,), and slopes, (n_points, n_params), at one point z (n_params,).
 
         The slopes are by all coordinates or, (n_points, n_coordinates), by those with the indices `by`.
@@ -226,7 +224,7 @@ class Model:
         points, steps = difference_points_and_steps(z)
         if by is not None:
             points, steps = points[[0, *(1 + by)]], steps[by]
-        return _prediction_and_slopes(self.predict(points, plan), steps)
+        return _prediction_and_slopes(self.predict(points), steps)
 
     def with_effect(self, effect: Effect) -> Model:
         """Return the model with one more effect, the last."""

@@ -11,6 +11,7 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.special import ndtr
@@ -32,35 +33,32 @@ BREAK_S = 30.0  # seconds to turn the sensor, or to exchange the sheet
 LAY_S = 60.0  # additional seconds to lay a new sheet
 
 
+_LAY = "lay"  # the kind of a scan over another sheet
+
+
 def scan_command(kind: str, description: str, plan: Plan) -> Command:
     """Return a scan that the arm could take."""
-    scanning = (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
-    return Command(kind, description, plan, scanning + _sheet_laying_s(kind) / 60.0)
+    minutes = (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 + (LAY_S if kind == _LAY else 0.0) / 60.0
+    return Command(kind, description, plan, minutes)
 
 
-def _sheet_laying_s(kind: str) -> float:
-    return LAY_S if kind == "lay" else 0.0
+def scan_started_after(scan: Command, plan: Plan) -> Command:
+    """Move a scan to after a plan, with time to lay its sheet."""
+    start_s = _earliest_start_s(plan) + (LAY_S if scan.kind == _LAY else 0.0)
+    return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + (start_s - float(scan.plan.time_s[0]))))
 
 
 def _earliest_start_s(plan: Plan) -> float:
     return float(plan.time_s.max(initial=0.0)) + BREAK_S
 
 
-def scan_started_after(scan: Command, plan: Plan) -> Command:
-    """Move a scan to after a plan, with time to lay its sheet."""
-    delay_s = _earliest_start_s(plan) + _sheet_laying_s(scan.kind) - float(scan.plan.time_s[0])
-    return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))
-
-
 _MOST_SCANS = 6
 _NEAR = 26  # readings of an excerpt around an edge
 _TURN_DEG = 45.0
 _RAISE = 1.25  # factor on the recording's height
-_WORDS = {1: "", 2: " (every second reading, twice as fast)"}
 
 
-@dataclass(frozen=True, eq=False)
-class Excerpt:
+class Excerpt(NamedTuple):
     """Part of a scan, as row numbers: every `stride`-th row, or those where readings change most.
 
     `suffix` is for the name of the new scan, `words` for its description.
@@ -72,9 +70,7 @@ class Excerpt:
     stride: int = 1
 
 
-def excerpts_of_scan(
-    scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-) -> list[Excerpt]:
+def excerpts_of_scan(scan: IntArray, strides: Sequence[int], level: FloatArray | None = None) -> list[Excerpt]:
     """Return the parts of a scan that could be scans of their own, of 8 to 102 readings.
 
     `strides`: strides to try; those that leave fewer than eight readings are skipped, and if all are, stride 1 is
@@ -85,7 +81,8 @@ def excerpts_of_scan(
     for stride in [s for s in strides if len(scan[::s]) >= LEAST_ROWS] or [1]:
         rows = scan[::stride][:MOST_READINGS]
         if rows.size >= LEAST_ROWS:
-            words = _WORDS.get(stride, f" (every {stride}th reading, {stride} times as fast)")
+            every, fast = ("second", "twice") if stride == 2 else (f"{stride}th", f"{stride} times")
+            words = "" if stride == 1 else f" (every {every} reading, {fast} as fast)"
             if len(scan[::stride]) > MOST_READINGS:
                 words += f", {MOST_READINGS} readings from its start"
             out.append(Excerpt("" if stride == 1 else f"_{stride}", words, rows, stride))
@@ -106,42 +103,34 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
     out: list[Command] = []
     for scan in rows_of_distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
-        degrees = math.degrees(float(plan.orientation_rad[scan[0]])) + _TURN_DEG
-        for part in excerpts_of_scan(scan, strides=strides, level=None if level is None else level[scan]):
-            rows, every, twice = part.rows, part.words, 2 * part.stride
+        degrees, take = math.degrees(float(plan.orientation_rad[scan[0]])) + _TURN_DEG, f"take scan {name}"
+        for suffix, every, rows, stride in excerpts_of_scan(scan, strides, None if level is None else level[scan]):
             once = rows_as_next_scan(plan, rows, name)
             half = rows[: MOST_READINGS // 2 * 2 : 2]
             both = rows_as_next_scan(plan, np.concatenate([half, half[::-1]]), name)
             # Of every second reading, with unchanged time per reading.
-            faster = f"at {twice} times the speed (every {twice}th reading)"
-            faster = f"at double speed{every}" if part.stride == 1 else faster
+            faster = f"at {2 * stride} times the speed (every {2 * stride}th reading)"
+            faster = f"at double speed{every}" if stride == 1 else faster
             taken = [
-                ("repeat", f"take scan {name} again{every}", once, "again"),
-                (
-                    "reverse",
-                    f"take scan {name} backwards{every}",
-                    rows_as_next_scan(plan, rows[::-1], name),
-                    "reversed",
-                ),
+                ("repeat", f"{take} again{every}", once, "again"),
+                ("reverse", f"{take} backwards{every}", rows_as_next_scan(plan, rows[::-1], name), "reversed"),
                 ("respeed", f"scan {name} forth and back {faster}", both, "both"),
             ]
             if "orientation_deg" in controls:
                 turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
-                words = f"take scan {name} with the sensor turned to {degrees:.0f} degrees{every}"
+                words = f"{take} with the sensor turned to {degrees:.0f} degrees{every}"
                 taken.append(("rotate", words, turned, "turned"))
             if "led" in controls:
                 dark = replace(once, covariates={**once.covariates, "led": np.zeros(len(once))})
-                taken.append(("relight", f"take scan {name} with the LED off{every}", dark, "dark"))
+                taken.append(("relight", f"{take} with the LED off{every}", dark, "dark"))
             if "height_mm" in controls and height_mm is not None:
                 commanded_mm = once.covariates.get("height_mm", np.full(len(once), np.nan))
                 high_mm = _RAISE * np.where(np.isfinite(commanded_mm), commanded_mm, height_mm)
                 where = f"{high_mm[0]:.4g} mm" if np.ptp(high_mm) == 0.0 else f"{_RAISE:g} times its height"
                 raised = replace(once, covariates={**once.covariates, "height_mm": high_mm})
-                taken.append(("raise", f"take scan {name} with the sensor at {where}{every}", raised, "raised"))
-            out += [
-                scan_command(kind, words, replace(own, scan_names=(f"{name}{part.suffix}_{how}",)))
-                for kind, words, own, how in taken
-            ]
+                taken.append(("raise", f"{take} with the sensor at {where}{every}", raised, "raised"))
+            for kind, words, own, how in taken:
+                out.append(scan_command(kind, words, replace(own, scan_names=(f"{name}{suffix}_{how}",))))
     return out
 
 
@@ -192,11 +181,11 @@ def target_swaps(plan: Plan) -> list[Command]:
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
         flat = rows_as_next_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
         flat = _with_pattern(flat, f"plain_{colour}", Uniform(albedo))
-        out.append(scan_command("lay", f"scan a plain {colour} surface", flat))
+        out.append(scan_command(_LAY, f"scan a plain {colour} surface", flat))
     name = plan.scan_names[int(plan.scan[first[0]])]
-    for part in excerpts_of_scan(first, strides=(_STRIDE // 2, _STRIDE)):
-        across = _rotated_scan(rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
+    for part in excerpts_of_scan(first, (_STRIDE // 2, _STRIDE)):
         words = f"scan at right angles to scan {name}, through its middle{part.words}"
+        across = _rotated_scan(rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(scan_command("across", words, across))
     edges = ((scan, plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])) for scan in scans)
     laid = (_scans_over_moved_targets(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
@@ -222,22 +211,25 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
         words = f"move pattern {name} by {aside_mm:g} mm along its normal and scan it"
         laid.append((f"{name}_by_{aside_mm:g}_mm", words, once, moved))
-    out: list[Command] = []
-
-    def lay(label: str, words: str, pattern: Pattern, whole: Plan, parts: Sequence[Excerpt]) -> None:
-        for part in parts:
-            taken = _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
-            out.append(scan_command("lay", f"{words}{part.words}", taken))
-
+    laid_in_parts = []
     for label, words, whole, moved in laid:
         seen = ndtr(_distance_inside_edge_mm(whole, moved) / (_FOOTPRINT * length))
-        lay(label, words, moved, whole, excerpts_of_scan(np.arange(len(whole)), strides=(_STRIDE,), level=seen))
+        parts = excerpts_of_scan(np.arange(len(whole)), (_STRIDE,), seen)
+        laid_in_parts.append((label, words, whole, cast(Pattern, moved), parts))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
-        lay(label, words, stripes, plan, excerpts_of_scan(scan, strides=(_STRIDE // 2, _STRIDE)))
-    return out
+        laid_in_parts.append((label, words, plan, stripes, excerpts_of_scan(scan, (_STRIDE // 2, _STRIDE))))
+    return [
+        scan_command(
+            _LAY,
+            f"{words}{part.words}",
+            _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern),
+        )
+        for label, words, whole, pattern, parts in laid_in_parts
+        for part in parts
+    ]
 
 
 def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
@@ -279,28 +271,22 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
     `usable`: row numbers of the usable readings, shape (n_usable,); `level`, `slope`: predicted reading and its slope
     along the motion, both (n_usable,).
     """
-    everything = np.arange(len(usable))
-    sign = sign_of_motion(plan)[usable]
+    everything, scan = np.arange(len(usable)), plan.scan[usable]
+    sign, degrees = sign_of_motion(plan)[usable], orientation_deg(plan)[usable]
     moving = np.flatnonzero(sign != 0)
-    scan = plan.scan[usable]
-    degrees = orientation_deg(plan)[usable]
     edge_mm = np.full(len(plan), np.inf)  # from the nearest edge of the row's pattern, if one is described
     for name, rows in plan.rows_by_pattern():
         if name in plan.patterns:
             region = region_of(plan.patterns[name])
             edge_mm[rows] = edge_distance(region, plan.x_mm[None, rows], plan.y_mm[None, rows])[0]
-    pooled: Mapping[str, FloatArray] = {
-        "time": plan.time_s[usable],
-        "level": level,
-        "edge_distance": edge_mm[usable],
-        **{f"column {k}" if k in _NOT_COLUMNS else k: values[usable] for k, values in plan.covariates.items()},
-    }
+    pooled = {"time": plan.time_s[usable], "level": level, "edge_distance": edge_mm[usable]}
+    pooled |= {f"column {k}" if k in _NOT_COLUMNS else k: values[usable] for k, values in plan.covariates.items()}
     out: list[Covariate] = []
     for name, values in pooled.items():
         there = np.flatnonzero(np.isfinite(values))
+        # A slope or a distance that is about 0 everywhere is rounding error: of the level over 1 mm, of 1 mm.
         if there.size and _varies(values[there], 1.0 if name == "edge_distance" else 0.0):
             out.append(Covariate(name, values[there], there))
-    # A slope or a distance that is about 0 everywhere is rounding error: of the level over 1 mm, of 1 mm.
     if moving.size and _varies(slope[moving], float(np.abs(level).max(initial=0.0))):
         out.append(Covariate("slope", slope[moving], moving))
     if _varies(sign[moving]):
@@ -346,14 +332,8 @@ class LightSensorApparatus(Apparatus):
         null="the sensor",
         find_signal="scan across an edge",
         settles_nothing="no reading that this apparatus can take tells them apart",
-        units={
-            "time": "s",
-            "place": "mm",
-            "edge_distance": "mm",
-            "orientation": "degree",
-            "level": "{reading}",
-            "slope": "{reading} per mm",
-        },
+        units={"time": "s", "place": "mm", "edge_distance": "mm", "orientation": "degree"}
+        | {"level": "{reading}", "slope": "{reading} per mm"},
     )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, Effect]:
@@ -380,12 +360,7 @@ class LightSensorApparatus(Apparatus):
         return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
     def covariate_of_effect(
-        self,
-        effect: Effect,
-        change: FloatArray,
-        without: FloatArray,
-        plan: Plan,
-        known: Sequence[Covariate],
+        self, effect: Effect, change: FloatArray, without: FloatArray, plan: Plan, known: Sequence[Covariate]
     ) -> Covariate | None:
         whole, sign = [c for c in known if c.scan is None], sign_of_motion(plan)
         if np.ptp(sign) > 0 and all(c.name != "direction" for c in whole):  # one at rest serves for comparison

@@ -26,18 +26,13 @@ from probewise.systems.table import published_covariate
 
 @dataclass(frozen=True, eq=False)
 class Covariate:
-    """One covariate (time, place, level, ...) of the usable readings.
-
-    `rows` (n_rows,): indices of the usable readings for which it is defined; `values` (n_rows,): its values there, in
-    its unit; `groups`: whether it is categorical (an orientation, a scan); `scan`: name of the scan to which it is
-    restricted, or None.
-    """
+    """One covariate (time, place, level, ...) of the usable readings."""
 
     name: str
-    values: FloatArray
-    rows: IntArray
-    groups: bool = False
-    scan: str | None = None
+    values: FloatArray  # where it is defined, in its unit, (n_rows,)
+    rows: IntArray  # indices of these readings, (n_rows,)
+    groups: bool = False  # categorical: an orientation, a scan
+    scan: str | None = None  # the one to which it is restricted
 
     @property
     def published_name(self) -> str:
@@ -145,40 +140,29 @@ def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], dra
     return float((1 + above.sum()) / (1 + len(above)))
 
 
-def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
+def window_columns(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[IntArray]]:
     """Build windows over the sorted values of a covariate: of half the readings, a quarter and so on, half overlapping.
 
-    Equal values stay together. Of a categorical covariate, one window per value.
-
-    Returns indicator columns, (n_points, n_windows), and the covariate's least and largest value in each window.
+    Equal values stay together: a window that split them would select by something else. Of a categorical covariate, one
+    window per value. Returns indicator columns, (n_points, n_windows), and the indices of the values in each window.
     """
-    values, rows = covariate.values, covariate.rows
-    columns, ends = list[FloatArray](), list[tuple[float, float]]()
-
-    def add_window(members: IntArray) -> None:
-        column = np.zeros(n_points)
-        column[rows[members]] = 1.0
-        columns.append(column)
-        ends.append((float(values[members].min()), float(values[members].max())))
-
+    values, n = covariate.values, len(covariate.values)
+    windows = dict[tuple[int, int], IntArray]()
     if covariate.groups:
-        for value in np.unique(values):
-            add_window(np.flatnonzero(values == value))
-        return np.stack(columns, axis=1), ends
+        windows = {(k, k): np.flatnonzero(values == value) for k, value in enumerate(np.unique(values))}
     order = np.argsort(values, kind="stable")
-    edges, n = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]]), len(values)
-    width = n // 2
-    looked: set[tuple[int, int]] = set()
-    while width >= _LEAST_ROWS and len(columns) <= 160:
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [n]])
+    width = 0 if covariate.groups else n // 2
+    while width >= _LEAST_ROWS and len(windows) <= 160:
         for first in sorted({*range(0, n - width + 1, max(width // 2, 1)), n - width}):
-            # Equal values stay together: a window that split them would select by something else.
-            low = int(edges[np.searchsorted(edges, first)])
-            high = int(edges[np.searchsorted(edges, first + width)])
-            if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
-                looked.add((low, high))
-                add_window(order[low:high])
+            low, high = (int(edges[np.searchsorted(edges, end)]) for end in (first, first + width))
+            if _LEAST_ROWS <= high - low < n:
+                windows.setdefault((low, high), order[low:high])
         width //= 2
-    return (np.stack(columns, axis=1) if columns else np.zeros((n_points, 0))), ends
+    columns = np.zeros((n_points, len(windows)))
+    for k, members in enumerate(windows.values()):
+        columns[covariate.rows[members], k] = 1.0
+    return columns, list(windows.values())
 
 
 def significant_places(
@@ -197,26 +181,28 @@ def significant_places(
     norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_kept)
     own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_kept) or 1.0
     for covariate in covariates:
-        columns, ends = window_columns_and_bounds(covariate, problem.n_points)
-        if not ends:
+        columns, windows = window_columns(covariate, problem.n_points)
+        if not windows:
             continue
         whitened = problem.whiten(columns)
         projected = problem.project_whitened(whitened)
         lengths = np.linalg.norm(projected, axis=0)
-        there = lengths > _ABSORBED * np.linalg.norm(whitened, axis=0)
-        if not there.any():
+        there = np.flatnonzero(lengths > _ABSORBED * np.linalg.norm(whitened, axis=0))
+        if not there.size:
             continue
         units = projected[:, there] / lengths[there]
-        kept = [ends[k] for k in np.flatnonzero(there)]
         scores = np.abs(units.T @ problem.residual) / own_norm
         null = np.max(np.abs(units.T @ draws) / norms, axis=0)
         best = int(np.argmax(scores))
         p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
         if p_value > _LARGEST_P:
             continue
-        window: tuple[str | None, float | None, float | None] = (covariate.scan, *kept[best])
-        if covariate.name in _RUNS:
-            window = scan_names[int(kept[best][0])], None, None
+        inside = covariate.values[windows[there[best]]]
+        window: tuple[str | None, float | None, float | None] = (
+            (scan_names[int(inside[0])], None, None)
+            if covariate.name in _RUNS
+            else (covariate.scan, float(inside.min()), float(inside.max()))
+        )
         curve = _mean_curve_fields(covariate, residuals)
         out.append(Place(covariate.published_name, *window, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
@@ -242,10 +228,10 @@ def places_of_effect(
     `change`: its change of the readings, (n_points,); `scans`: the covariate `scan`, if there are several; `residuals`:
     residuals of the null, (n_points,), for the mean curve.
     """
-    name = covariate.name
+    name, curve = covariate.name, _mean_curve_fields(covariate, residuals)
     if name == "run":
         strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
-        return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals))]
+        return [Place(name, strongest, None, None, p_value, size, **curve)]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
         curve = _mean_curve_fields(scans, residuals)
         # A scan without usable readings is not in the plan, and a name may return.
@@ -258,11 +244,9 @@ def places_of_effect(
     # The levels absorb what all readings share: where nearly all move one way, those at rest stand out.
     strength = np.abs(own - own.mean() if name == "direction" else own)
     # An effect with a threshold in level begins where it is first significant.
-    significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
-    values = covariate.values[significant]
-    curve = _mean_curve_fields(covariate, residuals)
-    start, end = float(values.min()), float(values.max())
-    return [Place(covariate.published_name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
+    values = covariate.values[strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()]
+    ends = float(values.min()), float(values.max())
+    return [Place(covariate.published_name, None, *ends, p_value, size, **curve, without_effect=name == "level")]
 
 
 def _mean_curve_fields(covariate: Covariate, residuals: FloatArray) -> dict[str, Any]:

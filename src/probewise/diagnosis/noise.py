@@ -1,13 +1,8 @@
-"""The distribution of a recording's noise, test statistics of residuals, and noise models.
+"""The distribution of a recording's noise, and noise models: effects on the noise, discretised to nodes.
 
 A wrong noise model causes false alarms, and a missed effect on the mean looks like correlated or heavy-tailed noise; so
-the evidence of every hypothesis on the mean is computed under every noise model: effects on the noise, discretised to
-nodes under which the evidence of a fit is computed.
-
-Rounded readings have the sum of a normal and a uniform part, with a flat-topped density: a rounded reading means that
-the unrounded one was within half a step. Within the flat top a residual carries no information. The density never
-exceeds one over the (known) step, however small the noise. All readings are rounded to one step, so the flat top of a
-reading with a smaller noise sd is wider in units of that sd.
+the evidence of every hypothesis on the mean is computed under every noise model. `NoiseLaw` is one distribution, which
+whitens residuals; the density of a whitened residual is `Tail`, a mixture of two normals, or `RoundedNormal`.
 """
 
 from __future__ import annotations
@@ -18,30 +13,129 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
-from scipy.linalg.lapack import dtbtrs
+from scipy.linalg.lapack import dpbtrf, dpttrf, dpttrs, dtbtrs
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.effects.noise_distribution import FittedReadings, log_gaussian_mass_between
-from probewise.inference import sd_floor, sd_of_numbers
+from probewise.inference import sd_of_numbers
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
+MAD_OF_NORMAL = 0.6745
+"""Median absolute deviation of a standard normal, by which a robust sd is estimated."""
+
+LEAST_SCALE = 1e-150
+"""Least sd, for readings that are exactly as predicted."""
+
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 _LOG_HALVES = np.linspace(math.log(0.01), math.log(1000.0), 116)  # at which the information is tabulated
+_EM_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """A scale mixture of two normals: sd sigma, or with probability `share` `times` sigma; scalars, or k of both (k,).
+
+    All methods take whitened residuals, (n_points, k) or (n_points, 1); `n_points` of them count, lost ones are 0.
+    """
+
+    share: float | FloatArray
+    times: float | FloatArray
+
+    @cached_property
+    def is_normal(self) -> bool:
+        """Whether there is no tail."""
+        return not np.any(self.share)
+
+    @cached_property
+    def fisher_information(self) -> FloatArray:
+        """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
+        return np.asarray(np.vectorize(_fisher_information_of_tail, otypes=[np.float64])(self.share, self.times))
+
+    def likeliest_sigma(
+        self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the most likely sigma, (k,), by EM."""
+        if self.is_normal:
+            rms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points)
+            return np.asarray(np.maximum(rms, max(floor, LEAST_SCALE)))
+        squares, sigma = whitened**2, start
+        if sigma is None:  # from the interquartile range of the readings not lost, which is robust to the tail
+            middle = len(whitened) - n_points // 2 - 1
+            median = np.partition(np.abs(whitened), middle, axis=0)[middle]
+            sigma = np.maximum(median / MAD_OF_NORMAL, floor) + LEAST_SCALE
+        for _ in range(_EM_STEPS if start is None else 3):
+            weighed = self._relative_precisions(squares / sigma**2) * squares
+            sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + LEAST_SCALE
+        return np.asarray(sigma)
+
+    def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+        """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
+        if self.is_normal:
+            return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
+        squares = (whitened / sigma) ** 2
+        log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds_of_wide(squares))
+        at_zero = np.logaddexp(0.0, self._log_odds_of_wide(np.zeros((1, 1))))[0]
+        of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
+        return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share)) - of_kept)
+
+    def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Convert residuals to equally informative normal ones, of sd sigma / sqrt(information) and the same shape.
+
+        Each is the score of the density over its Fisher information; outlying residuals have little weight (Huber 1981,
+        section 6.7).
+        """
+        if self.is_normal:
+            return whitened
+        return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.fisher_information)
+
+    def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+        """Return minus the second derivative of the log likelihood by log sigma at its peak sigma, (k,).
+
+        The result is at least 0.2 per reading.
+        """
+        squares = (whitened / sigma) ** 2
+        wide = self.wide_probability(squares)
+        less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
+        return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
+
+    def wide_probability(self, squares: FloatArray) -> FloatArray:
+        """Return the probability that a residual is from the wide component, from its square over sigma^2."""
+        return np.asarray(expit(self._log_odds_of_wide(squares)))
+
+    def _log_odds_of_wide(self, squares: FloatArray) -> FloatArray:
+        share, times = np.asarray(self.share), np.asarray(self.times)
+        return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
+
+    def _relative_precisions(self, squares: FloatArray) -> FloatArray:
+        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide_probability(squares))
+
+
+@lru_cache(maxsize=256)
+def _fisher_information_of_tail(share: float, times: float) -> float:
+    if share == 0:
+        return 1.0
+    # The integrand extends as far as the wide component.
+    z = np.linspace(-6 * times, 6 * times, 4001)
+    narrow = (1 - share) * np.exp(-0.5 * z * z)
+    wide = share / times * np.exp(-0.5 * (z / times) ** 2)
+    score = z * (narrow + wide / times**2) / (narrow + wide)
+    return float(np.sum(score**2 * (narrow + wide)) * (z[1] - z[0]) / math.sqrt(2 * math.pi))
 
 
 @dataclass(frozen=True, eq=False)
 class RoundedNormal:
     """Normal noise of known sd `sigma` plus a uniform part of half width `half` sigma; scalars, or k of both (k,).
 
-    The methods are those of `Tail`, with residuals (n_points, k) or (n_points, 1); pass this `sigma` to each.
+    A rounded reading means that the unrounded one was within half a step: the density has a flat top, within which a
+    residual carries no information, and never exceeds one over the step. The methods are those of `Tail`.
 
     `half`, `sigma`: the noise of a reading of relative sd 1; `sd`: sds of the readings relative to that one, (n_points,
-    1), 1 for lost readings; 1.0 if all are equal. Residuals are whitened by `whitening_sd`, so that each tells as much
+    1), 1 for lost readings; 1.0 if all are equal. All readings are rounded to one step, so that the flat top of one
+    with a smaller sd is wider in units of that sd. Residuals are whitened by `whitening_sd`, so that each tells as much
     of the mean as one of relative sd 1.
     """
 
@@ -56,8 +150,7 @@ class RoundedNormal:
         """Sd of the normal part of each whitened residual, in sigma, (n_points, k); 1.0 if all sds are equal."""
         if np.ndim(self.sd) == 0:
             return 1.0
-        log_information = _log_fisher_information(self._half_by_reading) - _log_fisher_information(self.half)
-        return np.asarray(np.exp(0.5 * log_information))
+        return np.asarray(np.exp(0.5 * (_log_fisher_information(self._halves) - _log_fisher_information(self.half))))
 
     @property
     def whitening_sd(self) -> float | FloatArray:
@@ -65,12 +158,12 @@ class RoundedNormal:
         return self.sd / self.normal_sd
 
     @cached_property
-    def _half_by_reading(self) -> FloatArray:
+    def _halves(self) -> FloatArray:
         return np.asarray(self.half / self.sd)
 
     @cached_property
     def fisher_information(self) -> FloatArray:
-        """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
+        """As of `Tail`."""
         return np.asarray(np.vectorize(_fisher_information_of_rounded, otypes=[np.float64])(self.half))
 
     def likeliest_sigma(
@@ -81,24 +174,16 @@ class RoundedNormal:
         return np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (k,)).copy()
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the log likelihood of `n_points` readings at sigma (k,), without n/2 log 2 pi: (k,).
-
-        It is that of the readings over their relative sds, whatever the whitening.
-        """
-        density = _log_density_of_rounded(whitened / sigma / self.normal_sd, self._half_by_reading) + _LOG_ROOT_2_PI
+        """As of `Tail`: that of the readings over their relative sds, whatever the whitening."""
+        density = _log_density_of_rounded(whitened / sigma / self.normal_sd, self._halves) + _LOG_ROOT_2_PI
         at_zero = _log_density_of_rounded(np.zeros((1, 1)), np.asarray(self.half))[0] + _LOG_ROOT_2_PI
         of_kept = density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * np.log(sigma) - of_kept)
 
     def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Convert residuals to equally informative normal ones, of sd sigma / sqrt(information) and the same shape."""
-        score = _score(whitened / sigma / self.normal_sd, self._half_by_reading) / self.normal_sd
+        """As of `Tail`."""
+        score = _score(whitened / sigma / self.normal_sd, self._halves) / self.normal_sd
         return np.asarray(sigma * score / self.fisher_information)
-
-    def add_rounding(self, normal: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Turn standard normal noise into that of whitened readings in units of sigma, (n_points, n_draws) both."""
-        uniform = rng.uniform(-1.0, 1.0, normal.shape)
-        return np.asarray(normal * self.normal_sd + self.half / self.whitening_sd * uniform)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return 2 pi, (k,): Laplace's integral over log sigma is then 1, since sigma is known."""
@@ -122,73 +207,36 @@ def _fisher_information_of_rounded(half: float) -> float:
     return float(np.sum(_score(x, width) ** 2 * density) * (x[1, 0] - x[0, 0]))
 
 
+@cache
+def _tabulated_log_information() -> FloatArray:
+    return np.log([_fisher_information_of_rounded(half) for half in np.exp(_LOG_HALVES).tolist()])
+
+
 def _log_fisher_information(half: float | FloatArray) -> FloatArray:
     log_half = np.log(half)
     beyond = np.maximum(log_half - _LOG_HALVES[-1], 0.0)
     return np.asarray(np.interp(log_half, _LOG_HALVES, _tabulated_log_information()) - beyond)
 
 
-@cache
-def _tabulated_log_information() -> FloatArray:
-    return np.log([_fisher_information_of_rounded(half) for half in np.exp(_LOG_HALVES).tolist()])
-
-
-_EM_STEPS = 12
-MAD_OF_NORMAL = 0.6745
-"""Median absolute deviation of a standard normal, by which a robust sd is estimated."""
-
-LEAST_SCALE = 1e-150
-"""Least sd, for readings that are exactly as predicted."""
-
-
-def order_by_scan(recording: Recording) -> IntArray:
-    """Return the numbers of the usable readings, those of each scan together, in their order, (n_usable,)."""
-    return np.argsort(recording.plan.scan[recording.usable], kind="stable")
-
-
-def previous_usable(recording: Recording) -> IntArray:
-    """Return the number of the usable reading before each in its scan, -1 for the first of a scan, (n_usable,)."""
-    order = order_by_scan(recording)
-    same = np.diff(recording.plan.scan[recording.usable][order], prepend=-1) == 0
-    out = np.full(len(order), -1)
-    out[order[same]] = order[np.flatnonzero(same) - 1]
-    return out
-
-
-def n_rows_since_previous_usable(recording: Recording) -> IntArray:
-    """Return the number of rows of the scan back to its previous usable reading, 0 if there is none.
-
-    Shape (n_usable,): neighbours of a missing reading are two steps apart. Rows of other scans in between do not count.
-    """
-    scan = recording.plan.scan
-    order = np.argsort(scan, kind="stable")
-    place = np.empty(len(scan), dtype=np.int64)
-    place[order] = np.arange(len(scan))
-    own, before = place[recording.usable], previous_usable(recording)
-    return np.where(before >= 0, own - own[before], 0).astype(np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseLaw:
-    """The joint distribution of all readings' noise, up to its overall sd.
+    """The joint distribution of all readings' noise, up to its overall sd; all arrays are (n_points,).
 
     Whitening, a linear map, makes residuals independent with one scale sigma; each is then normal, optionally with a
-    heavy tail (`times` as wide with probability `share`) or rounded (flat-topped). Lost readings carry no information.
-    Beside a random walk the tail is of each reading's own noise: given the probabilities of readings to be `wide`,
-    which a fit's residuals tell (`wide_readings`), the noise is normal, with sds that include them.
+    heavy tail (`times` as wide with probability `share`) or rounded (flat-topped). Beside a random walk the tail is of
+    each reading's own noise: given the probabilities of readings to be `wide`, which a fit's residuals tell
+    (`with_known_wide_readings`), the noise is normal, with sds that include them.
 
-    `sd`: sd of each reading relative to the overall one, (n_points,); `carry`: correlation with the previous reading, 0
-    for the first of a scan, (n_points,); `lost`: mask of lost readings, which do not depend on the target, (n_points,);
-    `share`, `times`: parameters of the heavy tail; none by default; `log_extra`: log probability of the lost readings;
-    `flat`, `sigma`: rounding, if there is no tail: a uniform part of half width `flat` sigma, with known sigma, in
-    every reading whatever its relative sd; `least`: least sd of a reading, given those before it; not used if sigma is
-    known; `walk`: increments in variance of a random walk of the offset from row to row, also between runs, relative to
-    the overall variance, (n_points,); empty without one. Then there is no other correlation. `before`: number of the
-    reading with which each has the correlation `carry`, (n_points,), arbitrary where that is 0. Empty: the reading
-    above, as always unless the rows of scans are interleaved. `wide`: probability of each reading to be wide,
-    (n_points,), where `sd` includes it; empty without or if unknown; `censored`: mask of the readings at an end of the
-    instrument's range, (n_points,); empty without one. The prediction there is limited to the end, so that the
-    likelihood is 1 where the signal is beyond it. They do not count in the sd.
+    `sd`: sds relative to the overall one; `carry`: correlation with the previous reading, 0 for the first of a scan;
+    `lost`: mask of lost readings, which carry no information; `share`, `times`: the heavy tail; `log_extra`: log
+    probability of the lost readings; `flat`, `sigma`: rounding, without a tail: a uniform part of half width `flat`
+    times a known sigma, in every reading whatever its relative sd; `least`: least sd of a reading, given those before
+    it; not used if sigma is known; `walk`: variance of the increments of a random walk of the offset from row to row,
+    also between runs, relative to the overall variance; empty without one, and without another correlation with one;
+    `before`: number of the reading with which each has the correlation `carry`, where that is not 0; empty: the reading
+    above, unless the rows of scans are interleaved; `wide`: probability to be wide, where `sd` includes it; else empty;
+    `censored`: mask of the readings at an end of the instrument's range; empty without one. The prediction there is
+    limited to the end, so that the likelihood is 1 where the signal is beyond it. They do not count in the sd.
     """
 
     sd: FloatArray
@@ -204,32 +252,25 @@ class NoiseLaw:
     before: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     wide: FloatArray = field(default_factory=lambda: np.zeros(0))
     censored: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-    kept: FloatArray = field(init=False)  # 1 where not lost, (n_points,)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "kept", 1.0 - self.lost)
-
-    @property
-    def n_kept(self) -> int:
-        """Number of readings that are neither lost nor censored."""
-        return int(self._counted.sum())
-
-    @property
-    def _counted(self) -> BoolArray:
-        return ~(self.lost | self.is_censored)
+    @cached_property
+    def kept(self) -> FloatArray:
+        """1 where a reading is not lost, else 0, (n_points,)."""
+        return np.where(self.lost, 0.0, 1.0)
 
     @property
     def is_censored(self) -> BoolArray:
         """Mask of the readings at an end of the instrument's range, (n_points,), also without one."""
         return self.censored if self.censored.size else np.zeros(len(self.sd), dtype=np.bool_)
 
-    def without_readings_beyond_end(self, residuals: FloatArray) -> NoiseLaw:
-        """Return the distribution without the censored readings that a fit with these residuals predicts beyond.
+    @property
+    def _counted(self) -> BoolArray:
+        return ~(self.lost | self.is_censored)
 
-        Such a reading tells nothing, whatever small change is added to the prediction.
-        """
-        beyond = self.is_censored & (residuals == 0)
-        return replace(self, lost=self.lost | beyond) if beyond.any() else self
+    @cached_property
+    def n_kept(self) -> int:
+        """Number of readings that are neither lost nor censored."""
+        return int(self._counted.sum())
 
     @property
     def whitening_key(self) -> tuple[bytes, ...]:
@@ -257,26 +298,9 @@ class NoiseLaw:
         """Whether successive readings have some of their noise in common."""
         return bool(self.walk.size or np.any(self.carry))
 
-    @property
-    def fisher_information(self) -> float:
-        """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
-        return float(self.whitened_density.fisher_information)
-
     def take_readings(self, rows: BoolArray) -> NoiseLaw:
         """Return the distribution of the readings in a mask, (n_points,), whatever the others read."""
-        walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
-        above, carry = self._nearest_taken_before(rows)
-        before = np.maximum(above, 0) if self.before.size else self.before
-        some = ("sd", "lost", "wide", "censored")
-        taken = {name: own[rows] for name in some if (own := getattr(self, name)).size}
-        return replace(self, carry=carry, walk=walk, before=before, **taken)
-
-    def _nearest_taken_before(self, rows: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return for each reading taken the nearest taken before it, and its correlation with that: (n_taken,) both.
-
-        The readings taken are numbered; -1 and 0 where none before it is correlated. Along a chain of correlations that
-        of two readings is the product of those in between.
-        """
+        # Along a chain of correlations that of two readings is the product of those in between.
         number, nearest, carry = np.cumsum(rows) - 1, np.full(len(rows), -1), np.zeros(len(rows))
         for k in np.flatnonzero(self.carry).tolist():  # a reading comes after the one before it
             above = self.before[k] if self.before.size else k - 1
@@ -284,38 +308,19 @@ class NoiseLaw:
                 nearest[k], carry[k] = number[above], self.carry[k]
             elif nearest[above] >= 0:
                 nearest[k], carry[k] = nearest[above], self.carry[k] * carry[above]
-        return nearest[rows], carry[rows]
+        some = ("sd", "lost", "wide", "censored")
+        taken = {name: own[rows] for name in some if (own := getattr(self, name)).size}
+        return replace(
+            self,
+            carry=carry[rows],
+            walk=np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk,
+            before=np.maximum(nearest[rows], 0) if self.before.size else self.before,
+            **taken,
+        )
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns, shape (n_points,) or (n_points, n_columns); rows of lost readings become 0."""
-        flat = columns.ndim == 1
-        y = columns[:, None] if flat else columns
-        if self.walk.size:
-            y = self._whiten_with_walk(y)
-            return y[:, 0] if flat else y
-        y = y * (self.kept / self._whitening_sd)[:, None]
-        if np.any(self.carry):
-            carry, told = self.carry[:, None], np.zeros_like(y)
-            if self.before.size:
-                told = carry * y[self.before]
-            else:  # a view: an indexed copy of thousands of columns takes longer than the rest
-                np.multiply(carry[1:], y[:-1], out=told[1:])
-            y = np.subtract(y, told, out=told)
-            y /= np.sqrt(1 - carry**2)
-        return y[:, 0] if flat else y
-
-    def _whiten_with_walk(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns (n_points, n_columns) with a random walk: differences correlate only with their neighbours."""
-        kept = ~self.lost
-        own = columns if kept.all() else columns[kept]
-        steps = np.array(own, dtype=np.float64, order="F")
-        steps[1:] -= own[:-1]
-        solved, _ = dtbtrs(self._difference_covariance_root, steps, uplo="L", overwrite_b=1)
-        if own is columns:
-            return np.asarray(solved)
-        out = np.zeros(columns.shape)
-        out[kept] = solved
-        return out
+        return self(columns[:, None])[:, 0] if columns.ndim == 1 else whiten_under_each([self], columns)[0]
 
     @cached_property
     def _difference_covariance_root(self) -> FloatArray:
@@ -327,7 +332,10 @@ class NoiseLaw:
         bands[0] = gained + variance
         bands[0, 1:] += variance[:-1]
         bands[1, :-1] = -variance[:-1]
-        return np.asarray(cholesky_banded(bands, lower=True))
+        root, failed = dpbtrf(bands, lower=1)  # scipy's own wrapper takes longer than the factor of a hundred rows
+        if failed:
+            raise np.linalg.LinAlgError("the covariance of a random walk is not definite")
+        return np.asarray(root)
 
     def half_log_det(self) -> float:
         """Return half the log determinant of the relative covariance."""
@@ -338,7 +346,7 @@ class NoiseLaw:
 
     @cached_property
     def whitened_density(self) -> Tail | RoundedNormal:
-        """Density of one whitened reading: a mixture of two normals (`Tail`) or a rounded normal (`RoundedNormal`)."""
+        """Density of one whitened reading."""
         return stacked_density([self])
 
     @cached_property
@@ -352,6 +360,11 @@ class NoiseLaw:
         if isinstance(density, RoundedNormal) and np.ndim(density.sd):
             return np.asarray(density.whitening_sd)[:, 0]
         return self.sd
+
+    @property
+    def fisher_information(self) -> float:
+        """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
+        return float(self.whitened_density.fisher_information)
 
     @cached_property
     def sigma_floor(self) -> float:
@@ -412,124 +425,67 @@ class NoiseLaw:
     def bounded_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return normal pseudo-residuals that, for rounded readings, are never larger than the residual.
 
-        A rounded reading has a flat-topped density. On its steep flank, the score over the Fisher information would
-        exceed the residual.
+        On the steep flank of a flat-topped density the score over the Fisher information would exceed it.
         """
         normal = self.normal_pseudo_residuals(whitened, sigma)
         return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
 
     def draw_pseudo_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw pseudo-residuals of noise alone, in units of their sd, (n_points, n_draws); 0 for lost readings."""
-        eps = rng.standard_normal((len(self.sd), n_draws))
-        if not self.whitened_density.is_normal:
+        eps, density = rng.standard_normal((len(self.sd), n_draws)), self.whitened_density
+        if not density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
-            if isinstance(self.whitened_density, RoundedNormal):
-                eps = self.whitened_density.add_rounding(eps, rng=rng)
+            if isinstance(density, RoundedNormal):
+                uniform = rng.uniform(-1.0, 1.0, eps.shape)
+                eps = np.asarray(eps * density.normal_sd + density.half / density.whitening_sd * uniform)
             eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.fisher_information)
         return eps * self._counted[:, None]
 
 
-@dataclass(frozen=True, eq=False)
-class Tail:
-    """A scale mixture of two normals: sd sigma, or with probability `share` `times` sigma; scalars, or k of both (k,).
-
-    All methods take whitened residuals, (n_points, k) or (n_points, 1).
-    """
-
-    share: float | FloatArray
-    times: float | FloatArray
-
-    @cached_property
-    def is_normal(self) -> bool:
-        """Whether there is no tail."""
-        return bool(np.all(np.asarray(self.share) == 0))
-
-    @cached_property
-    def fisher_information(self) -> FloatArray:
-        """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
-        return np.asarray(np.vectorize(_fisher_information_of_tail, otypes=[np.float64])(self.share, self.times))
-
-    def likeliest_sigma(
-        self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
-    ) -> FloatArray:
-        """Return the most likely sigma, (k,), by EM; `n_points` rows count, the others (lost readings) are 0."""
-        if self.is_normal:
-            rms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened) / n_points)
-            return np.asarray(np.maximum(rms, max(floor, LEAST_SCALE)))
-        squares, sigma = whitened**2, start
-        if sigma is None:  # from the interquartile range of the readings not lost, which is robust to the tail
-            middle = len(whitened) - n_points // 2 - 1
-            median = np.partition(np.abs(whitened), middle, axis=0)[middle]
-            sigma = np.maximum(median / MAD_OF_NORMAL, floor) + LEAST_SCALE
-        for _ in range(_EM_STEPS if start is None else 3):
-            weighed = self._relative_precisions(squares / sigma**2) * squares
-            sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + LEAST_SCALE
-        return np.asarray(sigma)
-
-    def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the log likelihood of `n_points` readings at sigma (k,), without n/2 log 2 pi: (k,)."""
-        if self.is_normal:
-            return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
-        squares = (whitened / sigma) ** 2
-        log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds_of_wide(squares))
-        at_zero = np.logaddexp(0.0, self._log_odds_of_wide(np.zeros((1, 1))))[0]
-        of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
-        return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share)) - of_kept)
-
-    def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Convert residuals to equally informative normal ones, of sd sigma / sqrt(information) and the same shape.
-
-        Each is the score of the density over its Fisher information; outlying residuals have little weight (Huber 1981,
-        section 6.7).
-        """
-        if self.is_normal:
-            return whitened
-        return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.fisher_information)
-
-    def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """Return minus the second derivative of the log likelihood by log sigma at its peak, (k,).
-
-        `sigma` must be the likeliest one; the result is at least 0.2 per reading.
-        """
-        squares = (whitened / sigma) ** 2
-        wide = self.wide_probability(squares)
-        less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
-        return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
-
-    def wide_probability(self, squares: FloatArray) -> FloatArray:
-        """Return the probability that a residual is from the wide component, from its square over sigma^2."""
-        return np.asarray(expit(self._log_odds_of_wide(squares)))
-
-    def _log_odds_of_wide(self, squares: FloatArray) -> FloatArray:
-        share, times = np.asarray(self.share), np.asarray(self.times)
-        return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
-
-    def _relative_precisions(self, squares: FloatArray) -> FloatArray:
-        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide_probability(squares))
-
-
 def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
-    """Return one density for the k distributions that whiten alike, all with a tail or all rounded.
+    """Return one density, with parameters (k,), for k distributions that whiten alike, all with a tail or all rounded.
 
-    Its parameters are (k,).
+    Which readings are wide beside a walk is in their sds.
     """
-    if any(law.wide.size for law in laws):  # which readings are wide is in their sds
+    if any(law.wide.size for law in laws):
         return Tail(0.0, 1.0)
     pairs = [(law.flat, law.sigma) if laws[0].flat else (law.share, law.times) for law in laws]
     first, second = pairs[0] if len(laws) == 1 else np.array(pairs).T
     return RoundedNormal(first, second, laws[0].sd_beside_rounding) if laws[0].flat else Tail(first, second)
 
 
-@lru_cache(maxsize=256)
-def _fisher_information_of_tail(share: float, times: float) -> float:
-    if share == 0:
-        return 1.0
-    # The integrand extends as far as the wide component.
-    z = np.linspace(-6 * times, 6 * times, 4001)
-    narrow = (1 - share) * np.exp(-0.5 * z * z)
-    wide = share / times * np.exp(-0.5 * (z / times) ** 2)
-    score = z * (narrow + wide / times**2) / (narrow + wide)
-    return float(np.sum(score**2 * (narrow + wide)) * (z[1] - z[0]) / math.sqrt(2 * math.pi))
+def whiten_under_each(laws: Sequence[NoiseLaw], columns: FloatArray) -> FloatArray:
+    """Whiten columns (n_points, n_columns) under each of some distributions, (n_laws, n_points, n_columns).
+
+    All of them have a random walk, or none has one. Rows of lost readings become 0.
+    """
+    kept = np.stack([law.kept for law in laws])
+    if laws[0].walk.size:
+        there = kept > 0
+        own = columns if len(laws) == 1 else np.tile(columns, (len(laws), 1))
+        own = own if there.all() else own[there.ravel()]
+        # Differences of successive readings correlate only with their neighbours. Those under all distributions are
+        # solved in one call: between their blocks the bands are 0.
+        steps, first = np.array(own, dtype=np.float64, order="F"), np.cumsum(there.sum(axis=1))[:-1]
+        steps[1:] -= own[:-1]
+        steps[first] = own[first]
+        roots = np.concatenate([law._difference_covariance_root for law in laws], axis=1)
+        solved, _ = dtbtrs(roots, steps, uplo="L", overwrite_b=1)
+        if there.all():
+            return np.reshape(solved, (len(laws), *columns.shape))
+        out = np.zeros((len(laws), *columns.shape))
+        out[there] = solved
+        return out
+    y = columns * (kept / np.stack([law._whitening_sd for law in laws]))[:, :, None]
+    carry = np.stack([law.carry for law in laws])[:, :, None]
+    if np.any(carry):
+        before = max((law.before for law in laws), key=len)
+        if before.size:
+            y -= carry * y[:, before]
+        else:  # a view: an indexed copy of thousands of columns takes longer than the rest
+            y[:, 1:] -= carry[:, 1:] * y[:, :-1]
+        y /= np.sqrt(1 - carry**2)
+    return np.asarray(y)
 
 
 def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
@@ -546,7 +502,7 @@ def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> Noi
     return replace(
         white_noise(int(usable.sum()), least=max(least, sd_of_numbers(recording))),
         sd=recording.relative_sd[usable],
-        censored=censored[usable] if censored.any() else np.zeros(0, dtype=np.bool_),
+        censored=censored[usable & censored.any()],
     )
 
 
@@ -602,13 +558,10 @@ def walk_given_readings(law: NoiseLaw, residuals: FloatArray) -> FloatArray:
     """Return the expected random walk in residuals, given all of them, (n_points,); 0 without a walk."""
     if not law.walk.size:
         return np.zeros(len(residuals))
-    weight = law.kept / law.sd**2
-    bands = precision_bands_of_walk(law)
-    bands[0] += weight
-    return np.asarray(solveh_banded(bands, weight * residuals, lower=True, check_finite=False))
+    return _smoothed_and_variance(_precision_bands_of_walk(law), law.kept / law.sd**2, residuals)[0]
 
 
-def precision_bands_of_walk(law: NoiseLaw) -> FloatArray:
+def _precision_bands_of_walk(law: NoiseLaw) -> FloatArray:
     """Return the diagonal and the one below of a random walk's precision, in 1 / sigma^2, (2, n_points)."""
     steps = 1 / law.walk
     return np.stack([steps + np.append(steps[1:], 0.0), np.append(-steps[1:], 0.0)])
@@ -620,42 +573,62 @@ _SMALLEST = 1e-9  # sigma, of the largest residual: most readings may be exactly
 _FARTHEST = 1e100  # residual whose square is a number
 
 
-def with_known_wide_readings(law: NoiseLaw, residuals: FloatArray) -> NoiseLaw:
-    """Return a random walk's distribution with the tail on each reading's own noise, given the residuals of a fit.
+def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) -> list[NoiseLaw]:
+    """Return random walks' distributions with the tail on each reading's own noise, given the residuals of a fit.
 
-    `law`: noise with a walk and a tail (`share`, `times`); `residuals`: residuals of the fit, (n_points,). Returns
-    Gaussian noise with the probability of each reading to be wide (`wide`), and sds that include it. Its `log_extra` is
+    `laws`: noises with a walk and a tail (`share`, `times`); `residuals`: residuals of the fit, (n_points,). Returns
+    Gaussian noises with the probability of each reading to be wide (`wide`), and sds that include it. `log_extra` is
     what the log density of these residuals, averaged over the sets of wide readings, exceeds that of this noise by.
     """
     if not np.abs(residuals).max() < _FARTHEST:  # of predictions that ran away: impossible in any case
-        return replace(law, wide=np.zeros(len(residuals)))
-    kept, excess = ~law.lost, 1 - law.times**-2
-    own, bands = law.sd**2, precision_bands_of_walk(law)
-    sigma = math.inf
-    precise = np.ones(len(own))  # expected precision of each reading, relative to a narrow one
+        return [replace(law, wide=np.zeros(len(residuals))) for law in laws]
+    out, going = list(laws), np.arange(len(laws))
+    bands = np.stack([_precision_bands_of_walk(law) for law in laws])
+    kept, own = np.stack([~law.lost for law in laws]), np.stack([law.sd**2 for law in laws])
+    per_law = [(law.share, law.times**2, 1 - law.times**-2) for law in laws]
+    share, wider, excess = (np.array(values)[:, None] for values in zip(*per_law, strict=True))
+    floor = np.array([max(law.sigma_floor, LEAST_SCALE) for law in laws])
+    sigma, precise = np.full(len(laws), math.inf), np.ones(own.shape)  # precision relative to that of a narrow reading
     for k in range(_ROUNDS):
-        weight = law.kept * precise / own
-        smoothed, variance = _smoothed_and_variance(bands, weight, residuals)
+        weight = kept * precise / own
+        # Of all distributions at once: between their blocks the bands are 0.
+        flat = np.concatenate(list(bands), axis=1), weight.ravel(), np.tile(residuals, len(own))
+        smoothed, variance = (values.reshape(own.shape) for values in _smoothed_and_variance(*flat))
         unshared = np.maximum(1 - weight * variance, 1e-12)
         apart, beside = (residuals - smoothed) / unshared, variance / unshared  # from the walk as the others tell it
         last = sigma
         if k:
-            sigma = math.sqrt(max(float(np.mean((weight * (residuals - smoothed) * residuals)[kept])), 0.0))
+            squares = np.sum(weight * (residuals - smoothed) * residuals, axis=1)
+            sigma = np.sqrt(np.maximum(squares, 0.0) / kept.sum(axis=1))
         else:  # whatever some outlying readings are
-            sigma = float(np.median(np.abs(apart / np.sqrt(beside + own))[kept])) / MAD_OF_NORMAL
-        sigma = max(sigma, law.sigma_floor, _SMALLEST * float(np.abs(apart).max()), LEAST_SCALE)
-        apart /= sigma
-        log_narrow = np.log1p(-law.share) + _log_normal_density(apart, beside + own)
-        log_wide = np.log(law.share) + _log_normal_density(apart, beside + own * law.times**2)
+            sizes = np.abs(apart / np.sqrt(beside + own))
+            sigma = np.array([np.median(a[b]) for a, b in zip(sizes, kept, strict=True)]) / MAD_OF_NORMAL
+        sigma = np.maximum(np.maximum(sigma, floor), _SMALLEST * np.abs(apart).max(axis=1))
+        apart /= sigma[:, None]
+        log_narrow = np.log1p(-share) + _log_normal_density(apart, beside + own)
+        log_wide = np.log(share) + _log_normal_density(apart, beside + own * wider)
         wide, used = expit(log_wide - log_narrow), precise
         precise = 1 - excess * wide
-        if k and np.abs(precise - used)[kept].max() < _SAME and abs(sigma / last - 1) < _SAME:
-            break
-    log_mixed = np.logaddexp(log_narrow, log_wide)
-    log_extra = float(np.sum((log_mixed - _log_normal_density(apart, beside + own / used))[kept]))
-    return replace(
-        law, sd=np.sqrt(own / used), wide=law.kept * (1 - used) / excess, log_extra=law.log_extra + log_extra
-    )
+        done = np.full(len(own), k == _ROUNDS - 1)
+        if k:
+            change = np.where(kept, np.abs(precise - used), 0.0).max(axis=1)
+            done |= (change < _SAME) & (np.abs(sigma / last - 1) < _SAME)
+        if done.any():
+            more = np.logaddexp(log_narrow, log_wide) - _log_normal_density(apart, beside + own / used)
+            for j in np.flatnonzero(done):
+                law = laws[going[j]]
+                out[going[j]] = replace(
+                    law,
+                    sd=np.sqrt(own[j] / used[j]),
+                    wide=law.kept * (1 - used[j]) / excess[j],
+                    log_extra=law.log_extra + float(np.sum(more[j][kept[j]])),
+                )
+            if done.all():
+                break
+            stay = ~done
+            going, bands, kept, own, floor = going[stay], bands[stay], kept[stay], own[stay], floor[stay]
+            share, wider, excess, sigma, precise = (a[stay] for a in (share, wider, excess, sigma, precise))
+    return out
 
 
 def _smoothed_and_variance(
@@ -665,18 +638,44 @@ def _smoothed_and_variance(
 
     `steps` are the bands of the walk's precision, (2, n_points); `weight` the precisions of the readings, (n_points,).
     """
-    bands = steps.copy()
-    bands[0] += weight
-    root = cholesky_banded(bands, lower=True, check_finite=False)
+    diagonal, below = steps[0] + weight, steps[1, :-1]
     # The inverse's diagonal from the pivots of elimination forwards and backwards.
-    backwards = np.stack([bands[0, ::-1], np.append(bands[1, -2::-1], 0.0)])
-    pivots = cholesky_banded(backwards, lower=True, check_finite=False)[0, ::-1] ** 2
-    smoothed = cho_solve_banded((root, True), weight * residuals, check_finite=False)
-    return np.asarray(smoothed), np.asarray(1 / (root[0] ** 2 + pivots - bands[0]))
+    forwards, lower, failed = dpttrf(diagonal, below)
+    backwards, _, _ = dpttrf(diagonal[::-1], below[::-1])
+    if failed:
+        raise np.linalg.LinAlgError("the precision of a random walk is not definite")
+    smoothed, _ = dpttrs(forwards, lower, weight * residuals)
+    return np.asarray(smoothed), np.asarray(1 / (forwards + backwards[::-1] - diagonal))
 
 
 def _log_normal_density(apart: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(-0.5 * np.log(variance) - 0.5 * apart**2 / variance)
+
+
+def order_by_scan(recording: Recording) -> IntArray:
+    """Return the numbers of the usable readings, those of each scan together, in their order, (n_usable,)."""
+    return np.argsort(recording.plan.scan[recording.usable], kind="stable")
+
+
+def previous_usable(recording: Recording) -> IntArray:
+    """Return the number of the usable reading before each in its scan, -1 for the first of a scan, (n_usable,)."""
+    order = order_by_scan(recording)
+    same = np.diff(recording.plan.scan[recording.usable][order], prepend=-1) == 0
+    out = np.full(len(order), -1)
+    out[order[same]] = order[np.flatnonzero(same) - 1]
+    return out
+
+
+def n_rows_since_previous_usable(recording: Recording) -> IntArray:
+    """Return the number of rows of the scan back to its previous usable reading, 0 if there is none, (n_usable,).
+
+    Neighbours of a missing reading are two steps apart. Rows of other scans in between do not count.
+    """
+    scan = recording.plan.scan
+    place = np.empty(len(scan), dtype=np.int64)
+    place[np.argsort(scan, kind="stable")] = np.arange(len(scan))
+    own, before = place[recording.usable], previous_usable(recording)
+    return np.where(before >= 0, own - own[before], 0).astype(np.int64)
 
 
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
@@ -684,8 +683,8 @@ _APART = 0.3  # initial spacing of nodes in the log of half a step over the nois
 _WIDEST, _NARROWEST = -6, 9  # range of nodes: noise sds from 3 steps, or the residual rms, to a thirtieth of a step
 _UNLIKELY = 15.0  # nats behind the best from which nodes of noise with rounding are dropped
 HIDDEN = 0.6  # sd over step from which rounding is negligible (lattice sum 1 + 2 exp(-2 pi^2 0.36) = 1.0016)
-
 _FINE = 0.01  # noise sds: tolerance of a lost reading's value without rounding
+_AT_ONCE = 100_000  # readings of nodes whose wide readings are estimated together, to fit a processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -721,24 +720,45 @@ class NoiseModel:
 
         `predicted` are predictions of the usable rows, (n_usable,). With `rounding`, each node is a noise sd.
         """
+        return self._nodes_about(predicted) if self._depends_on_fit else self._nodes_about_every_fit
+
+    @cached_property
+    def _nodes_about_every_fit(self) -> NoiseNodes:
+        return self._nodes_about(self._readings)
+
+    @cached_property
+    def _depends_on_fit(self) -> bool:
+        """Whether what a fit predicts changes the nodes or the distributions there."""
+        if self.rounding or any(e.nodes_about is not None and e.name not in self.likely for e in self.effects):
+            return True
+        settings, _ = self._grid(self._readings)
+        noise = self._parameters(settings, np.full((1, len(self.recording)), np.nan))
+        return bool(np.isnan(noise.sd).any() or noise.lost_share.any() or (noise.walk.any() and noise.wide_share.any()))
+
+    def _grid(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the settings of the parameters at all nodes about a fit, and their log weights."""
         residuals, sd = self._residuals_and_rough_sd(predicted)
-        rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._usable_readings)
-        whitened = residuals / sd
-        banks = [self.likely.get(e.name) or e.weighed_nodes(whitened, rows) for e in self.effects]
+        rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable], self._readings)
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
-        for bank, log_each in banks:
+        for effect in self.effects:
+            bank, log_each = self.likely.get(effect.name) or effect.weighed_nodes(residuals / sd, rows)
             every = [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))]
             settings = np.concatenate(every, axis=1)
             log_weights = (log_weights[:, None] + log_each).ravel()
+        return settings, log_weights
+
+    def _nodes_about(self, predicted: FloatArray) -> NoiseNodes:
+        settings, log_weights = self._grid(predicted)
         laws = self.laws_at(settings, predicted)
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
-            halves, beside = _sd_nodes_with_rounding(
-                law(self._usable_readings - predicted), 0.5 * self.rounding, law.n_kept, law.sd_beside_rounding
+            half_step = 0.5 * self.rounding
+            halves, log_weights = _sd_nodes_with_rounding(
+                law(self._readings - predicted), half_step, law.n_kept, law.sd_beside_rounding
             )
-            laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
-            return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
+            laws = tuple(replace(law, flat=x, sigma=half_step / x) for x in halves)
+            settings = np.repeat(settings, len(laws), axis=0)
         return NoiseNodes(settings, laws, log_weights)
 
     def laws_at(self, settings: FloatArray, predicted: FloatArray) -> tuple[NoiseLaw, ...]:
@@ -747,102 +767,110 @@ class NoiseModel:
         `predicted` are predictions of the usable rows, (n_usable,).
         """
         residuals, sd = self._residuals_and_rough_sd(predicted)
-        plan, span, seen = self.recording.plan, float(np.ptp(predicted)) or 1.0, np.zeros((1, len(self.recording)))
+        span, seen = float(np.ptp(predicted)) or 1.0, np.zeros((1, len(self.recording)))
         seen[0, self.recording.usable] = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
+        noise = self._parameters(settings, seen)
+        far = np.abs(residuals) > _FAR * sd
+        names = "rho", "walk", "wide_share", "wide_times", "lost_share", "lost_value"
+        each = (np.broadcast_to(getattr(noise, name)[:, 0], len(settings)).tolist() for name in names)
+        sds = noise.sd if noise.sd.shape[1] == 1 else noise.sd[:, self.recording.usable]
+        sds = np.broadcast_to(sds, (len(settings), len(far)))
+        laws = tuple(self._law(far, *values) for values in zip(sds, *each, strict=True))
+        if not (laws and laws[0].walk.size and laws[0].share):
+            return laws
+        left, at_once = self._readings - predicted, max(_AT_ONCE // len(predicted), 1)
+        parts = [laws[k : k + at_once] for k in range(0, len(laws), at_once)]
+        return tuple(law for part in parts for law in with_known_wide_readings(part, left))
+
+    def _parameters(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
         noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=seen)
         for effect, own in effects_with_columns(self.effects):
-            noise = effect.apply(noise, settings[:, own], plan)
-        far = np.abs(residuals) > _FAR * sd
-        laws = (self._law_at_node(noise, k, far) for k in range(len(settings)))
-        left = self._usable_readings - predicted
-        return tuple(with_known_wide_readings(law, left) if law.walk.size and law.share else law for law in laws)
+            noise = effect.apply(noise, settings[:, own], self.recording.plan)
+        return noise
 
     def _residuals_and_rough_sd(self, predicted: FloatArray) -> tuple[FloatArray, float]:
         """Return the residuals over their declared relative sds, (n_usable,), and a robust estimate of their sd."""
-        residuals = (self._usable_readings - predicted) / self.recording.relative_sd[self.recording.usable]
+        residuals = (self._readings - predicted) / self.recording.relative_sd[self.recording.usable]
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         free = residuals[~self._censored] if self._censored.any() else residuals
         sd = max(float(np.median(np.abs(free))) / MAD_OF_NORMAL, self._rounding_step / math.sqrt(12))
         return residuals, sd or 1.0
 
-    def _law_at_node(self, noise: NoiseParameters, node: int, far: BoolArray) -> NoiseLaw:
-        def value_at_node(values: FloatArray) -> float:
-            return float(values[min(node, len(values) - 1), 0])
-
-        sd = noise.sd[min(node, len(noise.sd) - 1)]
-        sd = np.full(len(far), sd[0]) if len(sd) == 1 else sd[self.recording.usable]
-        lost_share, value, lost = value_at_node(noise.lost_share), value_at_node(noise.lost_value), np.zeros_like(far)
-        log_extra = 0.0
-        if lost_share > 0:
-            lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * self._span + 1e-14 * abs(value))
-            n_lost, cells = int(lost.sum()), max(self._span / self._lost_value_resolution, 1.0)
-            # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
-            log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
-            log_extra += int((lost & self._censored).sum()) * math.log(self._lost_value_resolution)
-            log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
-            log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
-        rho, carry = value_at_node(noise.rho), np.zeros(len(far))
+    def _law(
+        self,
+        far: BoolArray,
+        sd: FloatArray,
+        rho: float,
+        step: float,
+        share: float,
+        times: float,
+        lost_share: float,
+        value: float,
+    ) -> NoiseLaw:
+        lost, log_extra = self._lost_readings(lost_share, value, far) if lost_share > 0 else (np.zeros_like(far), 0.0)
+        carry, (n_rows, above, before) = np.zeros(len(far)), self._rows_before
         if rho:
-            n_rows, above = self._n_rows_since_previous_in_scan, self._previous_in_scan
             # The noise of a censored reading is not known: none is correlated with it.
             unknown = lost | self._censored
             alone = (n_rows == 0) | unknown | (above >= 0) & unknown[above]
             carry = np.where(alone, 0.0, rho ** np.maximum(n_rows, 1))
-        step = value_at_node(noise.walk)
         return NoiseLaw(
             sd,
             carry,
             lost,
-            value_at_node(noise.wide_share),
-            value_at_node(noise.wide_times),
+            share,
+            times,
             log_extra,
             least=self._floor,
             walk=step**2 * self._n_rows_since_previous if step else np.zeros(0),
-            before=self._before_if_interleaved if rho else np.zeros(0, dtype=np.int64),
-            censored=self._censored if self._censored.any() else np.zeros(0, dtype=np.bool_),
+            before=before if rho else before[:0],
+            censored=self._censored[: len(far) * self._censored.any()],
         )
 
+    def _lost_readings(self, share: float, value: float, far: BoolArray) -> tuple[BoolArray, float]:
+        """Return the mask of the readings lost to a value, (n_usable,), and their log probability."""
+        span, resolution = self._span_and_resolution
+        lost = far & (np.abs(self._readings - value) <= 1e-9 * span + 1e-14 * abs(value))
+        n_lost, cells = int(lost.sum()), max(span / resolution, 1.0)
+        # A lost reading has a density, 1 / cell; a censored one has a probability, so the cell cancels.
+        log_extra = n_lost * math.log(share / resolution)
+        log_extra += int((lost & self._censored).sum()) * math.log(resolution)
+        log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
+        return lost, log_extra + (len(lost) - n_lost) * math.log1p(-share)
+
     @cached_property
-    def _floor(self) -> float:
-        return max(self.least_sd, sd_of_numbers(self.recording))
+    def _readings(self) -> FloatArray:
+        return self.recording.readings[self.recording.usable]
 
     @cached_property
     def _censored(self) -> BoolArray:
         return self.recording.censored[self.recording.usable]
 
     @cached_property
-    def _previous_in_scan(self) -> IntArray:
-        return previous_usable(self.recording)
+    def _floor(self) -> float:
+        return max(self.least_sd, sd_of_numbers(self.recording))
 
     @cached_property
-    def _before_if_interleaved(self) -> IntArray:
-        above = self._previous_in_scan
-        return np.maximum(above, 0) if np.any((above >= 0) & (above != np.arange(len(above)) - 1)) else above[:0]
+    def _rounding_step(self) -> float:
+        return lattice_step(self._readings)
 
     @cached_property
-    def _usable_readings(self) -> FloatArray:
-        return self.recording.readings[self.recording.usable]
+    def _span_and_resolution(self) -> tuple[float, float]:
+        """Span of the readings, and to what a lost reading's value is known."""
+        return float(np.ptp(self._readings)), self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
-    def _span(self) -> float:
-        return float(np.ptp(self._usable_readings))
+    def _rows_before(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Numbers of rows and of the reading before each in its scan, and that for `NoiseLaw`, empty if next above."""
+        above = previous_usable(self.recording)
+        interleaved = np.any((above >= 0) & (above != np.arange(len(above)) - 1))
+        before = np.maximum(above, 0) if interleaved else above[:0]
+        return n_rows_since_previous_usable(self.recording), above, before
 
     @cached_property
     def _n_rows_since_previous(self) -> FloatArray:
         """Number of rows back to the previous usable reading, even of another run, (n_usable,)."""
         return np.diff(np.flatnonzero(self.recording.usable), prepend=-1.0)
-
-    @cached_property
-    def _n_rows_since_previous_in_scan(self) -> IntArray:
-        return n_rows_since_previous_usable(self.recording)
-
-    @cached_property
-    def _lost_value_resolution(self) -> float:
-        return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
-
-    @cached_property
-    def _rounding_step(self) -> float:
-        return lattice_step(self._usable_readings)
 
 
 def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
@@ -884,12 +912,6 @@ def _sd_nodes_with_rounding(
     log_weights = np.log(np.gradient(x))
     likely = height > height.max() - _UNLIKELY
     return np.exp(x[likely]), log_weights[likely]
-
-
-def least_sd_given_rounding(recording: Recording) -> float:
-    """Return the least sd of a normal density of the readings: the usual floor, and at least 0.6 of a rounding step."""
-    # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
-    return max(sd_floor(recording), HIDDEN * lattice_step(recording.readings[recording.usable]))
 
 
 def rough_sd(recording: Recording) -> float:

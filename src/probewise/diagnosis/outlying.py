@@ -17,7 +17,7 @@ from scipy.special import betaln, ndtri, stdtr
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start, with_prior
-from probewise.diagnosis.locate import Covariate, window_columns_and_bounds
+from probewise.diagnosis.locate import Covariate, window_columns
 from probewise.diagnosis.noise import LEAST_SCALE, MAD_OF_NORMAL, NoiseLaw, Tail, white_noise_of_recording
 from probewise.diagnosis.templates import log_mean_exp
 from probewise.effects import NoiseEffect
@@ -57,7 +57,7 @@ def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covar
     even = float(betaln(total + _A, n - total + _A) - betaln(_A, _A))
     scores: dict[str, list[FloatArray]] = {}
     for covariate in covariates:
-        columns, _ = window_columns_and_bounds(covariate, n)
+        columns, _ = window_columns(covariate, n)
         if columns.shape[1]:
             inside, many = far_out @ columns, columns.sum(axis=0)
             outside, few = total - inside, n - many
@@ -104,7 +104,7 @@ def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) ->
     residual, slopes = law(found.residuals), law(found.slopes)
     if not (np.isfinite(residual).all() and np.isfinite(slopes).all()):
         return np.zeros(0, dtype=np.int64)
-    out, kept = list[int](), law.kept > 0
+    out, kept = list[int](), ~law.lost
     with np.errstate(all="ignore"):
         for _ in range(int(MOST_OUTLYING * kept.sum())):
             basis, singular, _ = np.linalg.svd(slopes[kept] / max(found.sd, LEAST_SCALE), full_matrices=False)
@@ -243,11 +243,11 @@ def note_on_improbable_rows(found: Fit, recording: Recording) -> tuple[str, ...]
     if not at.size:
         return ()
     squares = (found.residuals / law.sd) ** 2
+    share = _percent(float(squares[at].sum() / squares.sum()))
     carry, bend = ("carries", "bends") if len(at) == 1 else ("carry", "bend")
     return (
-        f"{rows_in_words(recording, usable[at])} {carry} {_percent(float(squares[at].sum() / squares.sum()))} of the "
-        f"squared residuals and {bend} the fit; correct or empty cells that hold no reading; probewise diagnose tells "
-        "outlying readings from effects",
+        f"{rows_in_words(recording, usable[at])} {carry} {share} of the squared residuals and {bend} the fit; correct "
+        "or empty cells that hold no reading; probewise diagnose tells outlying readings from effects",
     )
 
 

@@ -1,20 +1,17 @@
 """A hypothesis as an inference problem, and draws from its posterior.
 
-The likelihood of exchangeable Gaussians has every mode N! times. (The prior of three or more shares, given by their
-ratios to the first, is not quite the same for all orders.) Folded onto the order nearest to a point, with the prior
-density of all orders summed, the posterior has each mode once, and sampling need not hop between modes.
+The likelihood of exchangeable Gaussians has every mode N! times. Folded onto the order nearest to a point, with the
+prior density of all orders summed, the posterior has each mode once, and sampling need not hop between modes.
 
 Draws are by importance resampling from the closest proposal at hand, or by one of two ways where none is close enough.
-Where many predictions cost little, adaptive importance sampling: a few readings, or parameters that act alike, leave a
-posterior that is narrow and bent, of which Laplace's approximation at its mode covers a part. The ridge is followed
-from the mode to where it is unlikely; kernels along it, each of the local shape, are a proposal that covers all of it
-(after Cornuet, Marin, Mira & Robert 2012, with local covariances).
+Where many predictions cost little, adaptive importance sampling: the ridge of a posterior that is narrow and bent is
+followed from the mode to where it is unlikely; kernels along it, each of the local shape, are a proposal that covers
+all of it (after Cornuet, Marin, Mira & Robert 2012, with local covariances).
 
 Else annealing: the densities between are q^(1 - beta) p^beta (Neal 2001). After each step of beta the samples are
 resampled by their weights and moved: each half by differences of the other half (ter Braak 2006), which leaves the
 density invariant. A quadratic surrogate of the model's predictions is cheap enough to move thousands of samples. It is
-fitted at steps of the size of the approximate posterior, so that it interpolates over the relevant region instead of
-extrapolating from a point. Negligible changes of the readings are left out.
+fitted at steps of the size of the approximate posterior, so that it interpolates instead of extrapolating.
 """
 
 from __future__ import annotations
@@ -22,17 +19,22 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Self, TypeAlias, cast
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TypeAlias, cast
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
+from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.evidence import NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, with_prior
-from probewise.diagnosis.linear_posterior import ConditionallyLinearDensity, LinearAmplitudes
+from probewise.diagnosis.linear_posterior import (
+    TangentModel,
+    draws_of_linear_amplitudes,
+    modes_of_opposite_sign,
+    sizes_with_shape,
+)
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.diagnosis.simulator_fit import log_evidence_of
@@ -49,6 +51,7 @@ from probewise.nested.weights import (
 )
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
+from probewise.systems import System
 
 NUMBERS = 4_000_000
 """Readings that are predicted at once."""
@@ -90,17 +93,16 @@ class StandardNormal:
 class HypothesisProblem:
     """A model in its coordinates with a recording; noise sd and parameters of the noise model are marginalised.
 
-    Predictions of many samples are made in blocks, to fit in memory.
-
-    `model`, `recording`: model and data; `noise`: evidence of a fit by node of the noise model (a set of its
-    parameters); the probable nodes are averaged over; `near`: a point, (n_params,), such as its best fit, onto the
-    nearest order of whose Gaussians the prior is folded. Predictions do not depend on the order, nor does the evidence.
+    Predictions of many samples are made in blocks, to fit in memory. They do not depend on the order of exchangeable
+    Gaussians, nor does the evidence.
     """
 
     model: Model
     recording: Recording
-    noise: NoiseEvidence
-    near: FloatArray | None = None
+    noise: (
+        NoiseEvidence  # of a fit by node of the noise model (a set of its parameters): the probable are averaged over
+    )
+    near: FloatArray | None = None  # (n_params,), onto the nearest order of whose Gaussians the prior is folded
 
     @cached_property
     def prior(self) -> StandardNormal:
@@ -165,16 +167,10 @@ class FoldedNormal(StandardNormal):
     """A standard normal prior, folded onto the order of a sensor's Gaussians that is nearest to a point.
 
     The density of a point is the sum of the normal's densities over all orders (permutations of the Gaussians).
-
-    `n_params`: number of coordinates; `sensor`: sensor with exchangeable Gaussians; its coordinates come first; `near`:
-    the point, (n_params,).
     """
 
-    sensor: CalibratedSensor
-    near: FloatArray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "near", read_only_floats(self.near))
+    sensor: CalibratedSensor  # with exchangeable Gaussians; its coordinates come first
+    near: FloatArray  # the point, (n_params,)
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
@@ -402,7 +398,7 @@ class _Ridge:
 
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
-_LEAST_OF_IT = 0.5  # least acceptable share of the target
+_LEAST_SHARE = 0.25  # least acceptable effective sample size, likewise
 _ALIKE = 0.98  # effective share of a few draws, from which means of all are off by a seventh of an sd at most
 _EFFECTIVE = 0.5  # least effective share of the samples after a step of beta
 _AT_LAST = 3  # factor on the number of moves at beta = 1
@@ -419,21 +415,20 @@ def importance_resample(
     *,
     n_wanted: int,
     rng: np.random.Generator,
-    least: float = _LEAST_OF_IT * _ENOUGH,
     n_tried: int | None = None,
 ) -> FloatArray | None:
     """Draw from a density by importance resampling: (n_wanted, n_params), in random order.
 
     `first`: samples of the other density in random order, (n_first, n_params); only as many as needed are evaluated,
     for an effective sample size of half of `n_wanted`. `log_q`, `log_p`: unnormalised log densities of the proposal and
-    the target; the latter is minus infinity outside its support. `least`: share of `n_wanted` that the effective sample
-    size must reach; else None. `n_tried`: samples evaluated first; if these are fewer than wanted and nearly all
-    effective, so are the others.
+    the target; the latter is minus infinity outside its support. `n_tried`: samples evaluated first; if these are fewer
+    than wanted and nearly all effective, so are the others. None if the effective sample size is below a quarter of
+    `n_wanted`.
     """
     tried = first[: n_tried or n_wanted]
     gain = log_p(tried) - log_q(tried)
     share = _n_distinct_effective(gain, tried) / len(gain)
-    if share * len(first) < least * n_wanted:
+    if share * len(first) < _LEAST_SHARE * n_wanted:
         return None
     if len(tried) < n_wanted and share > _ALIKE:
         return first[:n_wanted]
@@ -441,7 +436,7 @@ def importance_resample(
     if enough > len(tried):
         more = first[len(tried) : enough]
         gain = np.append(gain, log_p(more) - log_q(more))
-    if _n_distinct_effective(gain, first[: len(gain)]) < least * n_wanted:
+    if _n_distinct_effective(gain, first[: len(gain)]) < _LEAST_SHARE * n_wanted:
         return None
     rows = resampled_rows(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])
@@ -472,24 +467,27 @@ def draw_by_annealing(
     returned, is as in `importance_resample`. Raises NotConvergedError if no initial sample is in the support of the
     target.
     """
-    n_walkers = len(first)
-    z, heights = first, (log_q(first), log_p(first))
+    n_walkers, beta, scale = len(first), 0.0, 1.0
+    z, heights = first, np.stack([log_q(first), log_p(first)])
     if not np.isfinite(heights[1]).any():
         raise NotConvergedError("no sample of the approximate posterior is within the bounds of the prior")
-    beta, scale = 0.0, 1.0
-    while beta < 1.0:
-        gain = heights[1] - heights[0]
-        after = _next_beta(gain, beta)
-        kept = resampled_rows(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
-        beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
-        progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
-        for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
+
+    def move(times: int) -> None:
+        nonlocal z, heights, scale
+        for _ in range(times):
             z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
+
+    while beta < 1.0:
+        gain, before = heights[1] - heights[0], beta
+        beta = _next_beta(gain, before)
+        kept = resampled_rows(np.exp((beta - before) * (gain - gain.max())), n_walkers, rng)
+        z, heights = z[kept], heights[:, kept]
+        progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
+        move(n_moves if beta < 1.0 else _AT_LAST * n_moves)
     harvest = [z]
     while len(harvest) * n_walkers < n_wanted:
         progress("sampling the posterior", len(harvest) * n_walkers, n_wanted)
-        for _ in range(n_moves):
-            z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
+        move(n_moves)
         harvest.append(z)
     return np.asarray(rng.permutation(np.concatenate(harvest))[:n_wanted])
 
@@ -505,98 +503,97 @@ def _next_beta(gain: FloatArray, beta: float) -> float:
 
 def _ensemble_step(
     z: FloatArray,
-    heights: tuple[FloatArray, FloatArray],
+    heights: FloatArray,
     beta: float,
     scale: float,
     log_q: Density,
     log_p: Density,
     *,
     rng: np.random.Generator,
-) -> tuple[FloatArray, tuple[FloatArray, FloatArray], float]:
-    """Move one half of the walkers by differences of the other half, then vice versa; adapt the step size."""
-    z, q, p = z.copy(), heights[0].copy(), heights[1].copy()
+) -> tuple[FloatArray, FloatArray, float]:
+    """Move one half of the walkers by differences of the other half, then vice versa; adapt the step size.
+
+    `heights` (2, n_walkers) are both log densities of the walkers.
+    """
+    z, heights = z.copy(), heights.copy()
     order, n = rng.permutation(len(z)), len(z) // 2
     accepted = 0
     for own, other in ((order[:n], order[n:]), (order[n:], order[:n])):
         first, second = (z[rng.choice(other, len(own))] for _ in range(2))
         length = scale * 2.38 / math.sqrt(2 * z.shape[1]) * rng.choice([1.0, 0.3], (len(own), 1))
         to = z[own] + length * (first - second)
-        to_q, to_p = log_q(to), log_p(to)
-        inside = np.isfinite(to_q) & np.isfinite(to_p)
-        rise = (1 - beta) * (to_q[inside] - q[own][inside]) + beta * (to_p[inside] - p[own][inside])
-        taken = inside.copy()
-        taken[inside] = np.log(rng.random(len(own)))[inside] < rise
-        z[own[taken]], q[own[taken]], p[own[taken]] = to[taken], to_q[taken], to_p[taken]
+        there = np.stack([log_q(to), log_p(to)])
+        taken = np.asarray(np.isfinite(there).all(axis=0))
+        of_q, of_p = (there - heights[:, own])[:, taken]
+        taken[taken] = np.log(rng.random(len(own)))[taken] < (1 - beta) * of_q + beta * of_p
+        z[own[taken]], heights[:, own[taken]] = to[taken], there[:, taken]
         accepted += int(taken.sum())
     rate = accepted / len(z)
-    return z, (q, p), min(max(scale * (1.3 if rate > 0.35 else 0.75 if rate < 0.15 else 1.0), 0.05), 2.0)
+    return z, heights, min(max(scale * (1.3 if rate > 0.35 else 0.75 if rate < 0.15 else 1.0), 0.05), 2.0)
 
 
 _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
 _RUNS_AWAY = 1e100  # of a prediction, whose square overflows: it counts as impossible
 
 
-@dataclass(frozen=True, eq=False)
-class QuadraticPredictions:
-    """Quadratic predictions at steps `e` from a point: `center` + `change_coefficients(e)` @ `changes`.
+def quadratic_predictions(
+    predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float
+) -> tuple[FloatArray, Callable[[FloatArray], FloatArray], FloatArray]:
+    """Predict readings to second order in steps `e`, as `center` + `coefficients(e)` @ `changes`, which are returned.
 
-    `center` (n_points,) are the predictions at the point; `changes` (n_changes, n_points) are orthonormal. Their
-    coefficients are linear in n_terms terms, the steps and products of `pairs` of steps, by `shares` (n_terms,
-    n_changes).
+    `center` (n_points,) are the predictions at e = 0; `coefficients` maps (n_samples, n_params) -> (n_samples,
+    n_changes); `changes` (n_changes, n_points) are orthonormal. This is exact, but for negligible changes, at every
+    step, its reverse, and sums of two.
+
+    `predict`: the model as a function of steps, (n_samples, n_params) -> (n_samples, n_points); finite at step 0; `sd`:
+    noise sd of a reading: changes by less than 0.02 sd over all readings together are neglected.
     """
+    first, second = np.triu_indices(n_params)
+    apart, one = first != second, np.eye(n_params)
+    y = predict(np.concatenate([np.zeros((1, n_params)), one, -one, one[first[apart]] + one[second[apart]]]))
+    y = np.where(np.abs(y) < _RUNS_AWAY, y, np.nan)
+    up, down, both = y[1 : n_params + 1] - y[0], y[n_params + 1 : 2 * n_params + 1] - y[0], y[2 * n_params + 1 :]
+    # Readings impossible on one side are as on the other; on both, they say nothing.
+    up, down = (np.nan_to_num(np.where(np.isnan(a), -b, a)) for a, b in ((up, down), (down, up)))
+    squares = np.empty((len(first), y.shape[1]))
+    squares[~apart] = 0.5 * (up + down)
+    squares[apart] = np.nan_to_num(both - y[0] - up[first[apart]] - up[second[apart]])
+    terms = np.concatenate([0.5 * (up - down), squares])
+    lengths, axes = np.linalg.eigh(terms @ terms.T)
+    kept = lengths > (_NEGLIGIBLE * sd) ** 2
+    root = np.sqrt(lengths[kept])
+    shares = axes[:, kept] * root
 
-    center: FloatArray
-    pairs: tuple[IntArray, IntArray]
-    shares: FloatArray
-    changes: FloatArray
+    def coefficients(e: FloatArray) -> FloatArray:
+        return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ shares)
 
-    @classmethod
-    def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> QuadraticPredictions:
-        """Build the surrogate; it is exact, but for negligible changes, at every step, its reverse, and sums of two.
-
-        `predict`: the model as a function of steps, (n_samples, n_params) -> (n_samples, n_points); finite at step 0;
-        `sd`: noise sd of a reading: changes by less than 0.02 sd over all readings together are neglected.
-        """
-        first, second = np.triu_indices(n_params)
-        apart = first != second
-        one = np.eye(n_params)
-        y = predict(np.concatenate([np.zeros((1, n_params)), one, -one, one[first[apart]] + one[second[apart]]]))
-        y = np.where(np.abs(y) < _RUNS_AWAY, y, np.nan)
-        up, down, both = y[1 : n_params + 1] - y[0], y[n_params + 1 : 2 * n_params + 1] - y[0], y[2 * n_params + 1 :]
-        # Readings impossible on one side are as on the other; on both, they say nothing.
-        up, down = (np.nan_to_num(np.where(np.isnan(a), -b, a)) for a, b in ((up, down), (down, up)))
-        squares = np.empty((len(first), y.shape[1]))
-        squares[~apart] = 0.5 * (up + down)
-        squares[apart] = np.nan_to_num(both - y[0] - up[first[apart]] - up[second[apart]])
-        terms = np.concatenate([0.5 * (up - down), squares])
-        lengths, axes = np.linalg.eigh(terms @ terms.T)
-        kept = lengths > (_NEGLIGIBLE * sd) ** 2
-        root = np.sqrt(lengths[kept])
-        return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
-
-    def change_coefficients(self, e: FloatArray) -> FloatArray:
-        """Return the coefficient of each change at steps `e`, (n_samples, n_params) -> (n_samples, n_changes)."""
-        first, second = self.pairs
-        return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)
+    return y[0], coefficients, (axes[:, kept] / root).T @ terms
 
 
 def surrogate_log_density(
-    quadratic: QuadraticPredictions, center: FloatArray, steps: FloatArray, readings: FloatArray, law: NoiseLaw
+    predict: Callable[[FloatArray], FloatArray],
+    center: FloatArray,
+    steps: FloatArray,
+    readings: FloatArray,
+    law: NoiseLaw,
+    sd: float,
 ) -> Density:
     """Return the unnormalised log posterior, as a function of e, of coordinates z = center + e @ steps, approximately.
 
-    It is that of quadratic predictions at `steps` from `center` for the readings (n_usable,) under normal noise: for
-    heavy-tailed noise, residuals are replaced by pseudo-residuals. Minus infinity beyond six prior sds.
+    It is that of `quadratic_predictions` for the readings (n_usable,) under normal noise: for heavy-tailed noise,
+    residuals are replaced by pseudo-residuals. Minus infinity beyond six prior sds. `predict` is the model as a
+    function of z.
     """
-    residual = law(readings - quadratic.center)[:, None]
+    middle, coefficients, changes = quadratic_predictions(lambda e: predict(center + e @ steps), len(center), sd)
+    residual = law(readings - middle)[:, None]
     residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), LEAST_SCALE))
     # In orthonormal axes of the space that residual and changes span, or of all readings if these are fewer.
-    _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
+    _, turned = np.linalg.qr(np.concatenate([law(changes.T), residual], axis=1))
     normal = law.without_tail_or_rounding()
 
     def log_density(e: FloatArray) -> FloatArray:
         z = center + e @ steps
-        whitened = turned[:, -1][:, None] - turned[:, :-1] @ quadratic.change_coefficients(e).T
+        whitened = turned[:, -1][:, None] - turned[:, :-1] @ coefficients(e).T
         height = log_likelihood_marginal_over_sigma(normal, whitened) - 0.5 * np.sum(z**2, axis=1)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
@@ -605,10 +602,8 @@ def surrogate_log_density(
 
 _N_WALKERS = 250
 _MOVES = 6  # of each walker after a step of beta
-_N_FIRST = 1000  # draws of a proposal
-_LEAST = 0.25  # least effective share of draws by a linear view of the simulation,
-_NEARLY_ALL = 0.8  # and where adaptive importance sampling costs little
-_SIZES_HERE = 1000, 60, 8, 250.0  # of that: draws of a round, kernels, rounds, effective draws that suffice
+# Of adaptive importance sampling where it costs little: draws of a round, kernels, rounds, and enough effective draws.
+_SIZES_HERE = 1000, 60, 8, 250.0
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -631,97 +626,73 @@ def posterior_draws(
 ) -> FloatArray:
     """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
 
-    Unless `annealed`, they are draws of Laplace's approximation, or of `LinearAmplitudes` where it applies. Otherwise:
-    If an effect on the readings has a nonlinear coordinate, they are resampled from a `ConditionallyLinearDensity`;
-    else, where many samples cost little more than one, they are drawn by adaptive importance sampling. Without either,
+    Unless `annealed`, they are draws of Laplace's approximation, or of its linear amplitudes where it has any.
+    Otherwise, where many samples cost little more than one, they are drawn by adaptive importance sampling; so are
+    those of a simulator that is called for each sample and has an effect with a size and a shape, by its tangent. Else
     samples of Laplace's approximation are moved to the posterior in two stages, the first through a quadratic
-    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse.
-
-    `n_samples` is their number; the other parameters are those of `sample_model`.
+    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse. The
+    parameters are those of `sample_model`.
     """
-    laplace = _Laplace.of(found, noise, recording)
-    if not annealed:
-        linear = LinearAmplitudes.of(found, laplace.slopes, laplace.residual) or laplace
-        return linear.draw(n_samples, rng=rng)
-    normal = rng.standard_normal((_N_NEAR, len(found.z)))
-    problem = HypothesisProblem(found.model, recording, noise.with_likeliest_node_alone)
+    model, law, usable = found.model, noise.likeliest_law, recording.usable
+    # Laplace's approximation: normal, of covariance steps.T @ steps, with `slopes` and `residual` in noise sds.
+    whitened = law(found.residuals)[:, None]
+    sigma = law.likeliest_sigma(whitened)
+    sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), LEAST_SCALE)
+    slopes = law(found.slopes)
+    curvature = with_prior(slopes.T @ slopes / sd**2)
+    slopes = slopes / sd
+    residual = law.normal_pseudo_residuals(whitened, np.maximum(sigma, LEAST_SCALE))[:, 0] / sd
+    # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps leave
+    # the SSF's geometry unchanged, which speeds up vectorised predictions.
+    order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
+    at, steps = np.ix_(order, order), np.empty_like(curvature)
+    steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
 
-    def log_posterior(z: FloatArray) -> FloatArray:
-        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
+    def mode() -> FloatArray:
+        """Return the mode, one Newton step from the fit, unless that leaves the domain of the formula."""
+        downhill = slopes.T @ residual - found.z
+        center = np.clip(found.z + np.linalg.solve(with_prior(slopes.T @ slopes), downhill), -FARTHEST, FARTHEST)
+        is_possible = np.isfinite(model.predict(center[None, :])[0, usable]).all()
+        return np.asarray(center) if is_possible else found.z
+
+    if not annealed:
+        linear = draws_of_linear_amplitudes(found, slopes, residual, n_samples, rng=rng)
+        return mode() + rng.standard_normal((n_samples, len(found.z))) @ steps if linear is None else linear
+    normal = rng.standard_normal((_N_NEAR, len(found.z)))
+    problem = HypothesisProblem(model, recording, noise.with_likeliest_node_alone)
+
+    def log_posterior(z: FloatArray, of: HypothesisProblem = problem) -> FloatArray:
+        height = of.prior.log_prob(z) + of.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    in_bulk = found.model.sensor.predicts_in_bulk
-    grid = ConditionallyLinearDensity.of(found, laplace.law, recording, laplace.steps.T @ laplace.steps, laplace.sd)
-    if grid is not None:
-        first, least = grid.draw(n_samples if in_bulk else _N_FIRST, rng=rng), _NEARLY_ALL if in_bulk else _LEAST
-        tried = n_tried(found.model)
-        drawn = importance_resample(
-            first, grid.log_density, log_posterior, n_wanted=n_samples, rng=rng, least=least, n_tried=tried
-        )
-        if drawn is not None:
-            return drawn
-    if in_bulk:
-        draws, _ = draw_by_importance(problem, [found], laplace.law, sizes=_SIZES_HERE, rng=rng, progress=progress)
-        if draws.n_eff >= _LEAST_OF_IT * _ENOUGH * n_samples:
-            return draws.samples(n_samples, rng=rng)
-    model, usable, center, steps = found.model, recording.usable, laplace.center, laplace.steps
-    quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), laplace.sd)
-    near = surrogate_log_density(quadratic, center, steps, recording.readings[usable], laplace.law)
-
     def resampled_or_annealed(
-        first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int, tried: int | None = None
+        first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n_wanted: int, tried: int | None = None
     ) -> FloatArray:
-        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng, n_tried=tried)
+        weighed = importance_resample(first, log_q, log_p, n_wanted=n_wanted, rng=rng, n_tried=tried)
         if weighed is not None:
             return weighed
         some = first[:_N_WALKERS]
-        return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
+        return draw_by_annealing(some, log_q, log_p, n_moves=n_moves, n_wanted=n_wanted, rng=rng, progress=progress)
 
+    tried, system = n_tried(model), model.sensor
+    cheap: Model | TangentModel | None = model if system.predicts_in_bulk else None
+    if tried and isinstance(system, System) and sizes_with_shape(found):
+        tangent = TangentModel(found, system)
+        cheap = tangent if tangent.is_finite else None
+    if cheap is not None:
+        stand_in = replace(problem, model=cast(Model, cheap))
+        modes = [found, *modes_of_opposite_sign(cheap, found, recording, law)]
+        draws, _ = draw_by_importance(stand_in, modes, law, sizes=_SIZES_HERE, rng=rng, progress=progress)
+        if draws.n_eff >= _LEAST_SHARE * n_samples:
+            if cheap is model:
+                return draws.samples(n_samples, rng=rng)
+            first = draws.samples(_N_NEAR, rng=rng)
+            log_q = partial(log_posterior, of=stand_in)
+            drawn = importance_resample(first, log_q, log_posterior, n_wanted=n_samples, rng=rng, n_tried=tried)
+            if drawn is not None:
+                return drawn
+    center, readings = mode(), recording.readings[usable]
+    near = surrogate_log_density(lambda z: model.predict(z)[:, usable], center, steps, readings, law, sd)
     e = resampled_or_annealed(normal, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)
-    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples, n_tried(model))
+    e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples, tried)
     return center + e @ steps
-
-
-@dataclass(frozen=True, eq=False)
-class _Laplace:
-    """Laplace's approximation to the posterior about a fit: normal about `center`, covariance `steps.T @ steps`.
-
-    `sd` is that of a whitened reading; `slopes` (n_points, n_params) and `residual` (n_points,) are whitened, in sds.
-    """
-
-    found: Fit
-    recording: Recording
-    law: NoiseLaw
-    sd: float
-    slopes: FloatArray
-    residual: FloatArray
-    steps: FloatArray
-
-    @classmethod
-    def of(cls, found: Fit, noise: NoiseEvidence, recording: Recording) -> Self:
-        law = noise.likeliest_law
-        whitened, turned = law(found.residuals)[:, None], law(found.slopes)
-        sigma = law.likeliest_sigma(whitened)
-        sd = max(float(sigma[0]) / math.sqrt(law.fisher_information), LEAST_SCALE)
-        curvature = with_prior(turned.T @ turned / sd**2)
-        # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps
-        # leave the SSF's geometry unchanged, which speeds up vectorised predictions.
-        order = np.roll(np.arange(len(found.z)), -found.model.sensor.n_params)
-        at, steps = np.ix_(order, order), np.empty_like(curvature)
-        steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
-        normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, LEAST_SCALE))[:, 0]
-        return cls(found, recording, law, sd, turned / sd, normal / sd, steps)
-
-    @cached_property
-    def center(self) -> FloatArray:
-        """The mode, one Newton step from the fit, (n_params,)."""
-        found, curvature = self.found, with_prior(self.slopes.T @ self.slopes)
-        center = found.z + np.linalg.solve(curvature, self.slopes.T @ self.residual - found.z)
-        center = np.asarray(np.clip(center, -FARTHEST, FARTHEST))
-        if np.isfinite(found.model.predict(center[None, :])[0, self.recording.usable]).all():
-            return center
-        return found.z  # the step left the domain of the formula
-
-    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw coordinates, (n_samples, n_params)."""
-        return np.asarray(self.center + rng.standard_normal((n_samples, len(self.center))) @ self.steps)

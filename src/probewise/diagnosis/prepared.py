@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,24 +48,28 @@ def join(recordings: Sequence[Recording]) -> Recording:
     require(recordings, "recordings", (), "one or more")
     for recording in recordings:
         require_recording(recording)
-    first = recordings[0]
     if len(recordings) == 1:
-        return first
-    unit = first.plan.instrumentation.unit
+        return recordings[0]
+    unit = recordings[0].plan.instrumentation.unit
     for other in recordings[1:]:
         if other.plan.instrumentation.unit != unit:
             raise ParameterError("reading unit", other.plan.instrumentation.unit, f"{unit!r}, as the first")
-    for (i, one), (j, other) in itertools.combinations(enumerate(recordings), 2):
-        if _is_same_recording(one, other):
-            found = f"{_recording_label(one, i)} (number {i + 1}) and {_recording_label(other, j)} (number {j + 1})"
+    labels = [recording.source or f"recording {k + 1}" for k, recording in enumerate(recordings)]
+    for i, j in itertools.combinations(range(len(recordings)), 2):
+        if _is_same_recording(recordings[i], recordings[j]):
+            found = f"{labels[i]} (number {i + 1}) and {labels[j]} (number {j + 1})"
             raise ParameterError("recordings", found, "recordings that differ; these are the same")
+    plans = [recording.plan for recording in recordings]
     notes = [note for recording in recordings for note in recording.notes]
     return Recording(
-        join_plans([recording.plan for recording in recordings], own_sessions=True),
+        join_plans(plans, own_sessions=True),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
-        (*notes, *_notes_on_missing_covariates(recordings), *_notes_on_other_instrumentation(recordings)),
+        (*notes, *_notes_on_missing_covariates(plans, labels), *_notes_on_other_instrumentation(plans, labels)),
     )
+
+
+_POSES = ("x_mm", "y_mm", "orientation_rad", "time_s")
 
 
 def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
@@ -103,9 +107,8 @@ def join_plans(plans: Sequence[Plan], *, own_sessions: bool = False) -> Plan:
         before = max(sessions, default=-1) + 1
         sessions += [before + session for session in plan.sessions or (0,) * len(plan.scan_names)]
     commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
-    poses = ("x_mm", "y_mm", "orientation_rad", "time_s")
     return Plan(
-        **{name: np.concatenate([getattr(plan, name) for plan in plans]) for name in poses},
+        **{name: np.concatenate([getattr(plan, name) for plan in plans]) for name in _POSES},
         scan=np.concatenate(scans),
         scan_names=tuple(scan_names),
         pattern=np.concatenate(codes),
@@ -125,44 +128,34 @@ def last_known_value(values: FloatArray, otherwise: float = math.nan) -> float:
 
 def _joined_covariate(plans: Sequence[Plan], name: str) -> FloatArray:
     """Return a covariate of every row; where a plan lacks it, NaN if commanded, else its last known value."""
-    columns: list[FloatArray] = []
-    last = math.nan
+    columns, last = list[FloatArray](), math.nan
     for plan in plans:
-        column = plan.covariates.get(name)
-        if column is None:
-            column = np.full(len(plan), math.nan if name in COMMANDED else last)
-        last = last_known_value(column, last)
-        columns.append(column)
+        lacking = np.full(len(plan), math.nan if name in COMMANDED else last)
+        columns.append(plan.covariates.get(name, lacking))
+        last = last_known_value(columns[-1], last)
     return np.concatenate(columns)
 
 
-def _notes_on_missing_covariates(recordings: Sequence[Recording]) -> list[str]:
-    """List notes on covariates that some recordings lack."""
-    first, out = recordings[0], []
-    for k, other in enumerate(recordings[1:], 1):
-        for name in sorted({*first.plan.covariates} - {*other.plan.covariates, *COMMANDED}):
-            out.append(f"{_recording_label(other, k)} has no column {name}: taken to be there as it was last known")
-        for name in sorted({*other.plan.covariates} - {*first.plan.covariates, *COMMANDED}):
-            out.append(f"column {name} of {_recording_label(other, k)} left out: {_recording_label(first, 0)} has none")
-    return out
+def _notes_on_missing_covariates(plans: Sequence[Plan], labels: Sequence[str]) -> Iterator[str]:
+    first = plans[0].covariates.keys()
+    for other, label in zip(plans[1:], labels[1:], strict=True):
+        for name in sorted(first - {*other.covariates, *COMMANDED}):
+            yield f"{label} has no column {name}: taken to be there as it was last known"
+        for name in sorted(other.covariates.keys() - {*first, *COMMANDED}):
+            yield f"column {name} of {label} left out: {labels[0]} has none"
 
 
-def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str]:
-    """List notes on each range, step or height that a later recording declares otherwise than the first."""
-    first, out = recordings[0], []
-    for k, other in enumerate(recordings[1:], 1):
+def _notes_on_other_instrumentation(plans: Sequence[Plan], labels: Sequence[str]) -> Iterator[str]:
+    for other, label in zip(plans[1:], labels[1:], strict=True):
         for name in ("min", "max", "step", "height_mm"):
-            own, taken = (getattr(recording.plan.instrumentation, name) for recording in (other, first))
+            own, taken = (getattr(plan.instrumentation, name) for plan in (other, plans[0]))
             if own == taken:
                 continue
-            label, value = _recording_label(other, k), "no value" if own is None else f"{own:g}"
+            declares = f"{label} declares {'no value' if own is None else f'{own:g}'} for {name}"
             if name == "height_mm" and own is not None and taken is not None:
-                as_taken = f"{_recording_label(first, 0)} {taken:g}: readings are taken to be at the height of each"
-                out.append(f"{label} declares {value} for height_mm, {as_taken}")
+                yield f"{declares}, {labels[0]} {taken:g}: readings are taken to be at the height of each"
             else:
-                as_first = "none, as" if taken is None else f"{taken:g}, that of"
-                out.append(f"{label} declares {value} for {name}: taken is {as_first} {_recording_label(first, 0)}")
-    return out
+                yield f"{declares}: taken is {'none, as' if taken is None else f'{taken:g}, that of'} {labels[0]}"
 
 
 def _is_same_recording(one: Recording, other: Recording) -> bool:
@@ -172,16 +165,9 @@ def _is_same_recording(one: Recording, other: Recording) -> bool:
     return (
         len(one) == len(other)
         and np.array_equal(one.readings, other.readings, equal_nan=True)
-        and all(
-            np.array_equal(getattr(one.plan, k), getattr(other.plan, k))
-            for k in ("x_mm", "y_mm", "orientation_rad", "time_s")
-        )
+        and all(np.array_equal(getattr(one.plan, k), getattr(other.plan, k)) for k in _POSES)
         and all(k in first and k in second and np.array_equal(first[k], second[k], equal_nan=True) for k in commanded)
     )
-
-
-def _recording_label(recording: Recording, index: int) -> str:
-    return recording.source or f"recording {index + 1}"
 
 
 MOST_READINGS = 2400
@@ -190,20 +176,18 @@ _STRETCH = 6  # readings
 _SEED = 0  # the same rows of the same recording, whatever the seed of its diagnosis
 
 
-def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArray:
-    """Choose rows spread over the recording with about `most` usable readings; all rows if there are no more.
+def rows_to_diagnose(recording: Recording) -> IntArray:
+    """Choose rows spread over the recording with about 2,400 usable readings; all rows if there are no more.
 
     Whole scans are chosen, to preserve correlations between readings; or, if these would be fewer than eight, stretches
     of six successive rows. Both are spread evenly but not regularly, so that what repeats itself is seen at all phases.
 
     Returns row numbers, ascending.
     """
-    n_usable, n_points = int(recording.usable.sum()), len(recording)
-    if n_usable <= most:
-        return np.arange(n_points)
-    share = most / n_usable
-    scan = recording.plan.scan
-    n_scans = len(recording.plan.scan_names)
+    n_usable, scan, n_scans = int(recording.usable.sum()), recording.plan.scan, len(recording.plan.scan_names)
+    if n_usable <= MOST_READINGS:
+        return np.arange(len(recording))
+    share = MOST_READINGS / n_usable
     n_kept = math.floor(n_scans * share)
     if n_kept >= _FEWEST_SCANS:
         # One of each n_scans / n_kept, with the first and the last: scans that go there and back must not all go there.
@@ -211,7 +195,7 @@ def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArra
         kept = np.floor((np.arange(n_kept) + jitter) * n_scans / n_kept).astype(np.int64)
         kept[[0, -1]] = 0, n_scans - 1
         return np.flatnonzero(np.isin(scan, kept))
-    return positions_in_stretches(scan, round(n_points * share))
+    return positions_in_stretches(scan, round(len(recording) * share))
 
 
 def positions_in_stretches(run: IntArray, most: int) -> IntArray:
@@ -326,15 +310,18 @@ def prepare(
         require_same_unit(sensor, everything.plan)
         null = sensor_from_samples(sensor)
     rows = rows_to_diagnose(everything)
-    recording = everything if len(rows) == len(everything) else everything.take(rows)
+
+    def chosen() -> Recording:
+        return everything if len(rows) == len(everything) else everything.take(rows)
+
+    recording, of_lost = chosen(), dict[str, Effect]()
     lost = _lost_readings(recording, null, apparatus) if recording.usable.sum() >= LEAST_READINGS else None
-    if lost is None:
-        return Prepared(recording, apparatus.effects(recording, null), null, apparatus, everything)
-    effect = lost.effect(recording)
-    everything = replace(lost, rows=rows[lost.rows]).left_out_of(everything)
-    recording = everything if len(rows) == len(everything) else everything.take(rows)
-    effects = {**apparatus.effects(recording, null), effect.name: effect}
-    return Prepared(recording, effects, null, apparatus, everything)
+    if lost is not None:
+        effect = lost.effect(recording)
+        of_lost[effect.name] = effect
+        everything = replace(lost, rows=rows[lost.rows]).left_out_of(everything)
+        recording = chosen()
+    return Prepared(recording, {**apparatus.effects(recording, null), **of_lost}, null, apparatus, everything)
 
 
 def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus) -> LostReadings | None:

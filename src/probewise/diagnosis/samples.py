@@ -46,11 +46,8 @@ def weights_beside_other_effects(
     `usable`: rows of the readings, (n_usable,); `weights`: the probabilities as each effect was added, by effect,
     (n_variants,). They are returned for a single effect, and for one whose choice no parameter shows.
     """
-    effects = found.model.effects
-    if len(effects) < 2:
-        return weights
     out = dict(weights)
-    for effect in effects:
+    for effect in found.model.effects if len(found.model.effects) > 1 else ():
         if effect.has_change_point and len(effect.variants()) == len(weights[effect.name]) > 1:
             # What the effect explains is in the residuals; the other parameters stay.
             model, stay = found.model.model_and_mask_without(effect.name)
@@ -104,27 +101,25 @@ class ModelSamples:
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Convert a light sensor's samples to a FittedSensor, as in sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
-        from_chain = self.theta
+        theta, plan, usable = self.theta, recording.plan, recording.usable
         if self.has_exchangeable_gaussians:
-            from_chain = gaussians_sorted_by_mass(self.theta, self.n_gaussians)
-        plan = recording.plan
+            theta = gaussians_sorted_by_mass(theta, self.n_gaussians)
         moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
         moves = moves[moves > rounding_error(np.append(plan.x_mm, plan.y_mm))]
         step_mm = float(np.median(moves)) if moves.size else max(Extent.of(recording).length_mm / 100, 1e-6)
-        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=step_mm)
-        field = posterior_mean_ssf_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
-        usable = recording.usable
-        residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
+        pixel_mm = choose_pixel_mm(theta, self.n_gaussians, step_mm=step_mm)
+        residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], plan)[:, usable]
         low, high = sd_floor(recording), sd_ceiling(recording)
-        scan, names = recording.plan.scan[usable], recording.plan.scan_names
-        scan_noise = noise_by_scan(residuals, scan, names, sd_floor=low, sd_ceiling=high, rng=rng)
+        scan_noise = noise_by_scan(
+            residuals, plan.scan[usable], plan.scan_names, sd_floor=low, sd_ceiling=high, rng=rng
+        )
         return FittedSensor(
             names=tuple(self.chain.names[i] for i in kept),
-            samples=from_chain[:, kept],
+            samples=theta[:, kept],
             n_gaussians=self.n_gaussians,
             noise_sd=self.noise_sd,
-            field=field,
-            instrumentation=cast(Chain, self.chain).plan_at_calibrated_height(recording.plan).instrumentation,
+            field=posterior_mean_ssf_field(theta[:100], self.n_gaussians, pixel_mm=pixel_mm),
+            instrumentation=cast(Chain, self.chain).plan_at_calibrated_height(plan).instrumentation,
             effects=self.effects,
             patterns={e.name: e.patterns for e in cast(Iterable[Effect], self.chain.effects) if e.patterns},
             absent=self.absent,
@@ -151,36 +146,35 @@ def sample_model(
 
     `weights`: by effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,),
     when it was added; `annealed`: whether samples are of the posterior; otherwise of Laplace's approximation, with
-    `LinearAmplitudes`.
+    `draws_of_linear_amplitudes`.
     """
-    law, n_samples = noise.likeliest_law, N_SAMPLES
-    weights = weights_beside_other_effects(found, law, np.flatnonzero(recording.usable), weights)
+    law, model, null = noise.likeliest_law, found.model, found.model.sensor
+    usable = np.flatnonzero(recording.usable)
+    readings = recording.readings[usable]
+    weights = weights_beside_other_effects(found, law, usable, weights)
     draws = posterior_draws(found, noise, recording, N_SAMPLES, annealed=annealed, rng=rng, progress=progress)
     z = np.clip(draws, -FARTHEST, FARTHEST)
     # Samples that are not annealed serve for the effects only: their noise is that of the fit. Where each sample is a
     # call, those that were tried serve for all.
-    tried = z[: n_tried(found.model)]
-    predicted = found.model.predict(tried)[:, recording.usable] if annealed else found.predicted[None, :]
-    residuals = np.resize(recording.readings[recording.usable] - predicted, (n_samples, predicted.shape[1]))
+    predicted = model.predict(z[: n_tried(model)])[:, usable] if annealed else found.predicted[None, :]
+    residuals = np.resize(readings - predicted, (N_SAMPLES, len(usable)))
     noise_sd = draw_noise_sd(law, residuals, rng=rng)
-    largest = float(np.abs(recording.readings[recording.usable]).max()) or 1.0
+    largest = float(np.abs(readings).max()) or 1.0
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + largest * 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
-    effects = (*found.model.effects, *on_noise)
-    null = found.model.sensor
-    chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
+    chain = null.chain(recording.plan, (*model.effects, *on_noise), n_nodes=ACCURATE_NODES)
     own = {}
-    for effect in found.model.effects:
-        values = effect_values(effect, z[:, found.model.coordinate_slice(effect.name)])
+    for effect in model.effects:
+        values = effect_values(effect, z[:, model.coordinate_slice(effect.name)])
         own[effect.name] = effect.redraw_by_variant(values, weights[effect.name], rng=rng)
-    theta = found.model.joined_theta(null.theta(z[:, : null.n_params]), own)
-    nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
+    theta = model.joined_theta(null.theta(z[:, : null.n_params]), own)
+    nodes = rng.choice(len(noise.weights), N_SAMPLES, p=noise.weights)
     of_noise = (noise_effect_samples(effect, noise, nodes, rng=rng) for effect in on_noise)
     theta = np.concatenate([theta, *of_noise], axis=1)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{quantisation.name}.step"]
     for i in of_lattice:
-        sd = sd_of_estimated_lattice_step(recording.readings[recording.usable], float(theta[0, i]))
-        theta[:, i] += sd * rng.standard_normal(n_samples)
+        sd = sd_of_estimated_lattice_step(readings, float(theta[0, i]))
+        theta[:, i] += sd * rng.standard_normal(N_SAMPLES)
     rounding = theta[:, of_lattice].sum(axis=1)
     if law.flat:  # sd at each noise node, without rounding if that is an effect, else including it
         noise_sd = noise_sd_by_node(noise, with_rounding=not of_lattice)[nodes]

@@ -41,6 +41,7 @@ from probewise.sensor import (
     footprint_of,
     free_form_theta,
     is_free_form,
+    mixture_parameter_names,
 )
 
 LEAST_READINGS = 24
@@ -100,9 +101,6 @@ class CalibratedSensor:
     def admits(self, effect: Effect) -> bool:
         return True
 
-    def coordinates(self, theta: FloatArray) -> None:
-        return None
-
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates z, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
         natural = self._natural_from_z(z)
@@ -146,15 +144,15 @@ def cached_known_scene(plan: Plan) -> KnownScene:
 def natural_to_theta(natural: FloatArray, n_gaussians: int) -> FloatArray:
     """Map natural coordinates (n_samples, 6 N + 1) to the paper's parameters (n_samples, 6 N + 2)."""
     n_logits = n_gaussians - 1
-    logits = np.concatenate([np.zeros((len(natural), 1)), natural[:, :n_logits]], axis=1)
+    logits = np.pad(natural[:, :n_logits], ((0, 0), (1, 0)))
     shares = np.exp(logits - logits.max(axis=1, keepdims=True))
     shares /= shares.sum(axis=1, keepdims=True)
     blocks = natural[:, n_logits:-2].reshape(len(natural), n_gaussians, 5)
-    u, v, log_sd_u, log_sd_v, turn = (blocks[..., k] for k in range(5))
+    u, v, log_sd_u, log_sd_v, turn = np.moveaxis(blocks, -1, 0)
     rho = np.tanh(turn)
     rest = 2 * (1 - rho**2)
-    a_uu = np.exp(-2 * log_sd_u) / rest  # [[A, C], [C, B]] is half the inverse of the covariance
-    b_vv = np.exp(-2 * log_sd_v) / rest
+    # [[A, C], [C, B]] is half the inverse of the covariance.
+    a_uu, b_vv = np.exp(-2 * log_sd_u) / rest, np.exp(-2 * log_sd_v) / rest
     c_uv = -rho * np.exp(-log_sd_u - log_sd_v) / rest
     amplitude = shares * np.sqrt(a_uu * b_vv - c_uv**2) / math.pi  # mass_n = a_n pi / sqrt(AB - C^2) = share
     columns = np.stack([amplitude, u, v, a_uu, b_vv, c_uv], axis=-1).reshape(len(natural), 6 * n_gaussians)
@@ -164,9 +162,8 @@ def natural_to_theta(natural: FloatArray, n_gaussians: int) -> FloatArray:
 def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
     """Invert `natural_to_theta`; the amplitudes may carry any common factor."""
     blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
-    amplitude, u, v, a_uu, b_vv, c_uv = (blocks[..., k] for k in range(6))
-    det = a_uu * b_vv - c_uv**2
-    log_mass = np.log(amplitude) - 0.5 * np.log(det)
+    amplitude, u, v, a_uu, b_vv, c_uv = np.moveaxis(blocks, -1, 0)
+    log_mass = np.log(amplitude) - 0.5 * np.log(a_uu * b_vv - c_uv**2)
     rho = -c_uv / np.sqrt(a_uu * b_vv)
     rest = 2 * (1 - rho**2)
     parts = np.stack([u, v, -0.5 * np.log(a_uu * rest), -0.5 * np.log(b_vv * rest), np.arctanh(rho)], axis=-1)
@@ -189,11 +186,11 @@ def theta_to_free_form(theta: FloatArray) -> FloatArray:
 
 def default_sensor(extent: Extent, n_gaussians: int) -> CalibratedSensor:
     """Return `n_gaussians` with the default prior: sds a fourteenth of the longest scan, to a factor of two."""
-    length = extent.length_mm
+    length, n_logits = extent.length_mm, n_gaussians - 1
     one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
     one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
-    center = np.array([0.0] * (n_gaussians - 1) + one_center * n_gaussians + [extent.low, extent.high])
-    sd = np.array([1.5] * (n_gaussians - 1) + one_sd * n_gaussians + [extent.span / 2] * 2)
+    center = np.array([0.0] * n_logits + one_center * n_gaussians + [extent.low, extent.high])
+    sd = np.array([1.5] * n_logits + one_sd * n_gaussians + [extent.span / 2] * 2)
     return CalibratedSensor(n_gaussians, center, np.diag(sd))
 
 
@@ -210,47 +207,6 @@ def with_free_form(one: CalibratedSensor) -> CalibratedSensor:
 
 _RIDGE = 1e-8  # of each variance, by which a covariance of samples is sure to be positive
 _LEAST_VARIANCE = 1e-16  # of a coordinate, relative to its size
-
-
-def sensor_from_posterior(
-    names: Sequence[str], mean: FloatArray, cov: FloatArray, *, height_mm: float | None = None
-) -> CalibratedSensor:
-    """Build a prior from an earlier sensor's posterior mean and covariance, calibrated at `height_mm`.
-
-    Only the SSF's and the levels' columns are used; effects of the earlier model are dropped.
-
-    Raises ParameterError if the names are not those of a mixture of Gaussians with two free levels.
-    """
-    names = list(names)
-    n_gaussians = sum(name.startswith("a_") for name in names)
-    wanted = [f"{p}_{n}" for n in range(1, n_gaussians + 1) for p in ("a", "u", "v", "A", "B", "C")]
-    wanted += ["I_min", "I_max"]
-    if n_gaussians == 0 or any(name not in names for name in wanted):
-        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
-    at = [names.index(name) for name in wanted]
-    mean = np.asarray(mean, dtype=np.float64)[at]
-    cov = np.asarray(cov, dtype=np.float64)[np.ix_(at, at)]
-    free = is_free_form(mean[None, :-2])
-    natural_from_theta = theta_to_free_form if free else partial(theta_to_natural, n_gaussians=n_gaussians)
-    center = natural_from_theta(mean[None, :])[0]
-    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
-    up = natural_from_theta(mean + np.diag(steps))
-    down = natural_from_theta(mean - np.diag(steps))
-    slope = ((up - down) / (2 * steps[:, None])).T
-    natural_cov = slope @ cov @ slope.T
-    # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
-    size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
-    size[levels] = np.abs(center[levels]).max() or 1.0
-    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
-    factor = np.linalg.cholesky(natural_cov + np.diag(floor))
-    return CalibratedSensor(
-        n_gaussians,
-        center,
-        factor,
-        has_exchangeable_gaussians=False,
-        is_free_form=free,
-        calibrated_height_mm=height_mm,
-    )
 
 
 class SensorPrior(Protocol):
@@ -275,23 +231,43 @@ def require_sensor_prior(sensor: object) -> None:
 
 def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
     """Raise ParameterError if the readings' unit differs from that of the calibration; "" is an unknown unit."""
-    unit, own = plan.instrumentation.unit, ""
-    if isinstance(sensor, FittedSensor):
-        own = sensor.instrumentation.unit
+    unit = plan.instrumentation.unit
+    own = sensor.instrumentation.unit if isinstance(sensor, FittedSensor) else ""
     if own and unit and own != unit:
         raise ParameterError("sensor", f"one that reads in {own!r}", f"one in {unit!r}, as the recording")
 
 
 def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
-    """Build a prior from an earlier sensor's posterior samples; see `sensor_from_posterior`.
+    """Build a prior from an earlier sensor's posterior samples.
 
-    If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
+    Only the SSF's and the levels' columns are used; effects of the earlier model are dropped. If the samples average
+    several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
+
+    Raises ParameterError if the names are not those of a mixture of Gaussians with two free levels.
     """
     height_mm = None
     if isinstance(sensor, FittedSensor):
         sensor, height_mm = sensor.with_leading_effects(), sensor.instrumentation.height_mm
-    samples = np.asarray(sensor.samples, dtype=np.float64)
-    return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T), height_mm=height_mm)
+    names, samples = list(sensor.names), np.asarray(sensor.samples, dtype=np.float64)
+    n_gaussians = sum(name.startswith("a_") for name in names)
+    wanted = [*mixture_parameter_names(max(n_gaussians, 1)), "I_min", "I_max"]
+    if any(name not in names for name in wanted):
+        raise ParameterError("sensor.names", tuple(names), "a_1, u_1, v_1, A_1, B_1, C_1, ..., I_min, I_max")
+    at = [names.index(name) for name in wanted]
+    mean, cov = samples.mean(axis=0)[at], np.cov(samples.T)[np.ix_(at, at)]
+    free = is_free_form(mean[None, :-2])
+    natural_from_theta = theta_to_free_form if free else partial(theta_to_natural, n_gaussians=n_gaussians)
+    center = natural_from_theta(mean[None, :])[0]
+    steps = np.maximum(1e-3 * np.sqrt(np.maximum(np.diag(cov), 0.0)), 1e-7 * np.abs(mean) + 1e-12)
+    up, down = natural_from_theta(mean + np.diag(steps)), natural_from_theta(mean - np.diag(steps))
+    slope = ((up - down) / (2 * steps[:, None])).T
+    natural_cov = slope @ cov @ slope.T
+    # Coordinates that are the same in all samples have a variance too, in the readings' unit where they are levels.
+    size, levels = np.ones(len(center)), slice(5, 7) if free else slice(-2, None)
+    size[levels] = np.abs(center[levels]).max() or 1.0
+    floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
+    factor = np.linalg.cholesky(natural_cov + np.diag(floor))
+    return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -409,28 +385,22 @@ def starts_of_one_gaussian(sensor: CalibratedSensor) -> FloatArray:
 
 def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: CalibratedSensor) -> FloatArray:
     """Split the heaviest Gaussian of a fit in three ways, as starts: coordinates of `wanted`, (3, wanted.n_params)."""
-    theta = found.theta(z[None, : found.n_params])[0]
-    n = found.n_gaussians
+    theta, n = found.theta(z[None, : found.n_params])[0], found.n_gaussians
     blocks = theta[: 6 * n].reshape(n, 6)
     at = int(np.argmax(footprint_of(theta[None, : 6 * n], n).weight))
     sd_u, sd_v = 1 / np.sqrt(2 * blocks[at, 3:5])
-    splits: Sequence[tuple[float, float, float, float]] = (
-        (0.0, 0.0, 0.65, 1.6),  # a core and a halo
-        (0.8, 0.0, 0.9, 0.9),  # side by side along x'
-        (0.0, 0.8, 0.9, 0.9),
-    )
+    # A core and a halo; or side by side, along x' or y'.
+    splits = ((0.0, 0.0, (0.65, 1.6)), (0.8, 0.0, (0.9, 0.9)), (0.0, 0.8, (0.9, 0.9)))
     out = []
-    for du, dv, first, second in splits:
+    for du, dv, widths in splits:
         pair = []
-        for sign, widen in ((1.0, first), (-1.0, second)):
+        for sign, widen in zip((1.0, -1.0), widths, strict=True):
             part = blocks[at].copy()
-            part[1] += sign * du * sd_u
-            part[2] += sign * dv * sd_v
+            part[1:3] += sign * du * sd_u, sign * dv * sd_v
             part[3:6] /= widen**2
             part[0] /= 2 * widen**2  # halves the mass
             pair.append(part)
-        rest = np.delete(blocks, at, axis=0)
-        out.append(np.concatenate([np.concatenate([rest, np.stack(pair)]).ravel(), theta[-2:]]))
+        out.append(np.concatenate([*np.delete(blocks, at, axis=0), *pair, theta[-2:]]))
     return np.clip(wanted.z(np.stack(out)), -FARTHEST + 0.5, FARTHEST - 0.5)
 
 

@@ -79,11 +79,15 @@ def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -
     if longer or not all(found.settled for found in tried):
         tried = _best_fits(model, recording, [*(found.z for found in tried), *longer], law)
     best = tried[0]
-    if system.first is None and system.caller is not None and system.caller.broadcasts:
+    if system.first is None and _broadcasts(system):
         for found in fit_each_start(model, recording, list(modes_of(system, recording, law, best.z)[0]), law):
             if log_evidence_of(found, law) > log_evidence_of(best, law) + _CLEARLY:
                 best = found
     return best
+
+
+def _broadcasts(system: System) -> bool:
+    return system.caller is not None and system.caller.broadcasts
 
 
 def log_evidence_of(found: Fit, law: NoiseLaw) -> float:
@@ -133,23 +137,25 @@ def modes_of(system: System, recording: Recording, law: NoiseLaw, found: FloatAr
     is the likeliest everywhere.
     """
     descent = _Descent(system, recording, law)
-    starts = found[None, :]
-    if system.caller is not None and system.caller.broadcasts:
-        points = AT_ONCE // len(recording)
-        scattered = system.scattered_points(int(np.clip(16 * points, 50, _SCREENED)))
-        heights = descent.heights(scattered)
+    x, n_steps = descent.from_normal(found[None, :]), _POLISH_FEW
+    if _broadcasts(system):
+        points, n_steps = AT_ONCE // len(recording), _POLISH
+        scattered = descent.from_normal(system.scattered_points(int(np.clip(16 * points, 50, _SCREENED))))
+        heights = descent.heights(descent.residuals(scattered), scattered)[0]
         kept = np.argsort(heights)[: int(np.clip(points // (system.n_params + 1), 8, _DESCENTS))]
-        starts = np.concatenate([starts, scattered[kept]])
-    x = descent.from_normal(starts)
-    for n_steps, n_kept in _STAGES if len(x) > 1 else ():
-        x, heights = descent.follow(x, n_steps)
-        x = x[np.argsort(heights)[:n_kept]]
-    x, heights = descent.follow(x, _POLISH if len(starts) > 1 else _POLISH_FEW, central=True)
+        x = np.concatenate([x, scattered[kept]])
+        for n, n_kept in _STAGES:
+            x, heights = descent.follow(x, n)
+            x = x[np.argsort(heights)[:n_kept]]
+    x, heights = descent.follow(x, n_steps, central=True)
     x, heights = x[np.isfinite(heights)], heights[np.isfinite(heights)]
     if not len(x):
         return np.clip(found, -FARTHEST, FARTHEST)[None, :], 1
-    z = descent.to_normal(x)
-    even = heights <= heights.min() + _EVENLY_HIGH + descent.rounding_of_heights(heights.min())
+    z = np.clip(np.where(descent.flat, ndtri(np.where(descent.flat, x, 0.5)), x), -FARTHEST, FARTHEST)
+    # The error of a height by rounding is no small one where readings are met to their last digits.
+    rms = np.exp(heights.min() / law.n_kept)
+    rounding = float(np.finfo(np.float64).eps * law.n_kept * np.abs(descent.readings).max() / rms)
+    even = heights <= heights.min() + _EVENLY_HIGH + rounding
     out: list[int] = []
     for k in np.lexsort((np.where(even, np.sum(z**2, axis=1), heights), ~even)).tolist():
         if all(np.abs(x[k] - x[j]).max() > _SAME_PLACE for j in out):
@@ -173,9 +179,6 @@ class _Descent:
     def from_normal(self, z: FloatArray) -> FloatArray:
         return np.where(self.flat, ndtr(z), z)
 
-    def to_normal(self, x: FloatArray) -> FloatArray:
-        return np.clip(np.where(self.flat, ndtri(np.where(self.flat, x, 0.5)), x), -FARTHEST, FARTHEST)
-
     def residuals(self, x: FloatArray) -> FloatArray:
         """Return whitened residuals, (..., n_params) -> (..., n_usable)."""
         u = np.where(self.flat, x, ndtr(x)).reshape(-1, x.shape[-1])
@@ -187,20 +190,12 @@ class _Descent:
             ]
         return np.concatenate(out).reshape(*x.shape[:-1], -1)
 
-    def _height(self, residuals: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def heights(self, residuals: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return minus the log density at points, of whitened residuals, and the likeliest variance, (k,) both."""
         with np.errstate(all="ignore"):
             variance = np.maximum(np.sum(residuals**2, axis=-1) / self.law.n_kept, LEAST_SCALE**2)
             height = 0.5 * self.law.n_kept * np.log(variance) + 0.5 * np.sum(np.where(self.flat, 0.0, x) ** 2, axis=-1)
         return np.where(np.isfinite(height), height, np.inf), variance
-
-    def heights(self, z: FloatArray) -> FloatArray:
-        x = self.from_normal(z)
-        return self._height(self.residuals(x), x)[0]
-
-    def rounding_of_heights(self, height: float) -> float:
-        """Return the error of a height, in nats: of readings that are met to their last digits it is no small one."""
-        rms = np.exp(height / self.law.n_kept)
-        return float(np.finfo(np.float64).eps * self.law.n_kept * np.abs(self.readings).max() / rms)
 
     def _look(self, x: FloatArray, *, central: bool) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return residuals (k, n), slopes of the readings (k, n_params, n), variances and heights, (k,), at points."""
@@ -213,7 +208,7 @@ class _Descent:
         with np.errstate(all="ignore"):
             slopes = (down[0] - up) / (2 * steps[:, :, None]) if central else (own - up) / steps[:, :, None]
         residuals = own[:, 0]
-        height, variance = self._height(residuals, x)
+        height, variance = self.heights(residuals, x)
         wrong = ~(np.isfinite(height) & np.isfinite(slopes).all(axis=(1, 2)))
         height[wrong], variance[wrong], residuals[wrong], slopes[wrong] = np.inf, 1.0, 0.0, 0.0
         return residuals, slopes, variance, height

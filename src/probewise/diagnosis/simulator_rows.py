@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -16,17 +16,7 @@ from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.words import join_names
-from probewise.effects import Effect, Extent, LightEffect, NoiseEffect
-from probewise.effects.noise import (
-    correlated_noise,
-    drifting_noise,
-    dropouts,
-    noise_per_run,
-    outliers,
-    quantisation,
-    random_walk,
-    signal_dependent_noise,
-)
+from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
@@ -100,28 +90,25 @@ def _variations_of_run(
         yield "reversed", words, {k: v[::-1] for k, v in own.items()}, 1.0
     if table.has_varying_time:
         yield "slow", f"take {of} again, twice as slowly", {}, 2.0
-    n = len(rows)
-    share = np.linspace(0.0, 1.0, n)
-    shapes: dict[str, tuple[str, Callable[[float, float], FloatArray]]] = {
-        "up": ("swept from {low} to {high}", lambda low, high: low + (high - low) * share),
-        "down": ("swept from {high} to {low}", lambda low, high: high + (low - high) * share),
-        "up and down": (
-            "swept from {low} to {high} and back", lambda low, high: low + (high - low) * (1 - np.abs(2 * share - 1)),
-        ),
-        "steps": ("switched between {low} and {high}, twice", lambda low, high: np.where(4 * share % 2 < 1, low, high)),
-        "low": ("held at {low}", lambda low, high: np.full(n, low)),
-        "middle": ("held at {middle}", lambda low, high: np.full(n, 0.5 * (low + high))),
-        "high": ("held at {high}", lambda low, high: np.full(n, high)),
-    }  # fmt: skip
+    share = np.linspace(0.0, 1.0, len(rows))
     for name, (low, high) in ends.items():
-        for kind, (said, shape) in shapes.items():
-            text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{0.5 * (low + high):.4g}")
-            values = shape(low, high)
+        middle, span = 0.5 * (low + high), high - low
+        shapes = {
+            "up": ("swept from {low} to {high}", low + span * share),
+            "down": ("swept from {high} to {low}", high + (low - high) * share),
+            "up and down": ("swept from {low} to {high} and back", low + span * (1 - np.abs(2 * share - 1))),
+            "steps": ("switched between {low} and {high}, twice", np.where(4 * share % 2 < 1, low, high)),
+            "low": ("held at {low}", np.full(len(rows), low)),
+            "middle": ("held at {middle}", np.full(len(rows), middle)),
+            "high": ("held at {high}", np.full(len(rows), high)),
+        }
+        for kind, (said, values) in shapes.items():
             if np.ptp(values) > 0 and name not in free:
                 continue
             if low < high:  # to a thousandth of the range or finer, so that they can be set; its ends stay
-                rounded = np.round(values, int(np.ceil(3 - np.log10(high - low))))
+                rounded = np.round(values, int(np.ceil(3 - np.log10(span))))
                 values = np.where((values == low) | (values == high), values, rounded)
+            text = said.format(low=f"{low:.4g}", high=f"{high:.4g}", middle=f"{middle:.4g}")
             yield f"{name} {kind}", f"take {of} with {name} {text}", {name: values}, 1.0
 
 
@@ -151,16 +138,10 @@ def _minutes_of_time_unit(table: RunTable, time_unit: str) -> float | None:
 
 
 ON_NOISE: tuple[LightEffect, ...] = (
-    signal_dependent_noise,
-    correlated_noise,
-    random_walk,
-    noise_per_run,
-    outliers,
-    dropouts,
-    quantisation,
-    drifting_noise,
-)
-_ALONG_ROWS = (correlated_noise, random_walk, drifting_noise)
+    noise.signal_dependent_noise, noise.correlated_noise, noise.random_walk, noise.noise_per_run, noise.outliers,
+    noise.dropouts, noise.quantisation, noise.drifting_noise,
+)  # fmt: skip
+_ALONG_ROWS = (noise.correlated_noise, noise.random_walk, noise.drifting_noise)
 CALLS_OF_A_SEARCH = 8_000  # with what judging and sampling ask beyond it, some 10,000 in a diagnosis
 # Of a law's rates, 15 to 20 microseconds each, of however many samples: about the same number of predictions of a long
 # table as of a short one.
@@ -179,16 +160,11 @@ _UNLIKELY = 0.1
 
 @dataclass(frozen=True, eq=False)
 class SimulatorApparatus(Apparatus):
-    """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
+    """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects."""
 
-    `about`: the system, its table, the first fit, and the sd of a reading; `stop`: the level at which the meter stops
-    without having declared it, if the readings show one; `lost`: the effect that lost readings which were left out, if
-    any.
-    """
-
-    about: ReferenceFit
-    stop: MeterStop | None = None
-    lost: NoiseEffect | None = None
+    about: ReferenceFit  # the system, its table, the first fit, and the sd of a reading
+    stop: MeterStop | None = None  # where the meter stops without having declared it, if the readings show that
+    lost: NoiseEffect | None = None  # the effect that lost readings which were left out, if any
 
     @property
     def system(self) -> System:
@@ -216,6 +192,12 @@ class SimulatorApparatus(Apparatus):
         if caller is not None:
             how = "for all samples at once" if caller.broadcasts else "for one sample after the other"
             facts.append(("calls of simulate", f"{caller.n_calls:,}, {how}"))
+        covariates = {
+            "time": own.time or "time",
+            "row": "row number (from 0)",
+            "level": f"predicted {own.reading}",
+            "previous": f"change of predicted {own.reading} between rows",
+        }
         return Words(
             null="the simulator",
             find_signal="record where the reading changes",
@@ -224,12 +206,7 @@ class SimulatorApparatus(Apparatus):
             next_plan="next.csv",
             model="repaired.json",
             no_cure="more rows, or columns and runs that vary differently",
-            covariates={
-                "time": own.time or "time",
-                "row": "row number (from 0)",
-                "level": f"predicted {own.reading}",
-                "previous": f"change of predicted {own.reading} between rows",
-            },
+            covariates=covariates,
             own_names=frozenset({own.reading, *self.about.table.columns, *own.parameters, *self.about.states}),
             units={"time": own.time_unit, "level": "{reading}", "previous": "{reading}"},
             nothing_held_out="Nothing could be held out: that takes two runs of eight readings or more, or a single "
@@ -242,7 +219,7 @@ class SimulatorApparatus(Apparatus):
         extent = Extent.of(recording)
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
-            kinds.remove(random_walk)
+            kinds.remove(noise.random_walk)
         stop = None if self.stop is None else self.stop.effect
         beside = (*(kind.for_extent(extent) for kind in kinds), stop, self.lost)
         return bind_forms(self.about) | {effect.name: effect for effect in beside if effect is not None}
@@ -301,17 +278,17 @@ class SimulatorApparatus(Apparatus):
 
     def multiplied_covariates(self, covariates: Sequence[Covariate]) -> list[Covariate]:
         # Columns with few values are settings or numbers of groups, whose product with another is the rarer mistake.
-        columns = {covariate_of_column(name) for name in self.about.table.covariates}
-        varied = [c for c in covariates if c.name == "time" or c.name in columns]
+        columns = {"time", *map(covariate_of_column, self.about.table.covariates)}
+        varied = [c for c in covariates if c.name in columns]
         chosen = sorted(varied, key=lambda c: -len(np.unique(c.values)))[:_MOST_MULTIPLIED]
         return [c for c in varied if c in chosen]
 
     def covariate_values_by_name(self, predicted: FloatArray) -> dict[str, FloatArray]:
         """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""
-        table, own = self.about.table, self.system.simulator
-        along = {"time": table.time_s} if table.has_varying_time else {"row": table.row_number}
-        out = {**along, "level": predicted}
-        out |= {covariate_of_column(name): v for name, v in own.inputs(table.covariates).items()}
+        table = self.about.table
+        out = {"time": table.time_s} if table.has_varying_time else {"row": table.row_number}
+        out |= {"level": predicted}
+        out |= {covariate_of_column(name): v for name, v in self.system.simulator.inputs(table.covariates).items()}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
         out["previous"] = np.zeros(len(table))
         for rows in table.rows_by_scan():
@@ -346,8 +323,8 @@ class SimulatorApparatus(Apparatus):
         return np.concatenate([np.array(parameters, dtype=np.int64), *values])
 
     def settings_of(self, plan: Plan) -> FloatArray:
-        table, own = cast(RunTable, plan), self.system.simulator
-        columns = own.inputs(table.covariates).values()
+        table = cast(RunTable, plan)
+        columns = self.system.simulator.inputs(table.covariates).values()
         return np.asarray(np.nan_to_num(np.stack([*columns, time_since_start_of_run(table)], axis=1)))
 
     def candidate_measurements(

@@ -18,12 +18,7 @@ from typing import TypeAlias, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence import (
-    Linearised,
-    average_over_amplitude_scales,
-    scale_and_project,
-    whiten_to_unit_rms,
-)
+from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised, scale_and_project, whiten_to_unit_rms
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
@@ -31,6 +26,7 @@ from probewise.effects import Effect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 
+_INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
 _ABSENT = 1e-9  # share of a template's squares below which its projection is rounding
 _REMEMBERED = 5  # most recent noise models of which whitened templates are cached, unless in groups
 _MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
@@ -146,24 +142,7 @@ def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whi
         width, begin = int(widths[first]), int(firsts[first])
         columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
         products.setdefault(width, []).append(_gram_matrices(columns))
-    grams = {width: np.concatenate(of_width) for width, of_width in products.items()}
-    return whitened, grams
-
-
-def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int) -> FloatArray:
-    """Return the log Bayes factors of templates of one width, (n, n_draws), with amplitude and noise sd integrated out.
-
-    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over
-    the `SCALES` at which it is detectable; marginalising the noise sd gives a Student-t.
-
-    `grams`: products of a projected template's columns, (n, width, width); `along`: their products with the residuals,
-    (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,).
-    """
-    gain, axes = _gram_eigensystems(grams)
-    gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
-    turned = axes.transpose(0, 2, 1) @ along
-    explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
-    return average_over_amplitude_scales(explained, gain, n_kept)
+    return whitened, {width: np.concatenate(grams) for width, grams in products.items()}
 
 
 def _gram_matrices(columns: FloatArray) -> FloatArray:
@@ -191,6 +170,36 @@ def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
         [first * c * c + second * s * s + 2 * both * c * s, first * s * s + second * c * c - 2 * both * c * s]
     )
     return values.T, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=2)
+
+
+def _log_bayes_factors_of_grams(grams: FloatArray, along: FloatArray, total: FloatArray, n_kept: int) -> FloatArray:
+    """Return the log Bayes factors of templates of one width, (n, n_draws), with amplitude and noise sd integrated out.
+
+    The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd; marginalising the
+    noise sd gives a Student-t. Bayes factors are averaged over the kappa of `SCALES` at which a template is detectable:
+    at smaller ones the projected template has an rms lambda below `LEAST_VISIBLE`, and the Bayes factor is near one
+    whatever the readings, which would keep irrelevant effects. The result is about -48 for a template that is
+    detectable at no scale.
+
+    `grams`: products of a projected template's columns, (n, width, width); `along`: their products with the residuals,
+    (n, width, n_draws); `total`: sums of squares of the residuals, (n_draws,).
+    """
+    gain, axes = _gram_eigensystems(grams)
+    gain = np.where(gain > _ABSENT * n_kept, gain, 0.0)
+    turned = axes.transpose(0, 2, 1) @ along
+    explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
+    terms = np.empty((len(SCALES), len(gain), len(total)))
+    visible = SCALES[:, None] ** 2 * gain.sum(axis=1) >= LEAST_VISIBLE**2
+    for k, scale in enumerate(SCALES):
+        ratio = scale**2 * gain
+        of_all = np.einsum("bwd,bw->bd", explained, ratio / (1 + ratio))
+        np.log1p(-np.minimum(of_all, 1 - 1e-12), out=terms[k])
+        terms[k] *= -0.5 * n_kept
+        terms[k] -= 0.5 * np.log1p(ratio).sum(axis=1)[:, None]
+    terms[~visible] = _INVISIBLE
+    top = terms.max(axis=0)
+    n_visible = np.maximum(np.count_nonzero(visible, axis=0), 1)[:, None]
+    return np.asarray(top + np.log(np.exp(terms - top).sum(axis=0) / n_visible))
 
 
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
@@ -355,30 +364,29 @@ def log_bayes_factors_of_pairs(
 
     It is the sum of both effects' own (`singles`), corrected by the joint score of the best two entries of each bank.
     """
-    best = {name: np.argsort(-scores)[:_BEST_ENTRIES] for name, scores in singles.items()}
-    entries = [(name, int(i)) for name in templates for i in best[name]]
     pairs = list(combinations(sorted(templates), 2))
     if not pairs:
         return {}
+    best = {name: np.argsort(-scores)[:_BEST_ENTRIES].tolist() for name, scores in singles.items()}
+    entries = [(name, i) for name in templates for i in best[name]]
     columns = [templates[name].columns[i] for name, i in entries]
     widths = np.array([c.shape[1] for c in columns])
     projected = scale_and_project(problem, columns)
     products, along = projected.T @ projected, projected.T @ problem.residual[:, None]
     own = dict(zip(entries, np.split(np.arange(len(along)), np.cumsum(widths)[:-1]), strict=True))
-    asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
+    asked = [((a, i), (b, j)) for a, b in pairs for i in best[a] for j in best[b]]
     both = [np.concatenate([own[first], own[second]]) for first, second in asked]
-    together = np.empty(len(both))
+    together, n_columns = np.empty(len(both)), np.array([len(at) for at in both])
     total = np.maximum(np.sum(problem.residual[:, None] ** 2, axis=0), 1e-300)
     per_column = np.sqrt(np.repeat(widths, widths))
-    for width in {len(at) for at in both}:
-        members = [k for k, at in enumerate(both) if len(at) == width]
+    for width in set(n_columns.tolist()):
+        members = np.flatnonzero(n_columns == width)
         at = np.array([both[k] for k in members])
         scale = (per_column[at] / math.sqrt(width))[:, :, None]  # both together of unit rms
         grams = products[at[:, :, None], at[:, None, :]] * scale * scale.transpose(0, 2, 1)
-        scores = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept)
-        together[members] = scores[:, 0]
+        together[members] = _log_bayes_factors_of_grams(grams, along[at] * scale, total, problem.n_kept)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     starts = np.concatenate([[0], np.cumsum([len(best[a]) * len(best[b]) for a, b in pairs])[:-1]])
     gained = np.logaddexp.reduceat(together, starts) - np.logaddexp.reduceat(apart, starts)
     alone = {name: log_mean_exp(scores) for name, scores in singles.items()}
-    return {(a, b): alone[a] + alone[b] + float(own) for (a, b), own in zip(pairs, gained, strict=True)}
+    return {(a, b): alone[a] + alone[b] + float(more) for (a, b), more in zip(pairs, gained, strict=True)}

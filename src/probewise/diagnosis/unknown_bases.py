@@ -11,8 +11,9 @@ cannot imitate a product of two that vary independently.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import replace
+from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,8 +41,7 @@ _TERMS_IN_TIME = (3, 8, 24, 64)  # where a wave may be of any frequency
 _WINDOWS = (4, 8, 16)  # parts of a covariate
 
 
-@dataclass(frozen=True, eq=False)
-class _BasisMultipliers:
+class _BasisMultipliers(NamedTuple):
     """Factors by which a function of a covariate is multiplied to give a basis, (n_points,) each; number of scans.
 
     `adds`: 1, an added error; `gain`: the signal; `shift`: the slope along the axis of motion, a displacement;
@@ -107,8 +107,8 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
         blocks = OrthonormalBlocks.of(problem, named.templates[group])
         held |= _are_held(own.u[:, own.starts[single]], blocks)
         twins |= _have_span_of_some(own, blocks)
-    kept = np.setdiff1d(np.arange(len(bases.widths)), single[held])
     templates = [0.0 * template if twin else template for template, twin in zip(bases.templates, twins, strict=True)]
+    kept = np.delete(np.arange(len(bases.widths)), single[held])
     return replace(bases, templates=tuple(templates)).take_entries(kept)
 
 
@@ -117,10 +117,10 @@ def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: 
     products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
     if products.size == 0 or not formulas.templates:
         return bases
-    own, held = OrthonormalBlocks.of(problem, [bases[k] for k in products]), np.zeros(len(products), dtype=np.bool_)
-    for group in formulas.groups:
-        held |= _are_held(own.u, OrthonormalBlocks.of(problem, formulas.templates[group]))
-    return bases.take_entries(np.setdiff1d(np.arange(len(bases.labels)), products[held]))
+    own = OrthonormalBlocks.of(problem, [bases[k] for k in products]).u
+    blocks = (OrthonormalBlocks.of(problem, formulas.templates[group]) for group in formulas.groups)
+    held = np.any([_are_held(own, each) for each in blocks], axis=0)
+    return bases.take_entries(np.delete(np.arange(len(bases.labels)), products[held]))
 
 
 def _are_held(columns: FloatArray, blocks: OrthonormalBlocks) -> BoolArray:
@@ -136,12 +136,16 @@ def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> 
     spans, other_spans = (
         [u[:, np.any(u, axis=0)] for u in np.split(each.u, each.starts[1:], axis=1)] for each in (blocks, others)
     )
-
-    def is_twin(span: FloatArray) -> bool:
-        alike = (other for other in other_spans if other.shape[1] == span.shape[1] > 1)
-        return any(np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE for other in alike)
-
-    return np.array([is_twin(span) for span in spans])
+    return np.array(
+        [
+            any(
+                np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE
+                for other in other_spans
+                if other.shape[1] == span.shape[1] > 1
+            )
+            for span in spans
+        ]
+    )
 
 
 def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:
@@ -204,17 +208,13 @@ def _product_bases(covariates: Sequence[Covariate], n_points: int) -> Iterator[F
 
 def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
     """Yield exponential averages (of 3, 10, 30 readings) and maximum of the signal within scans; the maximum alone."""
-    held = np.empty((len(signal), len(_MEMORIES) + 1))
-    keep = np.exp(-1 / np.array(_MEMORIES))
-    first = np.zeros(len(signal), dtype=np.bool_)
-    first[starts] = True
-    state, most = np.zeros(len(_MEMORIES)), 0.0
-    for k, value in enumerate(signal):
-        if first[k]:
-            state[:], most = value, value
-        state = keep * state + (1 - keep) * value
-        most = max(most, value)
-        held[k, :-1], held[k, -1] = state, most
+    held, keep = np.empty((len(signal), len(_MEMORIES) + 1)), np.exp(-1 / np.array(_MEMORIES))
+    for first, end in pairwise([*starts.tolist(), len(signal)]):
+        state = np.full(len(keep), signal[first])
+        for k in range(first, end):
+            state = keep * state + (1 - keep) * signal[k]
+            held[k, :-1] = state
+        held[first:end, -1] = np.maximum.accumulate(signal[first:end])
     yield held
     yield held[:, -1:]
 
@@ -224,9 +224,8 @@ def _scan_end_bases(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
 
     A pair is the same in all scans; with up to 24 scans, there are also bases of one pair per scan.
     """
-    first = np.repeat(starts, np.diff(starts, append=n_points))
-    last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
-    rows = np.arange(n_points)
+    n_rows, rows = np.diff(starts, append=n_points), np.arange(n_points)
+    first, last = np.repeat(starts, n_rows), np.repeat(starts + n_rows - 1, n_rows)
     each = (first[:, None] == starts).astype(np.float64)
     for length in (2.0, 8.0):
         begin, end = np.exp(-(rows - first) / length), np.exp(-(last - rows) / length)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -158,7 +159,7 @@ class Judged:
     def beside_shared(self) -> tuple[Hypothesis, ...]:
         """What may act beside the `shared` effects, most probable first; () is nothing more."""
         beside = [
-            Hypothesis(tuple(name for name in h.effects if name not in self.shared), h.probability)
+            Hypothesis(_without(h.effects, self.shared), h.probability)
             for h in self.hypotheses
             if {*self.shared} <= {*h.effects}
         ]
@@ -180,8 +181,10 @@ class Judged:
 
     @property
     def credible(self) -> tuple[str, ...]:
-        """Labels of the hypotheses in the 95 % credible set, most probable first."""
-        return credible_labels(self.hypotheses)
+        """Labels of the fewest hypotheses that hold a probability of 95 %, most probable first."""
+        ranked = sorted(self.hypotheses, key=lambda h: -h.probability)
+        held = list(itertools.accumulate(h.probability for h in ranked))
+        return tuple(h.label for k, h in enumerate(ranked) if k == 0 or held[k - 1] < SETTLED)
 
     @property
     def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
@@ -192,46 +195,38 @@ class Judged:
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
 
 
+def _without(names: Iterable[str], others: Iterable[str]) -> Names:
+    return tuple(name for name in names if name not in others)
+
+
 def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) -> Judged:
     """Return the verdict, with probabilities and aliases, from a search and the global test.
 
     The probability of what is out of vocabulary counts `unknown_weight` times against all others.
     """
-    prepared, prior = searched.prepared, searched.prior
+    prepared, half = searched.prepared, searched.prior.named_needs_half
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
-    on_noise, certain, half = prepared.pure_noise_effect_names, frozenset(searched.certain), prior.named_needs_half
+    on_noise, certain = prepared.pure_noise_effect_names, frozenset(searched.certain)
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
         noise = prepared.noise_effect_names & {*combination}
-        others = searched.combinations_aliased_with(tuple(name for name in combination if name not in noise))
+        others = searched.combinations_aliased_with(_without(combination, noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
 
     def verdict_on(hypotheses: tuple[Hypothesis, ...]) -> tuple[Verdict, Names]:
         if prepared.has_too_little_data:
             return "cannot_tell", ()
         return verdict_and_combination(
-            hypotheses,
-            test.p_value,
-            noise_names=on_noise,
-            aliases=pairs,
-            aliased_with=aliased_combinations,
-            certain=certain,
-            named_needs_half=half,
-        )
+            hypotheses, test.p_value, noise_names=on_noise, aliases=pairs, aliased_with=aliased_combinations,
+            certain=certain, named_needs_half=half,
+        )  # fmt: skip
 
     hypotheses, rare, (verdict, combination) = hypotheses_with_verdict(
         searched, test.p_value, verdict_on, unknown_weight=unknown_weight
     )
-    judged = Judged(
-        verdict,
-        combination,
-        test.p_value,
-        hypotheses,
-        aliases=pairs,
-        unknown_shares=searched.probabilities_of_unknown_forms(besides=rare),
-        too_little=prepared.has_too_little_data,
-    )
-    return with_shared_effects(judged, on_noise, certain=certain) if half and not judged.too_little else judged
+    forms, too_little = searched.probabilities_of_unknown_forms(besides=rare), prepared.has_too_little_data
+    judged = Judged(verdict, combination, test.p_value, hypotheses, pairs, forms, too_little)
+    return with_shared_effects(judged, on_noise, certain=certain) if half and not too_little else judged
 
 
 def hypotheses_with_verdict(
@@ -342,71 +337,52 @@ def verdict_and_combination(
     certain: frozenset[str] = frozenset(),
     named_needs_half: bool = False,
 ) -> tuple[Verdict, Names]:
-    """Return the verdict and the combination it names; effects on the mean also need a global test with p up to .01.
-
-    Effects in `certain`, which the readings show beyond doubt, need no significant test. With `named_needs_half`,
-    effects on the mean count whatever effects on the noise are beside them, and need half the probability; otherwise
-    the verdict is `cannot_tell`, with the combination.
-    """
-    by_mean, fullest = dict[Names, float](), dict[Names, Names]()
-    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
-        mean = hypothesis.effects
-        if named_needs_half:  # those with effects on the noise alone stay apart
-            mean = tuple(name for name in mean if name not in noise_names) or mean
-        by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
-        fullest.setdefault(mean, hypothesis.effects)
-    verdict, top = _verdict_by_probability(by_mean, noise_names, aliases, aliased_with)
-    if named_needs_half and verdict == "named" and by_mean[top] < 0.5:
-        verdict = "cannot_tell"
-    combination = fullest.get(top, top)
-    doubtful = verdict == "named" and not {*combination} <= noise_names | certain
-    return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
-
-
-def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
-    """Return the labels of the smallest set of hypotheses with a probability of 95 % or more, most probable first."""
-    out, held = [], 0.0
-    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
-        out.append(hypothesis.label)
-        held += hypothesis.probability
-        if held >= SETTLED:
-            break
-    return tuple(out)
-
-
-def _verdict_by_probability(
-    probability: Mapping[Names, float],
-    noise_names: frozenset[str],
-    aliases: tuple[Alias, ...],
-    aliased_with: Callable[[Names], frozenset[Names]],
-) -> tuple[Verdict, Names]:
-    """Return the verdict by probabilities and aliases alone, and the combination it names.
+    """Return the verdict and the combination it names.
 
     Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
     is `named` (`noise` if all its effects are on the noise). The verdict is `cannot_tell` instead,
 
     - with half the probability or more, if one aliased with it (`aliased_with`) has over a fifth of its probability;
     - with less, if it has half together with all that differ from it by one effect swapped for its alias (`aliases`);
-    - with less, if clean or unknown is more probable, or if there is no combination: then none is named.
+    - with less, if clean or unknown is more probable, or if there is no combination: then none is named;
+    - if the p-value of the global test is above .01, of effects on the mean: then none is named, but those in
+      `certain`, which the readings show beyond doubt.
+
+    With `named_needs_half`, effects on the mean count whatever effects on the noise are beside them, and need half the
+    probability to be `named`.
     """
-    if probability.get(("unknown",), 0.0) >= 0.5:
-        return "unknown", ("unknown",)
-    if probability.get((), 0.0) >= 0.5:
-        return "clean", ()
-    named = {effects: p for effects, p in probability.items() if effects not in ((), ("unknown",))}
-    if not named:
-        return "cannot_tell", ()
-    top = max(named, key=lambda effects: named[effects])
-    if named[top] >= 0.5:
-        if any(named.get(other, 0.0) > OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
-            return "cannot_tell", top
-        return ("noise" if set(top) <= noise_names else "named"), top
+    by_mean, fullest = dict[Names, float](), dict[Names, Names]()
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
+        mean = hypothesis.effects
+        if named_needs_half:  # those with effects on the noise alone stay apart
+            mean = _without(mean, noise_names) or mean
+        by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
+        fullest.setdefault(mean, hypothesis.effects)
+    unknown, clean = by_mean.get(("unknown",), 0.0), by_mean.get((), 0.0)
+    named = {effects: p for effects, p in by_mean.items() if effects not in ((), ("unknown",))}
+    top = max(named, key=lambda effects: named[effects], default=())
     of_class = _combination_and_alias_swaps(top, aliases)
-    if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
-        return "cannot_tell", top
-    if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
-        return "cannot_tell", ()
-    return ("noise" if set(top) <= noise_names else "named"), top
+    verdict: Verdict = "named"
+    if unknown >= 0.5:
+        verdict, top = "unknown", ("unknown",)
+    elif clean >= 0.5:
+        verdict, top = "clean", ()
+    elif not named:
+        verdict = "cannot_tell"
+    elif named[top] >= 0.5:
+        if any(named.get(other, 0.0) > OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
+            verdict = "cannot_tell"
+    elif len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
+        verdict = "cannot_tell"
+    elif max(clean, unknown) > named[top]:
+        verdict, top = "cannot_tell", ()
+    combination = fullest.get(top, top)
+    if verdict == "named" and {*top} <= noise_names:
+        return "noise", combination
+    if verdict == "named" and named_needs_half and named[top] < 0.5:
+        return "cannot_tell", combination
+    doubtful = verdict == "named" and not {*combination} <= noise_names | certain
+    return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
 
 
 def _combination_and_alias_swaps(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
@@ -429,32 +405,21 @@ _OPEN = 0.05  # least probability of a rival: what has less is no open question
 
 @dataclass(frozen=True)
 class Grounds:
-    """The facts, in addition to the verdict, for the sentence that gives its reason.
-
-    `n_readings`, `least_readings`: usable readings, and the fewest for a verdict;
-    `form`: description of the calibrated SSF, "" if there is none; `sentences`: sentence on each effect, by name;
-    `like`: sentences on the effects that the unknown one resembles; `family`: the most probable family of bases of the
-    unknown effect, such as "time"; `beside`: effects that act in addition to the unknown one; `shows_in`: names of the
-    covariates in which effects and residuals are located, in the order of `Diagnosis.where`; `p_value_after`: p-value
-    of the global test of the repaired model; `settles`: the readings that would separate the hypotheses that the
-    sentence names, in words; "" if no such readings do, None if that is not known; `apart`: which of these hypotheses
-    they separate, in words; `nuisances`: sentences on the noise that was found beside what has a name in the
-    vocabulary.
-    """
+    """The facts, in addition to the verdict, for the sentence that gives its reason."""
 
     words: Words
-    n_readings: int
-    least_readings: int
-    form: str = ""
-    sentences: Mapping[str, str] = field(default_factory=dict)
-    like: tuple[str, ...] = ()
-    family: str = ""
-    beside: tuple[str, ...] = ()
-    shows_in: tuple[str, ...] = ()
-    p_value_after: float = 1.0
-    settles: str | None = None
-    apart: str = ALL
-    nuisances: tuple[str, ...] = ()
+    n_readings: int  # usable ones
+    least_readings: int  # the fewest for a verdict
+    form: str = ""  # of the calibrated SSF, if there is one
+    sentences: Mapping[str, str] = field(default_factory=dict)  # on each effect, by name
+    like: tuple[str, ...] = ()  # sentences on the effects that the unknown one resembles
+    family: str = ""  # the most probable family of bases of the unknown effect, such as "time"
+    beside: tuple[str, ...] = ()  # effects that act in addition to the unknown one
+    shows_in: tuple[str, ...] = ()  # covariates of effects and residuals, in the order of `Diagnosis.where`
+    p_value_after: float = 1.0  # of the global test of the repaired model
+    settles: str | None = None  # the readings that would separate what is open; "" if none do, None if not known
+    apart: str = ALL  # which of the hypotheses they separate
+    nuisances: tuple[str, ...] = ()  # sentences on noise that was found beside what has a name in the vocabulary
 
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:
@@ -473,13 +438,27 @@ def reason_of(judged: Judged, grounds: Grounds) -> str:
         form = f", {grounds.form}," if grounds.form else ""
         rare = ", which is rare; nothing that was tried explains them better" if judged.p_value < ALARM else ""
         return f"The model{form} explains all {n} readings to within their noise ({p}{rare})."
-    say = {
-        "unknown": _unknown_sentence,
-        "cannot_tell": _cannot_tell_sentence,
-        "noise": _noise_sentence,
-        "named": _named_sentence,
-    }
-    return say[judged.verdict](judged, grounds)
+    if judged.verdict == "unknown":
+        return _unknown_sentence(judged, grounds)
+    if judged.verdict == "cannot_tell":
+        cure = "" if grounds.settles is None else f"; {grounds.words.settles_nothing}"
+        if grounds.settles:
+            cure = f"{TO_SEPARATE}{grounds.apart}: {grounds.settles}"
+        said = _joined_effect_sentences(judged.shared, grounds)
+        if said:
+            return f"{said}. Beside that, {_open_question(judged.beside_shared, grounds, NOTHING_MORE)}{cure}."
+        asked = _open_question(judged.hypotheses, grounds, NOTHING)
+        return f"{asked[:1].upper()}{asked[1:]}{cure}."
+    named = _joined_effect_sentences(judged.stated, grounds, *grounds.nuisances)
+    if judged.verdict == "noise":
+        mean = f"nothing is missing from the mean ({p})"
+        if judged.p_value < ALARM:
+            mean = f"a test of the mean alone gives {p}, which no effect explains better than this noise"
+        return f"{named}; {mean}."
+    said, after = f"{named} ({p}).", grounds.p_value_after
+    if judged.leader and judged.beside_shared[0].probability < SETTLED:
+        said += f" Beside that, {_open_question(judged.beside_shared, grounds, NOTHING_MORE)}."
+    return said + (f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else "")
 
 
 def separating_readings_in_words(
@@ -489,9 +468,11 @@ def separating_readings_in_words(
 
     Nothing is known of hypotheses that differ in their noise alone, or that are not among those compared.
     """
-    told = _combinations_in_reason(judged)
+    on_noise, told = searched.prepared.noise_effect_names, [h.effects for h in _rivals_to_name(judged.hypotheses)]
+    if judged.shared:
+        told = [tuple(sorted({*judged.shared, *h.effects})) for h in _rivals_to_name(judged.beside_shared)]
     named: dict[Names, str] = {}
-    on_mean = {tuple(sorted({*names} - searched.prepared.noise_effect_names)) for names in told}
+    on_mean = {tuple(sorted({*names} - on_noise)) for names in told}
     formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} - on_mean if asked else set()
     for names in told:
         if names == ("unknown",):  # without a formula it predicts what the null does
@@ -499,7 +480,7 @@ def separating_readings_in_words(
         else:
             beside = tuple(sorted({*names} - {*judged.shared}))
             label = hypothesis_in_words(beside, nothing=NOTHING_MORE if judged.shared else NOTHING)
-            named.setdefault(tuple(sorted({*names} - searched.prepared.noise_effect_names)), label)
+            named.setdefault(tuple(sorted({*names} - on_noise)), label)
     if len(named) < 2:
         return None, ""
     classes = asked.classes_among(named) if asked is not None else []
@@ -511,13 +492,6 @@ def separating_readings_in_words(
     if len(labels) < 2:  # formulas for one unknown effect
         return None, ""
     return asked.description, ALL if set(labels) == set(named.values()) else " from ".join(labels)
-
-
-def _combinations_in_reason(judged: Judged) -> list[Names]:
-    """Return the effects of the hypotheses that the reason of `cannot_tell` names."""
-    if judged.shared:
-        return [tuple(sorted({*judged.shared, *h.effects})) for h in _rivals_to_name(judged.beside_shared)]
-    return [h.effects for h in _rivals_to_name(judged.hypotheses)]
 
 
 def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
@@ -548,17 +522,6 @@ def covariate_of_unknown(family: str, shows_in: Sequence[str]) -> str:
     return likeliest if likeliest in shows_in and likeliest not in ("time", "row") else first
 
 
-def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
-    cure = "" if grounds.settles is None else f"; {grounds.words.settles_nothing}"
-    if grounds.settles:
-        cure = f"{TO_SEPARATE}{grounds.apart}: {grounds.settles}"
-    said = _joined_effect_sentences(judged.shared, grounds)
-    if said:
-        return f"{said}. Beside that, {_open_question(judged.beside_shared, grounds, NOTHING_MORE)}{cure}."
-    asked = _open_question(judged.hypotheses, grounds, NOTHING)
-    return f"{asked[:1].upper()}{asked[1:]}{cure}."
-
-
 def _open_question(hypotheses: Sequence[Hypothesis], grounds: Grounds, nothing: str) -> str:
     """Say which hypotheses these readings cannot tell apart, or which one is likeliest, without a full stop."""
     named = _rivals_to_name(hypotheses)
@@ -571,24 +534,6 @@ def _open_question(hypotheses: Sequence[Hypothesis], grounds: Grounds, nothing: 
 
 def _rivals_to_name(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for k, h in enumerate(hypotheses[:3]) if k == 0 or h.probability >= _OPEN]
-
-
-def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
-    p = p_in_words(judged.p_value)
-    mean = f"nothing is missing from the mean ({p})"
-    if judged.p_value < ALARM:
-        mean = f"a test of the mean alone gives {p}, which no effect explains better than this noise"
-    return f"{_joined_effect_sentences(judged.combination, grounds, *grounds.nuisances)}; {mean}."
-
-
-def _named_sentence(judged: Judged, grounds: Grounds) -> str:
-    after = grounds.p_value_after
-    named = f"{_joined_effect_sentences(judged.stated, grounds, *grounds.nuisances)} ({p_in_words(judged.p_value)})."
-    beside = ""
-    if judged.leader and judged.beside_shared[0].probability < SETTLED:
-        beside = f" Beside that, {_open_question(judged.beside_shared, grounds, NOTHING_MORE)}."
-    more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
-    return f"{named}{beside}{more}"
 
 
 def _joined_effect_sentences(names: Sequence[str], grounds: Grounds, *more: str) -> str:

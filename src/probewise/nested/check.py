@@ -1,9 +1,8 @@
 """Check a run's evidence by a second, independent estimate, and repeat the run where the two disagree.
 
-Chains that are too short bias every shell a little, always in the same direction, so the bias of log Z grows with the
-compression. The insertion ranks and the scatter between seeds do not show this bias. The second estimate uses chains
-twice as long and compresses by few nats: it runs from a prior near the posterior of the first run (`repartition`).
-Where the posterior fills so much of the prior that this saves nothing, it is a small run of the same problem.
+Chains that are too short bias every shell a little in the same direction, which neither insertion ranks nor the scatter
+between seeds show. The second estimate uses chains twice as long and compresses by few nats: it runs from a prior near
+the posterior of the first run (`repartition`), or, where that saves nothing, is a small run of the same problem.
 
 Parts of the posterior without live points escape both. So `probewise.nested.peaks` looks for missed peaks first, and
 the prior of the second estimate gets a part about each: its posterior tells which of them matter. The repetition hops
@@ -41,8 +40,7 @@ _MET = 0.5  # of the share of a peak: with more, a run has met it
 _AGAIN = 2.2  # times the first run's evaluations: what it costs to repeat it with chains twice as long
 _MISSING = 1.0  # errors by which a missed peak raises log Z, above which it is a doubt
 
-Search = Callable[..., NestedResult]
-"""Function that runs nested sampling once, without a check, as `run_once` does."""
+Search = Callable[..., NestedResult]  # runs nested sampling once, without a check, as `run_once` does
 
 
 @dataclass

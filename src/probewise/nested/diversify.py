@@ -26,15 +26,9 @@ def diversify(theta: FloatArray, problem: Samplable, *, rng: np.random.Generator
     chains' states, so the posterior is left invariant.
 
     `theta` are posterior samples, possibly repeated, (n_samples, n_params); `problem` has a prior with `log_prob`.
-    Return the samples after `n_steps` each; the paper takes about 1000.
-
-    Raises
-    ------
-    ParameterError, ShapeError
-        If a sample has zero posterior density, `n_steps` is negative, the prior has no `log_prob`, or `theta` has
-        another shape, or no rows.
-    NotConvergedError
-        If the likelihood fails.
+    Return the samples after `n_steps` each; the paper takes about 1000. Raises ParameterError or ShapeError if a sample
+    has zero posterior density, `n_steps` is negative, the prior has no `log_prob`, or `theta` has another shape, or no
+    rows; NotConvergedError if the likelihood fails.
     """
     require_rng(rng)
     start = np.array(floats(theta, "theta"))

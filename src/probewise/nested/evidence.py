@@ -97,11 +97,9 @@ def _log_shell_volumes(log_edges: FloatArray) -> FloatArray:
 def birth_rows(
     log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
 ) -> IntArray:
-    """Find the row of the dead point above whose level each point was drawn, (n_dead,); -1 where there is none.
+    """Find the row of the last death at or below the level of each birth, (n_dead,); -1 where there is none.
 
-    It is the last death at or below the level of birth. `log_likelihood` and `label` of the deaths are in order, ties
-    of likelihood by label; `log_birth` and `birth_label` are the levels above which each point was drawn, all
-    (n_dead,).
+    `log_likelihood` and `label` of the deaths are in order, ties of likelihood by label; all (n_dead,).
     """
     n = len(log_likelihood)
     born = np.repeat([0, 1], n)  # a death comes before the births at its own level
@@ -134,10 +132,10 @@ def insertion_ranks(ident: IntArray, n_live: int, n_replaced: int) -> tuple[IntA
 def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.random.Generator) -> float:
     """Test that new points were inserted uniformly among the live ones (Fowlie, Handley & Su 2020); return p.
 
-    `rank`: number of live points worse than each new one; `n_below_or_above`: number of points alive at its insertion,
-    m, without itself; (n_inserted,) each. The ranks of a correct sampler are independent and uniform on 0..m. A
-    Kolmogorov-Smirnov test is made of the whole run and of its tenths (a fault may be temporary), with Bonferroni's
-    correction. `rng` jitters the discrete ranks. For fewer than 20 points p is 1.
+    `rank`: number of live points worse than each new one, `n_below_or_above`: of those alive at its insertion, m,
+    (n_inserted,) each. The ranks of a correct sampler are independent and uniform on 0..m. A Kolmogorov-Smirnov test is
+    made of the whole run and of its tenths (a fault may be temporary), with Bonferroni's correction. `rng` jitters the
+    discrete ranks. For fewer than 20 points p is 1.
     """
     if len(rank) < 20:
         return 1.0
@@ -151,8 +149,7 @@ def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.ran
 def _uniform_p_value(position: FloatArray) -> float:
     """Return the Kolmogorov-Smirnov p value of positions, (n,), against the uniform distribution on 0 to 1.
 
-    It is the limiting distribution with Stephens' (1970) correction for finite n: `scipy.stats` has the exact one, but
-    takes a second to import.
+    Stephens' (1970) correction for finite n: `scipy.stats` has the exact distribution, but takes a second to import.
     """
     n = len(position)
     place, steps = np.sort(position), np.arange(n + 1) / n
@@ -262,10 +259,8 @@ def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_li
 def warning_of_coarse_coordinates(names: Sequence[str], u: FloatArray, weight: FloatArray) -> str | None:
     """Return a warning if the posterior is too narrow in the sampling coordinates for floating-point numbers, or None.
 
-    Just below 1 numbers are 1e-16 apart, so this is the case about 8 sds above the mean of a normal prior. Below the
-    mean, near 0, there are numbers enough.
-
-    `u`: points in the sampling coordinates, (n, n_params); `weight`, (n,): of the posterior, sum 1.
+    Just below 1 numbers are 1e-16 apart, so this is the case about 8 sds above the mean of a normal prior, not below.
+    `u`: points, (n, n_params); `weight`, (n,): of the posterior, sum 1.
     """
     low, high = weighted_quantiles(u, weight, [0.25, 0.75])
     steps = (high - low) / np.spacing(np.abs(low))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import expit, logsumexp
@@ -167,9 +168,8 @@ def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) ->
     """Fit two proposals to samples, (n_samples, n_params): the best wide form, then the best narrow form.
 
     Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's width or less.
-    Either with or without clusters. Of each form the variant with the greatest held-out likelihood (fit to one half,
-    score on the other) is fitted to all samples. The caller decides between the two by weighted draws: the likelihood
-    favours a close fit, the weights a wide one. Fewer than 80 samples give one wide kernel only.
+    Of each form the variant, with or without clusters, with the greatest held-out likelihood is fitted to all samples.
+    That favours a close fit, weights of draws a wide one. Fewer than 80 samples give one wide kernel only.
     """
     x = x[rng.permutation(len(x))]
     half = len(x) // 2
@@ -206,23 +206,13 @@ def _fit_kernels(x: FloatArray, split: bool, scale: float | None) -> Proposal:
     return Proposal(clusters, tuple(centres), tuple(width), size / size.sum())
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOutSamples:
-    """Posterior samples held out from the fit.
-
-    `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,);
-    `n_independent`: their effective number.
-    """
-
-    x: FloatArray
-    log_density: FloatArray
-    log_likelihood: FloatArray
-    n_independent: float
+HeldOut: TypeAlias = tuple[FloatArray, FloatArray, float]
+"""Posterior samples held out from a fit: in unbounded coordinates (n, n_params), log target (n,), effective number."""
 
 
 def draw_and_weigh(
     proposal: Proposal,
-    held: HeldOutSamples | None,
+    held: HeldOut | None,
     space: Space,
     evaluate: Evaluator,
     *,
@@ -249,9 +239,8 @@ def draw_and_weigh(
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
     k = pareto_k(log_ratio)
     held_ratio, n_held = np.empty(0), 0.0
-    if held is not None and len(held.x):
-        held_ratio = held.log_density + held.log_likelihood - proposal.log_density(held.x)
-        n_held = held.n_independent
+    if held is not None and len(held[0]):
+        held_ratio, n_held = held[1] - proposal.log_density(held[0]), held[2]
     log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, n_held)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)

@@ -24,33 +24,20 @@ _LEVELS = ("log_likelihood", "label", "log_birth", "birth_label")
 
 @own_arithmetic
 def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
-    """Merge independent runs of the same problem into one run with the live points of all.
+    """Merge independent runs of the same problem, two or more, into one run with the live points of all.
 
     A point is alive between the level above which it was drawn and its own. Sorted by level, the points of all runs
     form a run whose number of live points at each level is the sum over the runs (Higson, Handley, Hobson & Lasenby
     2019, section 4). The runs may differ in their numbers of live points and in where they stop. The labels make the
-    count exact on plateaus. Merged runs may be merged again. The error of ln Z falls as one over the root of the number
-    of runs.
+    count exact on plateaus. Merged runs may be merged again. The error of ln Z, for which `rng` draws, falls as one
+    over the root of the number of runs.
 
-    Parameters
-    ----------
-    results
-        Two runs or more, of different seeds.
-    rng
-        Source of randomness for the error of ln Z; see `probewise.nested.evidence.integrate`.
+    The result has an `agreement`, and a combined `check` if every run has one. If the runs' evidences differ by more
+    than their errors allow (p < 0.001), a warning is added and the error is at least their scatter. If the combined
+    second estimates disagree with the combined runs, as they do if all runs share a bias, a warning is added too.
 
-    Returns
-    -------
-    NestedResult
-        With `agreement`, and with a combined `check` if every run has one. If the runs' evidences differ by more than
-        their errors allow (p < 0.001), a warning is added and the error is at least their scatter. If the combined
-        second estimates disagree with the combined runs, as they do if all runs share a bias, a warning is added too.
-
-    Raises
-    ------
-    ParameterError
-        If there are fewer than two runs, or their parameters differ, or they share a seed or lack a complete record of
-        births and deaths.
+    Raises ParameterError if there are fewer than two runs, or their parameters differ, or they share a seed or lack a
+    complete record of births and deaths.
     """
     require_rng(rng)
     parts = tuple(results)
@@ -136,8 +123,7 @@ def n_alive_at_death(
 ) -> IntArray:
     """Count the points alive at each death, itself included, from the levels of birth and death, all (n_dead,).
 
-    A level is a log likelihood and a label, which orders equal ones; deaths are in order of level. A point is alive
-    from the deaths on that lie strictly above its birth.
+    Deaths are in order of level. A point is alive from the deaths on that lie strictly above its birth.
     """
     birth, death = birth_rows(log_likelihood, label, log_birth, birth_label), np.arange(len(label))
     return np.asarray(np.searchsorted(np.sort(birth), death) - death)

@@ -199,33 +199,24 @@ class HoppingMove:
         return HoppingMove(self.chains.adapted(tally), self.modes)
 
 
-@dataclass(frozen=True, eq=False)
 class Kernels:
     """A kernel density of Gaussians about points: half of the mass with sd `width`, half with a third of it.
 
-    `centre_rows` are the points whitened by their `mean` and the Cholesky `root` of their covariance, (n_kernels,
-    n_params); `width` is in that frame. The wide kernels lead to other modes and into corners without points, the
-    narrow ones follow a thin or curved region.
+    They are at up to a hundred of the points, (n_points, n_params), whitened by mean and covariance of all. The wide
+    kernels lead to other modes and into corners without points, the narrow ones follow a thin or curved region.
     """
 
-    mean: FloatArray
-    root: FloatArray
-    centre_rows: FloatArray
-    width: float
-
-    @classmethod
-    def at_points(cls, points: FloatArray, *, rng: np.random.Generator) -> Kernels:
-        """Place kernels at up to a hundred of the points, (n_points, n_params), whitened by the covariance of all."""
+    def __init__(self, points: FloatArray, *, rng: np.random.Generator) -> None:
         n_points, n_params = points.shape
-        mean = points.mean(axis=0)
+        self.mean = points.mean(axis=0)
         covariance = np.atleast_2d(np.cov(points, rowvar=False))
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         correlation = covariance / np.outer(scale, scale)
-        root = scale[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(n_params))
+        self.root = scale[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(n_params))
         rows = rng.permutation(n_points)[:_MOST_KERNELS]
-        centre_rows = np.linalg.solve(root, (points[rows] - mean).T).T
+        self.centre_rows = np.linalg.solve(self.root, (points[rows] - self.mean).T).T
         # Silverman's rule: the optimal width for Gaussian points.
-        return cls(mean, root, centre_rows, (4 / (n_params + 2) / len(rows)) ** (1 / (n_params + 4)))
+        self.width = (4 / (n_params + 2) / len(rows)) ** (1 / (n_params + 4))
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw points, (n, n_params)."""
@@ -285,7 +276,7 @@ class KernelMove:
     ) -> tuple[Points, Tally]:
         """Return the ends of one chain from each start, and the tally; see `Move`."""
         n_chains, space = len(start), evaluate.space
-        kernels = Kernels.at_points(live, rng=rng)
+        kernels = Kernels(live, rng=rng)
         n_tries = n_chains * self.n_proposals
         u = kernels.draw(n_tries, rng=rng)
         log_target = -kernels.log_density(u)

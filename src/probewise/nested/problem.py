@@ -107,10 +107,7 @@ class _NormalScores:
 
 
 def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
-    """Return the sampling coordinates: the prior's, if it has any, else the unit cube.
-
-    ParameterError if `periodic` names parameters that the prior does not have, or the prior has coordinates.
-    """
+    """Return the sampling coordinates: the prior's, if it has any, else the unit cube; ParameterError by `periodic`."""
     if hasattr(prior, "coordinates"):
         require(not periodic, "periodic", tuple(periodic), "none: the prior has coordinates of its own")
         return Space(prior, prior.coordinates)
@@ -119,10 +116,7 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
 
 
 def unbounded_space_of(prior: Prior) -> Space:
-    """Return unbounded coordinates, as fitted densities need them: the prior's, else normal scores.
-
-    ParameterError if the prior has neither coordinates nor `to_unit_cube`.
-    """
+    """Return unbounded coordinates, the prior's, else normal scores; ParameterError without `to_unit_cube` either."""
     if hasattr(prior, "coordinates"):
         return Space(prior, prior.coordinates)
     require_prior("problem.prior", prior, "to_unit_cube")
@@ -147,10 +141,10 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Points(Rows):
-    """Evaluated points.
+    """Evaluated points: `u` in the sampling coordinates and `theta` in parameters, both (n, n_params).
 
-    `u` in the sampling coordinates and `theta` in parameters, both (n, n_params); `log_density` of the prior in `u`,
-    (n,); `log_likelihood`, (n,); `label`, (n,): uniform random numbers that order points of equal likelihood.
+    `log_density` of the prior in `u`, `log_likelihood` and `label`, uniform random numbers that order points of equal
+    likelihood, are (n,).
     """
 
     u: FloatArray
@@ -180,8 +174,7 @@ class Points(Rows):
 class Bound:
     """A lower bound in the order (log likelihood, label), set by a dead point.
 
-    The label makes the order strict, so that the volume shrinks correctly where the likelihood is
-    constant over a finite part of the prior (a plateau).
+    The label makes the order strict, so that the volume shrinks correctly on a plateau of the likelihood.
     """
 
     log_likelihood: float
@@ -400,15 +393,12 @@ def make_problem(
         that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
         `probewise.priors`, pairs (low, high) for uniform ones, or frozen continuous ones of scipy.stats. A function
         suffices for `run`; `refine`, `update` and `diversify` need the prior's density or inverse.
-    names
-        Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default.
-    vectorized
-        Whether the functions take many points at once, (n_samples, n_params), and return one result per point: much
-        faster with NumPy.
-    pass_dict
-        Whether the likelihood takes a dict of parameters by name instead of an array.
-    periodic
-        Names of parameters whose range is periodic.
+    names, periodic
+        Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default; and
+        of those whose range is periodic.
+    vectorized, pass_dict
+        Whether the functions take many points at once, (n_samples, n_params), and return one result per point, much
+        faster with NumPy; whether the likelihood takes a dict of parameters by name instead of an array.
 
     ParameterError if an argument has the wrong type, or names and prior do not match.
     """

@@ -17,7 +17,7 @@ from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     MOST_LOST,
-    HeldOutSamples,
+    HeldOut,
     Weighted,
     draw_and_weigh,
     fit_wide_and_narrow_proposals,
@@ -64,23 +64,13 @@ def refine(
     So a mode of share s is lost with probability exp(-s n_live / H); the sum of s times that over the modes found is
     added.
 
-    Parameters
-    ----------
-    result
-        A run of the same problem, or an earlier refinement.
-    n_draws
-        Number of final draws, 100 or more; each of two pilot rounds takes a quarter of that, at least 100, in addition.
-    look
-        Whether to check the run, if it has no check (it was made with `max_cost=1`), for at most as many evaluations
-        again. Parts of the posterior that it has missed are among the warnings.
+    `result` is a run of the same problem, or an earlier refinement. `n_draws`: number of final draws, 100 or more; each
+    of two pilot rounds takes a quarter of that, at least 100, in addition. `look`: whether to check the run, if it has
+    no check (it was made with `max_cost=1`), for at most as many evaluations again; parts of the posterior that it has
+    missed are among the warnings.
 
-    Raises
-    ------
-    ParameterError
-        If an option is out of range, the run has other parameters, or the prior has neither `to_unit_cube` nor
-        coordinates.
-    NotConvergedError
-        If the likelihood fails.
+    Raises ParameterError if an option is out of range, the run has other parameters, or the prior has neither
+    `to_unit_cube` nor coordinates; NotConvergedError if the likelihood fails.
     """
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)
@@ -133,25 +123,10 @@ def update(
     reading. Where the new readings are surprising (too few effective samples or too heavy a tail of the weights),
     `fall_back` starts from scratch.
 
-    Parameters
-    ----------
-    previous
-        Posterior of the same parameters given fewer readings.
-    problem
-        Prior, and likelihood of all readings.
-    fall_back
-        Function that solves the new problem, for instance `lambda: run(problem, rng=rng)`; then its samples are
-        returned, and its result as `run`.
-    n_draws
-        Number of draws, 100 or more; half as many are pilots, and each old sample, at most 1000, is evaluated once.
-
-    Raises
-    ------
-    ParameterError
-        If `previous` has other parameters, an option is out of range, or the prior has neither `to_unit_cube` nor
-        coordinates.
-    NotConvergedError
-        If the likelihood fails.
+    `previous` is the posterior of the same parameters given fewer readings; `problem` has the prior, and the likelihood
+    of all readings; `fall_back` solves the new problem, as `lambda: run(problem, rng=rng)`: then its samples are
+    returned, and its result as `run`. `n_draws`: number of draws, 100 or more; half as many are pilots, and each old
+    sample, at most 1000, is evaluated once. Errors as of `refine`.
     """
     require_rng(rng)
     require_callable(
@@ -190,10 +165,7 @@ def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tup
 
 
 def _inherited_warnings(found: Weighted, result: Posterior) -> tuple[str, ...]:
-    """Return the warnings of `result`, which `found` refines.
-
-    For a run also where its log Z, or that of its check, is more than four errors from that of `found`.
-    """
+    """Return the warnings of `result`; of a run also where its log Z, or its check's, is four errors from `found`'s."""
     if isinstance(result, Weighted):
         return result.warnings
     routes = [("the run", result.log_z, result.log_z_error)]
@@ -221,22 +193,21 @@ def effective_lineages(found: Posterior) -> float:
 
 def _split_off_held_out(
     found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
-) -> tuple[FloatArray, HeldOutSamples]:
+) -> tuple[FloatArray, HeldOut]:
     """Split samples at random, two to one, into those for fitting a density, by weight, and held-out ones."""
     lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
     rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
-    held = HeldOutSamples(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
+    held = x, space.leave(x)[1] + found.log_likelihood[rows], _HELD_OUT * n_lineages
     return _resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 
 def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
     """Resample for fitting a density; return distinct samples in coordinates of `space`, (n, n_params).
 
-    As many are drawn by weight as the effective sample size, at most 2000, and a third as many by the square root of
-    the weights: a proposal must have wider tails than the posterior.
+    A third as many are drawn by the square root of the weights: a proposal must have wider tails than the posterior.
     """
     weight = np.exp(log_weight - log_weight.max())
     n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))

@@ -3,22 +3,20 @@
 Evidence and posterior depend only on the product of prior and likelihood, so any density may replace the prior if the
 likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835). From a density near the
 posterior there are few nats of compression, which lowers the cost and the error of a run. Live points climb to regions
-that the density undersamples, where importance sampling would depend on a few weights. A distant part of the posterior
-without any sample stays unseen.
+that the density undersamples; a distant part of the posterior without any sample stays unseen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.nested.problem import Samplable, Space, unbounded_space_of
+from probewise.nested.problem import Samplable, unbounded_space_of
 from probewise.nested.weights import student_t_log_norm
 from probewise.priors import Prior
 
@@ -45,32 +43,26 @@ class Repartitioned:
         return np.asarray(self.problem.log_likelihood(theta) + log_prior_ratio)
 
 
-@dataclass(frozen=True, eq=False)
 class _PriorNearPosterior:
     """A prior near the posterior: a mixture of Student t products in unbounded coordinates x, those of `space`.
 
-    Part k has the probability `share` (n_parts,); in it x = `center` (n_parts, n_params) + `root` (n_parts, n_params,
-    n_params) e, where the coordinates e along its principal axes are independent Student t of 5 degrees of freedom.
-    Chains move in the coordinates e of the first part. `original`: the problem's prior.
+    There is a part for each of some groups of points. In it x = `center` (n_parts, n_params) + `root` (n_parts,
+    n_params, n_params) e, where the coordinates e along its principal axes are independent Student t of 5 degrees of
+    freedom. Chains move in the coordinates e of the first part. `original`: the problem's prior.
     """
 
-    original: Prior
-    space: Space
-    share: FloatArray
-    center: FloatArray
-    root: FloatArray
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.original.names
+    def __init__(self, original: Prior, groups: Sequence[FloatArray]) -> None:
+        self.original, self.names, self.space = original, original.names, unbounded_space_of(original)
+        x = [self.space.enter(each) for each in groups]
+        self.share: FloatArray = np.array([len(group) for group in x]) / sum(map(len, x))
+        self.center = np.stack([group.mean(axis=0) for group in x])
+        self.root = np.stack([covariance_root_of_points(group, _WIDENING) for group in x])
+        self.inverse_root: FloatArray = np.asarray(np.linalg.inv(self.root), dtype=np.float64)
+        self._log_dets: FloatArray = np.asarray(np.linalg.slogdet(self.root)[1], dtype=np.float64)
 
     @property
     def coordinates(self) -> _PriorNearPosterior:
         return self
-
-    @cached_property
-    def inverse_root(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(self.root))
 
     @property
     def has_invertible_axes(self) -> bool:
@@ -108,10 +100,6 @@ class _PriorNearPosterior:
         along = (student_t_log_norm(1, nu) - 0.5 * (nu + 1) * np.log1p(e**2 / nu)).sum(axis=2)
         return np.asarray(np.logaddexp.reduce(along + (np.log(self.share) - self._log_dets)[:, None], axis=0))
 
-    @cached_property
-    def _log_dets(self) -> FloatArray:
-        return np.asarray(np.linalg.slogdet(self.root)[1])
-
 
 def repartitioned(problem: Samplable, theta: FloatArray, *, peaks: Sequence[FloatArray] = ()) -> Repartitioned:
     """Repartition a problem: a prior near its posterior, for a second run that is shorter and more precise.
@@ -125,12 +113,7 @@ def repartitioned(problem: Samplable, theta: FloatArray, *, peaks: Sequence[Floa
     n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * len(problem.prior.names)
     if n_different < max(least, 1):
         raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
-    space = unbounded_space_of(problem.prior)
-    groups = [space.enter(each) for each in (theta, *peaks)]
-    share = np.array([len(group) for group in groups]) / sum(map(len, groups))
-    center = np.stack([group.mean(axis=0) for group in groups])
-    root = np.stack([covariance_root_of_points(group, _WIDENING) for group in groups])
-    return Repartitioned(problem, _PriorNearPosterior(problem.prior, space, share, center, root))
+    return Repartitioned(problem, _PriorNearPosterior(problem.prior, (theta, *peaks)))
 
 
 def covariance_root_of_points(x: FloatArray, scale: float = 1.0) -> FloatArray:

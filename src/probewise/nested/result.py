@@ -28,8 +28,8 @@ from probewise.nested.evidence import birth_rows, log_volumes
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
 _FORMAT = "nested-result/4"
-_FLOATS = ("theta", "log_likelihood", "label", "log_weight", "log_birth", "birth_label")
-_COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
+# How an array is kept, by the annotation of its field.
+_READ_ONLY: Mapping[object, Callable[[Any], NDArray[Any]]] = {"FloatArray": read_only_floats, "IntArray": frozen_int}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,9 @@ class Samples(ShowsItself):
     n_calls: int
 
     def __post_init__(self) -> None:
-        for name in ("theta", "log_likelihood", "log_weight"):
-            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+        for field in fields(self):
+            if field.type in _READ_ONLY:
+                object.__setattr__(self, field.name, _READ_ONLY[field.type](getattr(self, field.name)))
 
     @property
     @own_arithmetic
@@ -120,8 +121,8 @@ class Samples(ShowsItself):
 class Agreement:
     """A test whether independent runs of one problem agree within their errors.
 
-    `log_z` and `log_z_error` of each run; `chi_square`: sum of the squared deviations from their weighted mean, in
-    units of each run's error; `p_value`: probability of a chi-square at least as large if the errors are right.
+    `chi_square`: sum of the squared deviations of the runs' `log_z` from their weighted mean, in units of each
+    `log_z_error`; `p_value`: probability of a chi-square at least as large if the errors are right.
     """
 
     log_z: tuple[float, ...]
@@ -142,10 +143,9 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Check:
-    """A second, independent estimate of the evidence; see `probewise.nested.check`.
+    """A second, independent estimate of the evidence by a method, the `route`; see `probewise.nested.check`.
 
-    `route` is the method, in words; `log_z`, `log_z_error` are its estimate; `distance` is the run's log Z minus this
-    one, in units of the combined error; `n_calls` the likelihood evaluations used.
+    `distance` is the run's log Z minus this one, in units of the combined error.
     """
 
     route: str
@@ -211,12 +211,6 @@ class NestedResult(Samples):
     warnings: tuple[str, ...]
     agreement: Agreement | None = None
     check: Check | None = None
-
-    def __post_init__(self) -> None:
-        for name in _FLOATS:
-            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
-        for name in _COUNTS:
-            object.__setattr__(self, name, frozen_int(getattr(self, name)))
 
     @property
     def n_dead(self) -> int:
@@ -320,7 +314,7 @@ class NestedResult(Samples):
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically; FileError if it cannot be written."""
         path = checked_path("path", path)
-        arrays = {name: np.asarray(getattr(self, name)) for name in (*_FLOATS, *_COUNTS)}
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self) if f.type in _READ_ONLY}
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         head["check"] = None if self.check is None else asdict(self.check)
@@ -356,8 +350,7 @@ def archive_bytes(head: Mapping[str, object], arrays: Mapping[str, NDArray[Any]]
 def read_archive(path: Path, form: str, wanted: str, *, cure: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read the JSON object, without its "format", and the arrays of a file of `archive_bytes`.
 
-    `wanted` is, for messages, what it should be. FileError if it is missing or no such file, or its format is not
-    `form` (`cure`: the way out).
+    FileError if it is missing or not what is `wanted`, or its format is not `form` (`cure`: the way out).
     """
     try:
         # Opened here, since np.load leaves a damaged file open.

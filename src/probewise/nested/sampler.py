@@ -160,6 +160,8 @@ def run(
 ) -> NestedResult:
     """Compute the evidence and posterior samples of a problem (paper, section on SSF estimation).
 
+    A doubtful result comes with warnings, which it also stores.
+
     Parameters
     ----------
     problem
@@ -189,12 +191,11 @@ def run(
         Limit of all evaluations in units of those of the first run; 1 means no check. Else the evidence is estimated a
         second time, and the run repeated where the two disagree or a mode was lost (`probewise.nested.check`); what
         remains in doubt is a warning.
-    checkpoint
-        File to which the state is saved atomically as the run proceeds; its folder is created if missing. If the file
-        exists, the run resumes and ends bit for bit as if it had not been interrupted or killed; `rng` must be in
-        the state of the run's start, made from the same seed. `max_calls` may differ.
-    checkpoint_every_s
-        Least seconds between savings, but no less than ten times the saving time. 0: save after every round.
+    checkpoint, checkpoint_every_s
+        File to which the state is saved atomically, at most once in so many seconds and ten times the saving time (0:
+        after every round); its folder is created if missing. If the file exists, the run resumes and ends bit for bit
+        as if it had not been interrupted or killed; `rng` must be in the state of the run's start, made from the same
+        seed. `max_calls` may differ.
     executor, n_workers
         Evaluates each batch of a slow likelihood in `n_workers` parts, by default the number of processors. The result
         is the same to the last bit if a hypothesis' likelihood does not depend on its batch (for matrix products in
@@ -202,18 +203,13 @@ def run(
     return_interrupted
         Whether Ctrl-C returns the result so far, with a warning; otherwise it raises `KeyboardInterrupt`.
 
-    Returns
-    -------
-    NestedResult
-        A doubtful result comes with warnings, which it also stores.
-
     Raises
     ------
     ParameterError
         If an option is out of range.
     NotConvergedError
-        If the likelihood fails (`partial` holds the result so far, if there is one), or every
-        hypothesis drawn from the prior is impossible.
+        If the likelihood fails (`partial` holds the result so far, if there is one), or every hypothesis drawn from the
+        prior is impossible.
     FileError
         Before anything is evaluated: if the checkpoint is damaged, belongs to another problem, other settings or
         another seed, or cannot be written. If a later saving fails, the run goes on with a warning.
@@ -268,12 +264,10 @@ def least_live(n_params: int) -> int:
 def replace_worst_live_points(
     live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
 ) -> tuple[LivePoints, LivePoints, Tally]:
-    """Replace the `n_replaced` worst live points by new ones above the best of the replaced.
+    """Replace the `n_replaced` worst live points by new ones above the best of the replaced, drawn together.
 
-    Return the new live points, the dead ones, worst first, and the statistics of the move.
-
-    The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is counted
-    exactly; the new points are drawn together.
+    Return the new live points, the dead ones, worst first, and the statistics of the move. The points die one after
+    another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is counted exactly.
     """
     order = live.rows_by_rising_likelihood()
     doomed, survivors = live.take_rows(order[:n_replaced]), live.take_rows(order[n_replaced:])
@@ -331,11 +325,11 @@ def run_once(
     moving: Move = SliceMove() if move is None else move
     if n_params == 0:
         return _result_of_problem_without_parameters(evaluate, moving, n_live, seed_state)
-    keeper = None
+    keeper = resumed = None
     if checkpoint is not None:
         settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
         keeper = CheckpointFile(checkpoint, checkpoint_every_s, settings)
-    resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
+        resumed = keeper.resume(evaluate, moving, rng)
     now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if len(now.live) < n_live:  # a run with more calls begins anew
         keeper = None
@@ -462,22 +456,17 @@ def _initial_run_state(
     all have forgotten their few starts; where `max_calls` is too few for these chains, the draws found are all live
     points. NotConvergedError if no draw is possible.
     """
-    most = max(100 * n_live, 20_000) if max_calls is None else min(max(100 * n_live, 20_000), max_calls)
-    n_params = len(evaluate.names)
-    parts: list[Points] = []
-    found = drawn = 0
+    most = min(max(100 * n_live, 20_000), math.inf if max_calls is None else max_calls)
+    parts, found, drawn = list[Points](), 0, 0
     while found < n_live and drawn < most:
         share = max(found, 0.5) / drawn if drawn else 1.0
-        batch = min(int(1.1 * (n_live - found) / share) + 1 if drawn else n_live, 4 * n_live, most - drawn)
+        batch = int(min(1.1 * (n_live - found) / share + 1 if drawn else n_live, 4 * n_live, most - drawn))
         tried = evaluate(evaluate.space.draw(batch, rng=rng), rng)
         possible = np.flatnonzero(np.isfinite(tried.log_likelihood))
-        if found + possible.size > n_live:
-            possible = possible[: n_live - found]
-            drawn += int(possible[-1]) + 1
-        else:
-            drawn += batch
-        parts.append(tried.take_rows(possible))
-        found += possible.size
+        kept = possible[: n_live - found]
+        drawn += batch if kept.size == possible.size else int(kept[-1]) + 1
+        parts.append(tried.take_rows(kept))
+        found += kept.size
     points = Points.join(*parts)
     if found == 0:
         raise NotConvergedError(
@@ -490,9 +479,8 @@ def _initial_run_state(
         bound = Bound(-math.inf, 1.0)
         start = points.take_rows(rng.integers(found, size=n_live - found))
         # Differences of live points need two besides the start.
-        cloud = (
-            points.u if found > max(n_params, 2) else np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)])
-        )
+        few = found <= max(len(evaluate.names), 2)
+        cloud = np.concatenate([points.u, evaluate.space.draw(n_live, rng=rng)]) if few else points.u
         with contextlib.suppress(OutOfCallsError):
             more, _ = move.draw(start, bound, cloud, evaluate, rng)
             mixed, mixing = Points.join(points, more), move

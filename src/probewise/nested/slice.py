@@ -22,9 +22,9 @@ _NOTHING = 1e-13  # length of a bracket that has shrunk to a point
 class _Candidates:
     """Candidates of one round, `n_ahead` for each of the chains `rows`, chain by chain: n in all.
 
-    `chain` (n,): the chain of each; `u` (n, n_params): their places; `level` (n,): the log prior density that each must
-    exceed; `cluster` (n,): in which each lies; `possible` (n,): whether each may be accepted; `hop`, `shrunk`
-    (n_rows,): whether the chain's step is a hop, and whether its bracket has shrunk to nothing.
+    Of each, (n,): its `chain`, its place `u` (n, n_params), the log prior density that it must exceed, the cluster in
+    which it lies, and whether it may be accepted. Of each chain, (n_rows,): whether its step is a hop, and whether its
+    bracket has `shrunk` to nothing.
     """
 
     rows: IntArray
@@ -46,20 +46,35 @@ class SliceChains:
     """
 
     def __init__(self, start: Points, live: FloatArray, space: Space, *, width: float) -> None:
-        self._space, self._width = space, width
+        self._space, self._width, self._columns = space, width, list(space.periodic)
         # Lower and upper bounds of the coordinates, None without any; periodic ones are not bounded.
         low, high = space.low, space.high
-        low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
+        low[self._columns], high[self._columns] = -np.inf, np.inf
         self._walls = (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
-        self._periodic = _PeriodicAxes.cut_where_empty(space.periodic, live)
-        if self._periodic is not None:
-            live = self._periodic.wrapped_at_cut(live)
-            start = replace(start, u=self._periodic.wrapped_at_cut(start.u))
-        self._live, self._clusters = live, find_clusters(live)
-        n_chains, n_params = start.u.shape
-        self._now = start.copy()
-        self._home = self._clusters.assign(start.u)
-        self._metrics = _ClusterCovariancesByChain.from_clusters(self._clusters, start.u, self._home, live)
+        # Each periodic coordinate is cut in the middle of the widest gap between live points, so that no peak is split
+        # at the ends. A candidate is wrapped before it is evaluated, so that a step and its reverse use the same metric
+        # and clusters.
+        place = np.sort(live[:, self._columns] % 1.0, axis=0)
+        gap = np.diff(place, axis=0, append=place[:1] + 1.0)
+        widest = np.argmax(gap, axis=0), np.arange(len(self._columns))
+        self._cut = (place[widest] + 0.5 * gap[widest]) % 1.0
+        self._live, u = self._wrapped(live, self._cut), self._wrapped(start.u, self._cut)
+        self._clusters = find_clusters(self._live)
+        n_chains, n_params = u.shape
+        self._now = replace(start, u=u).copy()
+        self._home = self._clusters.assign(u)
+        # The clusters, followed by the starting cluster of each chain without the starting point: a covariance that
+        # includes the start stretches the lines through it and shrinks the others; with 150 live points in 20
+        # dimensions that alone raised log Z by more than one.
+        same = np.logical_and.reduce(
+            [ours == of_start[:, None] for ours, of_start in zip(self._live.T, u.T, strict=True)]
+        )
+        self._own_row = np.argmax(same, axis=1)  # of each start among the live points
+        self._own_home = np.where(same.any(axis=1), self._home, -1)  # a start that is not a live point is in no cluster
+        self._each = Clusters.join(self._clusters, self._clusters.home_clusters_without_each_point(u, self._home))
+        # For each of these rows and every axis the conditional sd, and the ratio of the marginal sd to it.
+        self._conditional = 1.0 / np.sqrt((self._each.inverse_root**2).sum(axis=1))
+        self._widening = np.sqrt((self._each.root**2).sum(axis=2)) / self._conditional
         self._line = np.empty((n_chains, n_params))
         self._low, self._high, self._level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         self._step = np.zeros(n_chains, dtype=np.int64)
@@ -73,9 +88,18 @@ class SliceChains:
 
     def points(self) -> Points:
         """Return where the chains are."""
-        if self._periodic is None:
-            return self._now
-        return replace(self._now, u=self._periodic.wrapped_to_unit(self._now.u))
+        return replace(self._now, u=self._wrapped(self._now.u, 0.0))
+
+    def _wrapped(self, u: FloatArray, begin: FloatArray | float) -> FloatArray:
+        """Wrap periodic coordinates into the period that begins there."""
+        if self._columns:
+            u = u.copy()
+            u[:, self._columns] = begin + (u[:, self._columns] - begin) % 1.0
+        return u
+
+    def _metric_rows(self, rows: IntArray, home: IntArray) -> IntArray:
+        """Return the row of `_each` for cluster `home` of the chains `rows`, (n,): its own where it began in it."""
+        return np.where(home == self._own_home[rows], len(self._clusters) + rows, home)
 
     def run(self, kinds: IntArray, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
         """Take the steps of the given kinds, (n_chains, n_steps), above `bound`.
@@ -102,24 +126,23 @@ class SliceChains:
     def _begin_step(self, rows: IntArray, rng: np.random.Generator) -> None:
         """Set up the line, the bracket and the level of the next step of the chains `rows`."""
         at = self._step[rows]
-        kinds, measure = self._kinds[rows, at], self._metrics.row_of_each_chain(rows, self._home[rows])
+        kinds, measure = self._kinds[rows, at], self._metric_rows(rows, self._home[rows])
         toward = np.zeros((rows.size, self._line.shape[1]))
         turned, along, follow = ((kinds == one).nonzero()[0] for one in (FRAME, AXIS, DIFFERENCE))
         if turned.size:
             frame = self._frames[rows[turned], at[turned]]
-            root = self._metrics.each.root[measure[turned]]
+            root = self._each.root[measure[turned]]
             toward[turned] = self._width * np.matmul(root, frame[:, :, None])[:, :, 0]
         if along.size:
             which = self._axes[rows[along], at[along]]
-            least = self._metrics.conditional[measure[along], which]
-            widening = self._metrics.widening[measure[along], which]
-            toward[along, which] = self._width * least * widening ** rng.random(along.size)
+            least, most = (sds[measure[along], which] for sds in (self._conditional, self._widening))
+            toward[along, which] = self._width * least * most ** rng.random(along.size)
         if follow.size:
             n = len(self._live)
             first = rng.integers(n - 1, size=follow.size)
             second = (first + rng.integers(1, n - 1, size=follow.size)) % (n - 1)
             # Counted cyclically from the row after the chain's own start, so that neither is the start.
-            behind = self._metrics.own_row[rows[follow]] + 1
+            behind = self._own_row[rows[follow]] + 1
             toward[follow] = 2.0 * (self._live[(behind + first) % n] - self._live[(behind + second) % n])
         self._line[rows] = toward
         self._low[rows], self._high[rows] = _random_bracket(self._now.u, rows, toward, self._walls, rng)
@@ -132,9 +155,7 @@ class SliceChains:
         self._low[rows], self._high[rows] = below, above
         chain = rows.repeat(n_ahead)
         ahead = self._now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * self._line.take(rows, axis=0)[:, None, :]
-        u = ahead.reshape(-1, self._line.shape[1])
-        if self._periodic is not None:
-            u = self._periodic.wrapped_at_cut(u)
+        u = self._wrapped(ahead.reshape(-1, self._line.shape[1]), self._cut)
         if self._walls is not None:
             np.clip(u, *self._walls, out=u)
         possible, hop = np.ones(chain.size, dtype=bool), np.zeros(rows.size, dtype=bool)
@@ -155,12 +176,11 @@ class SliceChains:
             first = (hopping & candidates.possible).nonzero()[0]
             who = candidates.chain[first]
             goal[first] = (self._home[who] + rng.integers(1, len(self._clusters), size=who.size)) % len(self._clusters)
-            home, there = (self._metrics.row_of_each_chain(who, k) for k in (self._home[who], goal[first]))
-            to, log_growth = self._metrics.each.map_with_log_volume_ratio(self._now.u[who], home, there)
+            home, there = (self._metric_rows(who, k) for k in (self._home[who], goal[first]))
+            to, log_growth = self._each.map_with_log_volume_ratio(self._now.u[who], home, there)
             candidates.u[first] = to
-            if self._periodic is not None:
-                # Across the cut of a circle the reverse hop would differ.
-                candidates.possible[first] &= (self._periodic.wrapped_at_cut(to) == to).all(axis=1)
+            # Across the cut of a circle the reverse hop would differ.
+            candidates.possible[first] &= (self._wrapped(to, self._cut) == to).all(axis=1)
             candidates.level[first] -= log_growth
             if self._walls is not None:
                 candidates.possible[first] &= ((to >= self._walls[0]) & (to <= self._walls[1])).all(axis=1)
@@ -232,88 +252,6 @@ def _axis_numbers_in_random_order(n_chains: int, n_steps: int, n_params: int, rn
     """Draw axis numbers, (n_chains, n_steps), in random order without repetition until all were used."""
     n_turns = -(-n_steps // n_params)
     return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
-
-
-@dataclass(frozen=True, eq=False)
-class _ClusterCovariancesByChain:
-    """The clusters' covariances for each chain: its own cluster is computed without the chain's starting point.
-
-    A covariance that includes the start stretches the lines through it and shrinks the others; with 150 live points in
-    20 dimensions that alone raised log Z by more than one.
-
-    `each`: the clusters, followed by each chain's version of its starting cluster. `conditional` and `widening`: for
-    each of these rows and every axis the conditional sd, and the ratio of the marginal sd to it.
-    """
-
-    each: Clusters
-    conditional: FloatArray
-    widening: FloatArray
-    n_clusters: int
-    own_home: IntArray
-    own_row: IntArray  # row of the start among the live points
-
-    @classmethod
-    def from_clusters(
-        cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray
-    ) -> _ClusterCovariancesByChain:
-        """Compute the covariances for chains that start at `u`, (n_chains, n_params), in clusters `home`."""
-        same = np.logical_and.reduce(
-            [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
-        )
-        # A start that is not a live point is in no cluster.
-        own_home = np.where(same.any(axis=1), home, -1)
-        each = Clusters.join(clusters, clusters.home_clusters_without_each_point(u, home))
-        conditional = 1.0 / np.sqrt((each.inverse_root**2).sum(axis=1))
-        return cls(
-            each,
-            conditional,
-            np.sqrt((each.root**2).sum(axis=2)) / conditional,
-            len(clusters),
-            own_home,
-            np.argmax(same, axis=1),
-        )
-
-    def row_of_each_chain(self, rows: IntArray, home: IntArray) -> IntArray:
-        """Return the row of `each` for cluster `home` of the chains `rows`, (n,).
-
-        For the cluster in which a chain began it is the version without the chain's start.
-        """
-        return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
-
-
-@dataclass(frozen=True, eq=False)
-class _PeriodicAxes:
-    """Periodic coordinates, each cut in the widest gap between live points, so that no peak is split at the ends.
-
-    A candidate is wrapped before it is evaluated, so that a step and its reverse use the same metric and clusters.
-    """
-
-    columns: IntArray
-    cut: FloatArray
-
-    @classmethod
-    def cut_where_empty(cls, periodic: tuple[int, ...], live: FloatArray) -> _PeriodicAxes | None:
-        """Cut each circle in the middle of the widest gap between live points, (n_live, n_params); None without any."""
-        if not periodic:
-            return None
-        columns = np.array(periodic)
-        place = np.sort(live[:, columns] % 1.0, axis=0)
-        gap = np.diff(place, axis=0, append=place[:1] + 1.0)
-        widest = np.argmax(gap, axis=0)
-        each = np.arange(len(columns))
-        return cls(columns, (place[widest, each] + 0.5 * gap[widest, each]) % 1.0)
-
-    def wrapped_at_cut(self, u: FloatArray) -> FloatArray:
-        """Wrap coordinates into the period that begins at the cut."""
-        u = u.copy()
-        u[:, self.columns] = self.cut + (u[:, self.columns] - self.cut) % 1.0
-        return u
-
-    def wrapped_to_unit(self, u: FloatArray) -> FloatArray:
-        """Wrap coordinates into 0 to 1."""
-        u = u.copy()
-        u[:, self.columns] %= 1.0
-        return u
 
 
 def _random_bracket(

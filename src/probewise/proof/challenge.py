@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import tempfile
 import time
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -39,14 +38,9 @@ from probewise.proof.refits import (
 )
 from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
-from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup, CovariateRegion, EffectSizer
-from probewise.proof.systems.cases import (
-    SystemCase,
-    SystemEffect,
-    draw_system_case,
-    system_stratum_of,
-    write_system_case,
-)
+from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup, CovariateRegion
+from probewise.proof.systems.cases import SystemCase, draw_system_case, system_stratum_of, write_system_case
+from probewise.proof.systems.forms import SystemEffect
 from probewise.proof.tables import HONEST_NATS, NOISE, names_in_label
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
@@ -59,6 +53,7 @@ from probewise.world.world import World
 
 __all__ = ["challenge", "run_case"]
 
+Hidden = TypeVar("Hidden", HiddenEffect, SystemEffect)
 _RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
@@ -123,13 +118,11 @@ def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
 def log_densities_of_scans(
     case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Return the log predictive density of each held-out scan under up to four models, in nats, summed over readings.
+    """Return the log predictive density of each held-out scan, by its name, under up to four models, by name, in nats.
 
     "null" and "repaired" are the diagnosis's models without effects and with those found. "right", if all concealed
     effects are in the vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the
     same readings. "true" is an upper limit (exact for white noise): it knows the noise-free readings and the noise sd.
-
-    Returns values by name of the scan ("angle", "pattern", "direction"), then of the model.
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
@@ -187,14 +180,27 @@ def run_case(task: Task, rounds: int = 1) -> dict[str, Any]:
 
     In more than one of `rounds`, take the advised readings after each; the result is then a `results.ROUNDS_CASE`.
     """
-    return _result_or_failure(stratum_of(task.number)[0], _parts_of_result(task, rounds))
+
+    def parts() -> Iterator[dict[str, Any]]:
+        refit = NullRefit()
+        case = draw_case(task.seed, task.number, norm_after_refit=refit)
+        yield _truth_result(case, refit)
+        yield _diagnosis_result(case, task) if rounds == 1 else _investigation_result(case, task, rounds)
+
+    return _result_or_failure(stratum_of(task.number)[0], parts())
 
 
-def _parts_of_result(task: Task, rounds: int) -> Iterator[dict[str, Any]]:
-    refit = NullRefit()
-    case = draw_case(task.seed, task.number, norm_after_refit=refit)
-    yield _truth_result(case, refit)
-    yield _diagnosis_result(case, task) if rounds == 1 else _investigation_result(case, task, rounds)
+@own_arithmetic
+def run_system_case(task: Task) -> dict[str, Any]:
+    """Draw a case and diagnose it from its files alone; return a `results.SYSTEM_CASE`, or what failed."""
+
+    def parts() -> Iterator[dict[str, Any]]:
+        refit = SystemRefit()
+        case = draw_system_case(task.seed, task.number, after_refit=refit)
+        yield _system_truth_result(case, refit)
+        yield _system_diagnosis_result(case, task, refit)
+
+    return _result_or_failure(system_stratum_of(task.number)[0], parts())
 
 
 def _result_or_failure(stratum: Stratum, parts: Iterator[dict[str, Any]]) -> dict[str, Any]:
@@ -211,8 +217,33 @@ def _result_or_failure(stratum: Stratum, parts: Iterator[dict[str, Any]]) -> dic
     return result
 
 
+def _hidden_result(
+    effect: HiddenEffect | SystemEffect, cosines: Mapping[str, float], on_noise: bool = False
+) -> dict[str, Any]:
+    return {
+        "name": effect.name,
+        "size_lambda": effect.size_lambda,
+        "on_noise": on_noise,
+        "in_vocabulary": effect.in_vocabulary,
+        "shows_in": list(effect.covariates),
+        "cosines": cosines,
+    }
+
+
 def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
-    plain = replace(case.world, concealed=(), step=None)
+    setup = CleanSetup(case.recording.plan, replace(case.world, concealed=(), step=None), refit)
+    hidden = []
+    for one in case.hidden:
+        # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
+        on_noise = one.effect.disturbs or one.name == "quantisation"
+        changed = None if on_noise else setup.recording_with_effects(one.effect)
+        like = {} if changed is None else cosines_with_vocabulary(refit, setup.clean_recording, changed)
+        hidden.append(_hidden_result(one, {name: rho for name, rho in like.items() if rho > _LEAST_COSINE}, on_noise))
+    if len(hidden) == 2:  # the size of each, in sds, when the other is in the model
+        both = setup.recording_with_effects(*(one.effect for one in case.hidden))
+        left = residual_norms_with_one_named(refit, setup.clean_recording, both, [one.name for one in case.hidden])
+        for own, other in zip(hidden, reversed(hidden), strict=True):
+            own["size_beside"] = left[other["name"]] / case.world.noise_sd
     return {
         "plan": case.plan,
         "ssf": case.ssf,
@@ -220,39 +251,9 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
         "noise_model": case.noise_model,
         "readings": len(case.recording),
         "truth": list(case.combination),
-        "hidden": _effect_results(case.hidden, EffectSizer(CleanSetup(case.recording.plan, plain), refit), refit),
+        "hidden": hidden,
         "alias": case.alias,
         "cosine": case.cosine,
-    }
-
-
-def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
-    """Return one dict per effect; in a pair with "size_beside", its size in sds when the other is in the model."""
-    each = [_effect_result(one, sizer, refit) for one in hidden]
-    if len(hidden) == 2:
-        both = sizer.recording_with_effects(*(one.effect for one in hidden))
-        left = residual_norms_with_one_named(refit, sizer.clean_recording, both, [one.name for one in hidden])
-        for own, other in zip(each, reversed(each), strict=True):
-            own["size_beside"] = left[other["name"]] / sizer.setup.world.noise_sd
-    return each
-
-
-def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
-    """Return an effect as a dict; "cosines" are those above 0.5 with effects of the vocabulary, by name."""
-    # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
-    on_noise = hidden.effect.disturbs or hidden.name == "quantisation"
-    like = (
-        {}
-        if on_noise
-        else cosines_with_vocabulary(refit, sizer.clean_recording, sizer.recording_with_effects(hidden.effect))
-    )
-    return {
-        "name": hidden.name,
-        "size_lambda": hidden.size_lambda,
-        "on_noise": on_noise,
-        "in_vocabulary": hidden.in_vocabulary,
-        "shows_in": list(hidden.residual_covariates),
-        "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
     }
 
 
@@ -261,19 +262,24 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     begun_s = time.process_time()
     diagnosis = diagnose(case.recording, rng=blind)
     cpu_s = time.process_time() - begun_s
-    found = {effect.name: effect for effect in diagnosis.effects}
-    named = [h for h in case.hidden if h.name in diagnosis.combination and h.name in found]
+    named = _named_effects(case.hidden, diagnosis)
     region = case.hidden[0].region if len(case.hidden) == 1 else None
     return {
         **statements_to_score(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
-        "parameters": {h.name: effect_truths_and_intervals(h.parameters, found[h.name]) for h in named},
+        "parameters": {h.name: effect_truths_and_intervals(h.effect.parameters, found) for h, found in named},
         "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
         "held_out": log_densities_of_scans(case, diagnosis, rng=files),
         "settled": _result_after_advice(case, diagnosis, later) if case.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }
+
+
+def _named_effects(hidden: Iterable[Hidden], diagnosis: Diagnosis) -> list[tuple[Hidden, EffectFound]]:
+    """Return the concealed effects that a diagnosis names, each with what was found."""
+    found = {effect.name: effect for effect in diagnosis.effects if effect.name in diagnosis.combination}
+    return [(one, found[one.name]) for one in hidden if one.name in found]
 
 
 def _investigation_result(case: Case, task: Task, rounds: int) -> dict[str, Any]:
@@ -305,8 +311,7 @@ def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
 
 def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
     """Diagnose the recording together with simulated readings of the advised plan; None if none was advised."""
-    asked = diagnosis.next_measurement
-    if asked is None:
+    if (asked := diagnosis.next_measurement) is None:
         return None
     more = case.world.simulate(asked.plan, rng=rng)
     return {"readings": len(more), **statements_to_score(diagnose([case.recording, more], rng=rng))}
@@ -322,7 +327,8 @@ def challenge(
     """
     settings = {"challenge": __version__, "seed": seed} | ({"of": of} if of else {})
     schema = _RESULTS.get(of, ROUNDS_CASE)
-    return Campaign(work, [Task(seed, n) for n in numbers], settings, partial(misfit_of_case, schema=schema), "cases")
+    tasks = {task.key: task for task in (Task(seed, n) for n in numbers)}
+    return Campaign(work, tasks, settings, partial(misfit_of_case, schema=schema), "cases")
 
 
 _N_SAMPLES = 200
@@ -332,13 +338,10 @@ _N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the densi
 def log_densities_of_runs(
     case: SystemCase, diagnosis: Diagnosis, later: RunTable, refit: SystemRefit, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Return the log predictive density of each held-out run under up to four models, in nats, summed over readings.
+    """Return as `log_densities_of_scans` for the held-out runs "inside" the range of the recorded ones and "beyond" it.
 
-    "null" and "repaired" are the diagnosis's models without effects and with those found. "right" knows the concealed
-    effects: absent without effects or if the fit fails. "true" knows the noise-free reading.
-
-    Returns values by run, "inside" the range of the recorded runs and "beyond" it, then by model; not finite ones are
-    left out.
+    "right" knows the concealed effects: absent without effects or if the fit fails. "true" knows the noise-free
+    reading. What is not finite is left out.
     """
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
@@ -355,7 +358,7 @@ def log_densities_of_runs(
             *predict_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings
         )
     if case.effects:
-        with contextlib.suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
+        with suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
             scores["right"] = _log_mean_density(*_right_predictions(case, refit, rng=fitting), readings)
     run = case.drawn.table.run[rows]
     names = {case.drawn.table.n_runs - 2: "inside", case.drawn.table.n_runs - 1: "beyond"}
@@ -374,10 +377,11 @@ def _right_predictions(
     predicts. An effect's values for the held-out runs, which nobody can know, are the mean of the others.
     """
     drawn, known = case.drawn, []
-    for form, values in case.forms_with_parameters():
-        of_runs = [v for name, v in values.items() if name.startswith("values[")]
+    for effect in case.effects:
+        of_runs = [v for name, v in effect.values.items() if name.startswith("values[")]
         unseen = [f"values[{k}]" for k in (drawn.table.n_runs - 2, drawn.table.n_runs - 1)] if of_runs else []
-        known.append((form, {**values, **dict.fromkeys(unseen, float(np.mean(of_runs[:-2])) if of_runs else 0.0)}))
+        mean = float(np.mean(of_runs[:-2])) if of_runs else 0.0
+        known.append(replace(effect, values={**effect.values, **dict.fromkeys(unseen, mean)}))
     change = drawn.simulate_all_rows(known) - drawn.simulate_all_rows([])
     seen, rows, sd = drawn.diagnosed_row_numbers, drawn.held_out_row_numbers, drawn.kind.sd
     found = refit.refit(drawn, (case.readings - change)[seen])
@@ -391,12 +395,10 @@ def _right_predictions(
 def predict_runs(
     samples: ModelSamples, about: ReferenceFit, table: RunTable, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict new runs: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
+    """Predict the new runs of a table: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
 
     Parameters per run are drawn from their prior, and an effect's values per run as `predict_system` draws them.
-
-    `samples`: posterior samples of the model; `about`: the reference fit of the diagnosis, from which its effects have
-    their scales; `table`: the new runs; `rng`: random generator, for the choice of samples and for the values per run.
+    `about`: the reference fit of the diagnosis, from which its effects have their scales.
     """
     chain = cast(SystemChain, samples.chain)
     system = chain.system.with_added_runs(table)
@@ -430,23 +432,16 @@ def _log_mean_density(predicted: FloatArray, sd: FloatArray, readings: FloatArra
 _LIKELY = 0.05
 
 
-@own_arithmetic
-def run_system_case(task: Task) -> dict[str, Any]:
-    """Draw a case and diagnose it from its files alone; return a `results.SYSTEM_CASE`, or what failed."""
-    return _result_or_failure(system_stratum_of(task.number)[0], _parts_of_system_result(task))
-
-
-def _parts_of_system_result(task: Task) -> Iterator[dict[str, Any]]:
-    refit = SystemRefit()
-    case = draw_system_case(task.seed, task.number, after_refit=refit)
-    yield _system_truth_result(case, refit)
-    yield _system_diagnosis_result(case, task, refit)
-
-
 def _system_truth_result(case: SystemCase, refit: SystemRefit) -> dict[str, Any]:
-    kind = case.drawn.kind
+    kind, hidden = case.drawn.kind, []
+    for effect in case.effects:
+        rivals = rivals_with_nats(refit, case, effect)
+        # An alias's loss in nats is converted to a cosine.
+        of_alias = {name: 1 - 2 * nats / effect.size_lambda**2 for name, nats in rivals.items() if nats < HONEST_NATS}
+        like = {name: math.sqrt(max(squared, 0.0)) for name, squared in of_alias.items()}
+        shared = {name: value for name, value in effect.values.items() if not name.startswith("values[")}
+        hidden.append({**_hidden_result(effect, like), "rival_nats": dict(rivals), "parameters": shared})
     of_noise = {"white": [], "quantised": [], "t4": ["outliers"]}.get(case.noise.name, [case.noise.name])
-    names = [effect.name for effect in case.effects]
     strange = any(not effect.in_vocabulary for effect in case.effects)
     return {
         "system": kind.name,
@@ -454,25 +449,10 @@ def _system_truth_result(case: SystemCase, refit: SystemRefit) -> dict[str, Any]
         "noise_model": case.noise.name,
         "noise_text": case.noise_text,
         "readings": len(case.drawn.diagnosed_row_numbers),
-        "truth": ["unknown"] if strange else sorted([*names, *of_noise]),
-        "hidden": [_system_effect_result(effect, rivals_with_nats(refit, case, effect)) for effect in case.effects],
+        "truth": ["unknown"] if strange else sorted([*(effect.name for effect in case.effects), *of_noise]),
+        "hidden": hidden,
         "alias": None,
         "cosine": case.cosine,
-    }
-
-
-def _system_effect_result(effect: SystemEffect, rivals: Mapping[str, float]) -> dict[str, Any]:
-    """Return an effect as a dict; an alias's loss in nats is converted to a cosine, sqrt(1 - 2 nats / lambda^2)."""
-    squared, aliases = effect.size_lambda**2, {name: nats for name, nats in rivals.items() if nats < HONEST_NATS}
-    return {
-        "name": effect.name,
-        "size_lambda": effect.size_lambda,
-        "on_noise": False,
-        "in_vocabulary": effect.in_vocabulary,
-        "shows_in": list(effect.covariates),
-        "cosines": {name: math.sqrt(max(1 - 2 * nats / squared, 0.0)) for name, nats in aliases.items()},
-        "rival_nats": dict(rivals),
-        "parameters": {name: value for name, value in effect.values.items() if not name.startswith("values[")},
     }
 
 
@@ -485,23 +465,19 @@ def _system_diagnosis_result(case: SystemCase, task: Task, refit: SystemRefit) -
         begun_s = time.process_time()
         diagnosis = diagnose_system(simulator, seen, rng=blind)
         cpu_s = time.process_time() - begun_s
-    found = {effect.name: effect for effect in diagnosis.effects}
-    named = [e for e in case.effects if e.name in diagnosis.combination and e.name in found]
+    named = _named_effects(case.effects, diagnosis)
+    # Values per run by the names of the runs, as in a diagnosis.
+    of_run = {f"values[{k}]": f"values[{run}]" for k, run in enumerate(case.labels)}
+    truths = {e.name: {of_run.get(name, name): value for name, value in e.values.items()} for e, _ in named}
     return {
         **(said := statements_to_score(diagnosis)),
         "alternative_nats": nats_of_alternatives(case, said, refit),
         "where": [place.covariate for place in diagnosis.where],
-        "parameters": {e.name: effect_truths_and_intervals(_truths(e, case), found[e.name]) for e in named},
-        "formula": _has_formula(diagnosis),
+        "parameters": {e.name: effect_truths_and_intervals(truths[e.name], found) for e, found in named},
+        "formula": any(getattr(e, "expression", "") for e in getattr(diagnosis.repaired.chain, "effects", ())),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, refit, rng=later),
         "cpu_s": cpu_s,
     }
-
-
-def _truths(effect: SystemEffect, case: SystemCase) -> dict[str, Any]:
-    """Return the parameters of an effect, values per run by the names of the runs, as in a diagnosis."""
-    of_run = {f"values[{k}]": f"values[{run}]" for k, run in enumerate(case.labels)}
-    return {of_run.get(name, name): value for name, value in effect.values.items()}
 
 
 def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any], refit: SystemRefit) -> dict[str, float]:
@@ -518,8 +494,3 @@ def nats_of_alternatives(case: SystemCase, said: Mapping[str, Any], refit: Syste
     others = {tuple(sorted(set(names) - NOISE - {"unknown"})) for names in labels} - {(), own}
     nats = {"+".join(names): nats_of_alternative(refit, case, names) for names in sorted(others)}
     return {label: loss for label, loss in nats.items() if math.isfinite(loss)}
-
-
-def _has_formula(diagnosis: Diagnosis) -> bool:
-    """Return whether an effect of the diagnosis's repaired model is a formula that the diagnosis found."""
-    return any(getattr(effect, "expression", "") for effect in getattr(diagnosis.repaired.chain, "effects", ()))

@@ -19,27 +19,27 @@ import numpy as np
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole
 from probewise._version import __version__
-from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
+from probewise.arm import Pose, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
 from probewise.inference import Rounded
 from probewise.proof.campaign import Campaign, Result
-from probewise.proof.configurations import FIELD, MOST_CIRCLES, POPULATIONS, REFERENCE
-from probewise.proof.estimates import Estimate, estimated_share
+from probewise.proof.configurations import FIELD, MOST_CIRCLES, REFERENCE, SEED, true_circle
+from probewise.proof.estimates import Estimate, estimated_share, grouped
 from probewise.proof.results import CONCEALED_TRIAL, misfit
 from probewise.proof.trial import (
     BLOB,
     BRIGHT,
     DARK,
-    SEED,
     WRONG_MM,
     accuracy_measures,
+    arm_that_reads,
+    disc_of,
     experiment_of,
     footprint_pixels,
     has_reached_target,
     mixture_of,
     timed_steps,
 )
-from probewise.recordings import Disc
 from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
 from probewise.world import Blob, Concealed, World
@@ -79,8 +79,9 @@ class Conditions:
 
 
 Make: TypeAlias = Callable[[float, Conditions, np.random.Generator], Concealed | tuple[Concealed, ...]]
-Row: TypeAlias = tuple[Make, tuple[float, float, float]]
-"""What is concealed, as a function of its size; and three sizes: barely detectable, clear, gross."""
+Row: TypeAlias = tuple[Make, tuple[float, float, float]] | tuple[Make, tuple[float, float, float], str]
+"""What is concealed, as a function of its size; three sizes: barely detectable, clear, gross; and the right answers,
+if not the row's name: an effect equivalent to another circle cannot be detected."""
 
 
 def _of(kind: Callable[..., Concealed], *more: float) -> Make:
@@ -91,16 +92,16 @@ def _and_tenfold(least: float) -> tuple[float, float, float]:
     return least, 4 * least, 10 * least
 
 
-def _at_any_moment(now: Conditions, rng: np.random.Generator) -> float:
-    return float(now.each_s * rng.uniform(1, 20))
+def _step_at_any_moment(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
+    return known.ambient_step(a, float(now.each_s * rng.uniform(1, 20)))
 
 
 def _wandering_gain(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
     return strange.thermal_gain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10)))
 
 
-def _gain_and_dark_level(a: float, now: Conditions, rng: np.random.Generator) -> tuple[Concealed, ...]:
-    return known.gain_drift(a / 50, math.inf), known.ambient_step(a, -math.inf)
+def _chirp(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
+    return strange.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0)
 
 
 _W, _UNITS, _PLACES, _SHARES = FIELD.width_mm, (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4)
@@ -119,7 +120,7 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
         "halo": (_of(known.halo, 25.0), _SHARES),
         "dropouts": (_of(known.dropouts, DARK), (0.03, 0.1, 0.2)),
         "outliers": (_of(known.outliers, 12.0), (0.03, 0.1, 0.2)),
-        "gain_loss": (lambda a, now, rng: strange.gain_loss(a, now.each_s), (0.001, 0.005, 0.01)),
+        "gain_loss": (lambda a, now, rng: strange.gain_loss(a, now.each_s), (0.001, 0.005, 0.01), "gain_drift"),
         "hysteresis": (_of(known.hysteresis), _and_tenfold(1.0)),
         "lag": (_of(known.lag), (2.0, 4.0, 8.0)),
         "flicker": (_of(known.flicker, 0.37, 1.0), _UNITS),
@@ -131,22 +132,22 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
         "height_gradient": (lambda a, now, rng: known.height_gradient(a / _W), (0.5, 2.0, 5.0)),
         "albedo_patch": (_of(known.albedo_patch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
         "glint": (_of(known.glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
-        "sensor_tilt": (_of(known.sensor_tilt, 0.0), (2.0, 6.0, 12.0)),
-        "position_scale": (lambda a, now, rng: known.position_scale(a, a), (0.005, 0.02, 0.05)),
+        "sensor_tilt": (_of(known.sensor_tilt, 0.0), (2.0, 6.0, 12.0), CLEAN),
+        "position_scale": (lambda a, now, rng: known.position_scale(a, a), (0.005, 0.02, 0.05), CLEAN),
         "dark_level": (_of(known.ambient_step, -math.inf), _and_tenfold(2.0)),
         "gain": (_of(known.gain_drift, math.inf), _and_tenfold(0.05)),
         "noise_sd": (lambda a, now, rng: known.drifting_noise(1 + a, 1e-9), _and_tenfold(0.5)),
-        "play_of_axes": (lambda a, now, rng: strange.play_of_axes(a, a / 2), _PLACES),
-        "scale_of_x": (_of(known.position_scale, 0.0), (0.005, 0.02, 0.05)),
-        "step_at_any_moment": (lambda a, now, rng: known.ambient_step(a, _at_any_moment(now, rng)), (2.0, 8.0, 16.0)),
+        "play_of_axes": (lambda a, now, rng: strange.play_of_axes(a, a / 2), _PLACES, "backlash"),
+        "scale_of_x": (_of(known.position_scale, 0.0), (0.005, 0.02, 0.05), "position_scale"),
+        "step_at_any_moment": (_step_at_any_moment, (2.0, 8.0, 16.0), "ambient_step"),
     },
     "another form": {
-        "thermal_gain": (_wandering_gain, _and_tenfold(0.02)),
-        "soft_saturation": (_of(known.saturation, 10.0), (55.0, 40.0, 25.0)),
-        "dead_zone": (_of(strange.floor), _and_tenfold(0.05)),
-        "ghost": (_of(strange.ghost, 25.0, 0.0), _SHARES),
-        "stick_slip": (_of(strange.stick_slip, 60.0, 0.0), _and_tenfold(1.0)),
-        "chirp": (lambda a, now, rng: strange.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0), _UNITS),
+        "thermal_gain": (_wandering_gain, _and_tenfold(0.02), "gain_drift"),
+        "soft_saturation": (_of(known.saturation, 10.0), (55.0, 40.0, 25.0), "saturation"),
+        "dead_zone": (_of(strange.floor), _and_tenfold(0.05), "nonlinearity"),
+        "ghost": (_of(strange.ghost, 25.0, 0.0), _SHARES, "halo"),
+        "stick_slip": (_of(strange.stick_slip, 60.0, 0.0), _and_tenfold(1.0), "periodic_position_error"),
+        "chirp": (_chirp, _UNITS, "flicker"),
     },
     "in no list": {
         "bent_rail": (lambda a, now, rng: strange.bent_rail(a * (10 / _W) ** 2), _and_tenfold(2.0)),
@@ -156,33 +157,18 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
     },
     "two at once": {
         "backlash_and_step": (
-            lambda a, now, rng: (known.backlash(a), known.ambient_step(a, _at_any_moment(now, rng))),
-            _PLACES,
+            lambda a, now, rng: (known.backlash(a), _step_at_any_moment(a, now, rng)),
+            *(_PLACES, "backlash ambient_step"),
         ),
-        "gain_and_dark_level": (_gain_and_dark_level, _and_tenfold(2.0)),
+        "gain_and_dark_level": (
+            lambda a, now, rng: (known.gain_drift(a / 50, math.inf), known.ambient_step(a, -math.inf)),
+            *(_and_tenfold(2.0), "gain dark_level"),
+        ),
     },
 }
 """What is concealed in each row: as a rival of the robot has it, in another form than its, or in no list of rivals."""
 
 CONCEALED: Mapping[str, Row] = {name: row for rows in CONCEALED_BY_FORM.values() for name, row in rows.items()}
-
-NAMES: Mapping[str, tuple[str, ...]] = {
-    "": (CLEAN,),
-    **dict.fromkeys(("sensor_tilt", "position_scale"), (CLEAN,)),
-    **dict.fromkeys(("gain_loss", "thermal_gain"), ("gain_drift",)),
-    "play_of_axes": ("backlash",),
-    "scale_of_x": ("position_scale",),
-    "step_at_any_moment": ("ambient_step",),
-    "soft_saturation": ("saturation",),
-    "dead_zone": ("nonlinearity",),
-    "ghost": ("halo",),
-    "stick_slip": ("periodic_position_error",),
-    "chirp": ("flicker",),
-    "backlash_and_step": ("backlash", "ambient_step"),
-    "gain_and_dark_level": ("gain", "dark_level"),
-    **dict.fromkeys(CONCEALED_BY_FORM["in no list"], ()),
-}
-"""The right answers of a row, if not its name: an effect equivalent to another circle cannot be detected."""
 
 _IN_ARM_FRAME: Mapping[str, Callable[[float, FloatArray], FloatArray]] = {
     "sensor_tilt": lambda mm, circle: circle - np.array([mm, 0.0, 0.0]),
@@ -210,7 +196,7 @@ class ConcealedTrial:
     @property
     def circle_mm(self) -> FloatArray:
         """The true circle: x_mm, y_mm, radius_mm, (3,)."""
-        return np.asarray(POPULATIONS[REFERENCE.population].circles(self.circle + 1, seed=self.seed)[self.circle])
+        return true_circle(REFERENCE.population, self.circle, seed=self.seed)
 
     @property
     def true_circle_in_arm_frame(self) -> FloatArray:
@@ -226,7 +212,12 @@ class ConcealedTrial:
     @property
     def right_answers(self) -> tuple[str, ...]:
         """The names that a run may give: of the concealed effect or an equivalent one, or "clean"; none in no list."""
-        return NAMES.get(self.effect, (self.effect,))
+        if not self.effect:
+            return (CLEAN,)
+        if self.effect in CONCEALED_BY_FORM["in no list"]:
+            return ()
+        _, _, *names = CONCEALED[self.effect]
+        return tuple(" ".join(names or [self.effect]).split())
 
     @property
     def key(self) -> str:
@@ -238,15 +229,8 @@ class ConcealedTrial:
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     """Search for a circle with a sensor that has a concealed effect; return a `results.CONCEALED_TRIAL`."""
     experiment = replace(trial.conditions.experiment(), trust=trial.trust)
-    cpu = []
-    steps = timed_steps(
-        _arm_in_concealed_world(trial),
-        experiment,
-        seed=trial.seed,
-        circle=trial.circle,
-        max_readings=trial.max_readings,
-    )
-    for step, cpu_s in steps:
+    arm, run, cpu = _arm_in_concealed_world(trial), {"seed": trial.seed, "circle": trial.circle}, []
+    for step, cpu_s in timed_steps(arm, experiment, **run, max_readings=trial.max_readings):
         last = step
         cpu.append(cpu_s)
     left_out = left_out_after_step(last, trial.trust)
@@ -266,7 +250,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     now = trial.conditions
     made: Any = ()
     if trial.effect:
-        make, sizes = CONCEALED[trial.effect]
+        make, sizes, *_ = CONCEALED[trial.effect]
         made = make(sizes[trial.size], now, np.random.default_rng([trial.seed, trial.circle, trial.size, 2]))
     world = World(
         footprint_pixels(now.blobs),
@@ -276,8 +260,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         step=now.step,
         concealed=made if isinstance(made, tuple) else (made,),
     )
-    x_mm, y_mm, radius_mm = trial.circle_mm.tolist()
-    disc = Disc((x_mm, y_mm), radius_mm)
+    disc = disc_of(trial.circle_mm)
     came: list[tuple[Pose, float, tuple[float, float]]] = []
 
     def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
@@ -291,8 +274,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
         rng = np.random.default_rng([trial.seed, trial.circle, len(came) - 1])
         return world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng, direction=direction)
 
-    everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
-    return SimulatedArm(light_reading, reach=everywhere, speed=Speed(500.0, now.each_s - _MOVE_S), scale=None)
+    return arm_that_reads(light_reading, speed=Speed(500.0, now.each_s - _MOVE_S))
 
 
 def concealed_study(
@@ -324,7 +306,8 @@ def concealed_study(
     ]
     settings = {"concealed": __version__, "max_readings": max_readings, "seed": seed}
     settings |= {"varied": True} if varied else {}
-    return Campaign(run_concealed_trial, trials, settings, partial(misfit, schema=CONCEALED_TRIAL))
+    tasks = {trial.key: trial for trial in trials}
+    return Campaign(run_concealed_trial, tasks, settings, partial(misfit, schema=CONCEALED_TRIAL))
 
 
 @dataclass(frozen=True)
@@ -371,42 +354,36 @@ def concealed_forms(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedR
 def _summaries(
     results: Mapping[ConcealedTrial, Result], row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]]
 ) -> list[ConcealedRow]:
-    rows: dict[tuple[str, float | None, float], list[tuple[tuple[str, ...], Result]]] = {}
-    for trial, result in results.items():
-        rows.setdefault(row_of(trial), []).append((trial.right_answers, result))
-    return [_summary_row(*key, runs) for key, runs in rows.items()]
-
-
-def _summary_row(
-    concealed: str, size: float | None, trust: float, runs: list[tuple[tuple[str, ...], Result]]
-) -> ConcealedRow:
-    found = [run for _, run in runs]
-    readings, cpu_s = [run["readings"] for run in found], np.array([run["cpu_s"] for run in found])
-    return ConcealedRow(
-        concealed,
-        size,
-        trust,
-        runs=len(found),
-        readings=float(np.median(readings)),
-        mean_readings=round(float(np.mean(readings)), 1),
-        reached=estimated_share([run["known"] for run in found]),
-        intervals_hold=estimated_share([hit for run in found for hit in run["held"]]),
-        sure_and_wrong=estimated_share([run["known"] and run["error_mm"] > WRONG_MM for run in found]),
-        noticed=estimated_share([run["noticed"] for run in found]),
-        in_credible_set=estimated_share([not {*names}.isdisjoint(run["credible"]) for names, run in runs if names]),
-        names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
-        cpu_s_median=round(float(np.median(cpu_s[:, 0])), 2),
-        cpu_s_95=round(float(np.median(cpu_s[:, 1])), 2),
-    )
+    rows = []
+    for key, runs in grouped((row_of(t), (t.right_answers, run)) for t, run in results.items()).items():
+        found = [run for _, run in runs]
+        readings, cpu_s = [run["readings"] for run in found], np.median([run["cpu_s"] for run in found], axis=0)
+        right = [not {*names}.isdisjoint(run["credible"]) for names, run in runs if names]
+        row = ConcealedRow(
+            *key,
+            runs=len(found),
+            readings=float(np.median(readings)),
+            mean_readings=round(float(np.mean(readings)), 1),
+            reached=estimated_share(run["known"] for run in found),
+            intervals_hold=estimated_share(hit for run in found for hit in run["held"]),
+            sure_and_wrong=estimated_share(run["known"] and run["error_mm"] > WRONG_MM for run in found),
+            noticed=estimated_share(run["noticed"] for run in found),
+            in_credible_set=estimated_share(right),
+            names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
+            cpu_s_median=round(float(cpu_s[0]), 2),
+            cpu_s_95=round(float(cpu_s[1]), 2),
+        )
+        rows.append(row)
+    return rows
 
 
 def concealed_csv(rows: Sequence[ConcealedRow]) -> str:
     """Return rows as CSV text: shares with their intervals as text."""
+
+    def cell(value: object) -> object:
+        if isinstance(value, Estimate):
+            return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})" if value.n else ""
+        return "" if value is None else value
+
     names = [column.name for column in fields(ConcealedRow)]
-    return csv_text_of_rows(names, ([_csv_cell(getattr(row, name)) for name in names] for row in rows))
-
-
-def _csv_cell(value: object) -> object:
-    if isinstance(value, Estimate):
-        return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})" if value.n else ""
-    return "" if value is None else value
+    return csv_text_of_rows(names, ([cell(getattr(row, name)) for name in names] for row in rows))

@@ -18,31 +18,19 @@ from probewise.scene import Circle, Field
 FIELD = Field()
 MOST_CIRCLES = 10_000
 """Largest number of circles of a row: a month of processor time, whose tasks are listed in memory."""
-_SEED = 2013
+SEED = 2013
+
+POPULATIONS: Mapping[str, Circle] = {
+    "anywhere": Circle(FIELD, (20.0, 150.0)),
+    "inside": Circle(FIELD, (50.0, 150.0), inside=True),
+}
+"""Named distributions of circles, which are also the robot's priors."""
 
 
-@dataclass(frozen=True)
-class Population:
-    """A named distribution of circles, which is also the robot's prior."""
-
-    name: str
-    shape: Circle
-
-    def circles(self, n: int, *, seed: int = _SEED) -> FloatArray:
-        """Return the first `n` circles of a seed: rows (x_mm, y_mm, radius_mm), (n, 3)."""
-        return np.asarray(self.shape.prior.from_unit_cube(np.random.default_rng(seed).random((n, 3))))
-
-
-_POPULATIONS = (
-    Population("anywhere", Circle(FIELD, (20.0, 150.0))),
-    Population("inside", Circle(FIELD, (50.0, 150.0), inside=True)),
-)
-POPULATIONS: Mapping[str, Population] = {p.name: p for p in _POPULATIONS}
-
-
-def noise_of_run_in_sds(circle: int, n: int) -> FloatArray:
-    """Return the noise of the first `n` readings over a circle, in units of its sd, (n,); the same in all rows."""
-    return np.random.default_rng([circle, 99]).standard_normal(n)
+def true_circle(population: str, number: int, *, seed: int = SEED) -> FloatArray:
+    """Return a circle of a population, by its number from 0: x_mm, y_mm, radius_mm, (3,)."""
+    cube = np.random.default_rng(seed).random((number + 1, 3))
+    return np.asarray(POPULATIONS[population].prior.from_unit_cube(cube)[number])
 
 
 _IN_BATCHES = ("finishing", "information")
@@ -72,13 +60,8 @@ class SearchConfiguration:
     nested_stop: NestedStop = "change"
 
     def __post_init__(self) -> None:
-        choices = {
-            "population": POPULATIONS,
-            "model": ("ssf", "naive"),
-            "method": get_args(MethodName),
-            "nested_stop": NESTED_STOP,
-        }
-        for name, allowed in choices.items():
+        choices = {"population": POPULATIONS, "model": ("ssf", "naive"), "method": get_args(MethodName)}
+        for name, allowed in {**choices, "nested_stop": NESTED_STOP}.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), " or ".join(allowed))
         utility_named(self.utility)
         for name in ("noise_sd", "width"):
@@ -108,8 +91,10 @@ class SearchConfiguration:
             words.append(self.utility)
         if self.noise_sd != REFERENCE.noise_sd:
             words.append(f"noise {_exact_number_text(self.noise_sd)}")
-        if self.width != REFERENCE.width:
-            words.append(_ssf_width_in_words(self.width))
+        if self.width != round(self.width, 2):
+            words.append(f"believed {float(self.width)!r} times as wide")
+        elif self.width != REFERENCE.width:
+            words.append(f"believed {abs(self.width - 1):.0%} too {'wide' if self.width > 1 else 'narrow'}")
         if self.learn_sensor:
             words.append("learning it")
         if self.batch != REFERENCE.batch:
@@ -120,13 +105,6 @@ class SearchConfiguration:
 def _exact_number_text(value: float) -> str:
     """Return a number as text: six digits if they are exact, otherwise all."""
     return text if float(text := f"{value:g}") == value else repr(float(value))
-
-
-def _ssf_width_in_words(width: float) -> str:
-    """Describe a wrong width: in whole percent if possible, otherwise as a factor."""
-    if width != round(width, 2):
-        return f"believed {float(width)!r} times as wide"
-    return f"believed {abs(width - 1):.0%} too {'wide' if width > 1 else 'narrow'}"
 
 
 REFERENCE = SearchConfiguration()
@@ -146,20 +124,9 @@ def paper_comparison_rows(
 def standard_rows() -> tuple[SearchConfiguration, ...]:
     """Return the rows of the published table, the reference first."""
     changes: tuple[dict[str, Any], ...] = (
-        {},
-        {"model": "naive"},
-        {"population": "anywhere"},
-        {"population": "anywhere", "model": "naive"},
-        {"utility": "information"},
-        {"utility": "entropy"},
-        {"utility": "per-second"},
-        {"utility": "about:radius_mm"},
-        {"batch": 3},
-        {"noise_sd": 0.5},
-        {"noise_sd": 2.0},
-        {"width": 1.3},
-        {"width": 0.7},
-        {"width": 1.3, "learn_sensor": True},
-        {"width": 0.7, "learn_sensor": True},
+        *({}, {"model": "naive"}, {"population": "anywhere"}, {"population": "anywhere", "model": "naive"}),
+        *({"utility": name} for name in ("information", "entropy", "per-second", "about:radius_mm")),
+        *({"batch": 3}, {"noise_sd": 0.5}, {"noise_sd": 2.0}),
+        *({"width": width, **learns} for learns in ({}, {"learn_sensor": True}) for width in (1.3, 0.7)),
     )
     return tuple(replace(REFERENCE, **change) for change in changes)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.stats import binom, binomtest, t
@@ -15,6 +16,8 @@ LEAST_FOR_MEDIAN = 6
 """Smallest number of values whose range covers the median with 95 %: 1 - 2 / 2^6 is 97 %."""
 
 _DRAWS = 400
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
@@ -29,30 +32,42 @@ class Estimate:
     high: float
     n: int = 0
 
+    @property
+    def half_width(self) -> float:
+        """Half the length of the interval."""
+        return 0.5 * (self.high - self.low)
+
     def __str__(self) -> str:
-        half = 0.5 * (self.high - self.low)
-        return f"{self.value:.3g} ± {half:.2g}"
+        return f"{self.value:.3g} ± {self.half_width:.2g}"
 
 
 _NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def estimated_share(hits: list[bool]) -> Estimate:
-    """Estimate the share of True values, with Wilson's interval (Wilson 1927)."""
-    if not hits:
+def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """Return the values of each key, in order."""
+    out: dict[K, list[V]] = {}
+    for key, value in pairs:
+        out.setdefault(key, []).append(value)
+    return out
+
+
+def estimated_share(hits: Iterable[bool]) -> Estimate:
+    """Estimate a proportion, with Wilson's interval."""
+    each = list(hits)
+    if not each:
         return _NOTHING
-    found = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
-    return Estimate(sum(hits) / len(hits), float(found.low), float(found.high), len(hits))
+    found = binomtest(sum(each), len(each)).proportion_ci(method="wilson")
+    return Estimate(sum(each) / len(each), float(found.low), float(found.high), len(each))
 
 
-def estimated_mean(values: list[float]) -> Estimate:
+def estimated_mean(values: Iterable[float]) -> Estimate:
     """Estimate a mean, with Student's interval (infinite for one value)."""
-    if not values:
+    each = list(values)
+    if not each:
         return _NOTHING
-    center, n = float(np.mean(values)), len(values)
-    if n == 1:
-        return Estimate(center, -math.inf, math.inf, n)
-    half = float(t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
+    center, n = float(np.mean(each)), len(each)
+    half = float(t.ppf(0.975, n - 1) * np.std(each, ddof=1) / math.sqrt(n)) if n > 1 else math.inf
     return Estimate(center, center - half, center + half, n)
 
 
@@ -72,12 +87,13 @@ def estimated_statistic(rows: FloatArray, statistic: Callable[[FloatArray], floa
     return Estimate(value, float(2 * value - high), float(2 * value - low), len(rows))
 
 
-def mean_with_error(values: FloatArray) -> Estimate:
+def mean_with_error(values: Iterable[float]) -> Estimate:
     """Estimate a mean with its standard error to either side; NaN for fewer than two values."""
-    if values.size < 2:
+    each = np.array([*values], dtype=np.float64)
+    if each.size < 2:
         return _NOTHING
-    mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(values.size)
-    return Estimate(mean, mean - error, mean + error, values.size)
+    mean, error = float(each.mean()), float(each.std(ddof=1)) / math.sqrt(each.size)
+    return Estimate(mean, mean - error, mean + error, each.size)
 
 
 def median_with_interval(values: FloatArray) -> Estimate:

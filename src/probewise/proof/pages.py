@@ -33,6 +33,7 @@ from probewise.proof.plots import (
 from probewise.proof.study import Summary, summaries, trials_by_row
 from probewise.proof.tables import (
     NOISE,
+    Results,
     ScoreRow,
     are_names_right,
     confusion_counts,
@@ -88,8 +89,58 @@ _INTERVALS = (
 
 def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage:
     """Return what a study comes to; `command` is the command line that made it."""
-    found = summaries(results)
-    return CampaignPage(study_csv(found), partial(study_html, results, found, command), study_sentence(found))
+    found, own, first = summaries(results), trials_by_row(results), next(iter(results))
+    sentence = study_sentence(found)
+    usual = (
+        row
+        for row in found
+        if (row.utility == REFERENCE.utility or row.method == "paper")
+        and (row.noise_sd, row.width, row.batch) == (1.0, 1.0, 1)
+    )
+    curves = {row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in own[row]] for row in usual}
+
+    def html(draw: Draw) -> str:
+        by_name = {row.name: summary for row, summary in found.items()}
+        needed = figure(
+            draw("readings needed", lambda: png(readings_needed(by_name))),
+            f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that "
+            "many.",
+        )
+        tables = (
+            table_of(_READINGS, found.items(), caption=_INTERVALS),
+            table_of(_WORTH, found.items(), caption="Information per reading, errors of the runs, and cost."),
+        )
+        sections = [Section("The table", (fragment(*tables), paragraph(_STUDY_LEGEND)))]
+        if curves:
+            drawn = figure(
+                draw("widths", lambda: png(posterior_widths_of_runs(curves))),
+                "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
+                "width.",
+            )
+            sections.insert(0, Section("How fast", (drawn,)))
+        least = lower_bound_table(found)
+        if least is not None:
+            sections.append(Section("Lower bound for any strategy", (least, paragraph(_BOUNDS))))
+        sections.append(_how_it_was_made(command))
+        return page("How many measurements?", answer=sentence, key_figure=needed, sections=sections)
+
+    return CampaignPage(study_csv(found), html, sentence)
+
+
+def _how_it_was_made(command: str) -> Section:
+    return Section("How it was made", (definition_list([("command", command)]),))
+
+
+_BOUNDS = (
+    "Bits needed over the capacity of a reading in bits. Up to the first reading on white, a reading answers yes or "
+    "no, with the largest probability of yes that any place has; after that, the capacity is the sensor's."
+)
+_STUDY_LEGEND = (
+    "± is the standard error. Every row uses the same circles and the same noise. On white: "
+    "a reading at least a tenth of the way from dark to bright. Error: of the worst length, median over the runs "
+    "that reached the target precision. Sure and wrong: stopped with a length off by more than 12 mm, with the "
+    "number that the runs' own posteriors predict and the number that chance exceeds in one study in a hundred."
+)
 
 
 def study_sentence(table: Mapping[SearchConfiguration, Summary]) -> str:
@@ -97,7 +148,7 @@ def study_sentence(table: Mapping[SearchConfiguration, Summary]) -> str:
     row, found = next(iter(table.items()))
     share = "All" if found.reached.value == 1 else f"{number_text(100 * found.reached.value, 1)} % of the"
     return (
-        f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, _half_width(found.mean))} readings "
+        f"{row.name[0].upper()}{row.name[1:]}: {value_with_error(found.mean.value, found.mean.half_width)} readings "
         f"on average, median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
     )
 
@@ -163,106 +214,44 @@ def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
         estimates = [getattr(found, name) for name in _COLUMNS]
         values = [value for e in estimates for value in (e.value, e.low, e.high)]
         values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
-        rows.append([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])
+        rows.append([row.name, found.n_runs, *map(_csv_cell, values)])
     return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
-
-
-def study_html(
-    results: Mapping[Trial, Result], found: Mapping[SearchConfiguration, Summary], command: str, draw: Draw
-) -> str:
-    """Return the HTML of a study's page from the results and their `summaries`."""
-    own, (first, *_) = trials_by_row(results), results
-    curves = {
-        row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in own[row]]
-        for row in found
-        if (row.utility == REFERENCE.utility or row.method == "paper")
-        and row.noise_sd == 1.0
-        and row.width == 1.0
-        and row.batch == 1
-    }
-    needed = figure(
-        draw("readings needed", lambda: png(readings_needed({row.name: summary for row, summary in found.items()}))),
-        f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that many.",
-    )
-    tables = (
-        table_of(_READINGS, found.items(), caption=_INTERVALS),
-        table_of(_WORTH, found.items(), caption="Information per reading, errors of the runs, and cost."),
-    )
-    sections = [Section("The table", (fragment(*tables), _study_legend()))]
-    if curves:
-        drawn = figure(
-            draw("widths", lambda: png(posterior_widths_of_runs(curves))),
-            "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
-            "width.",
-        )
-        sections.insert(0, Section("How fast", (drawn,)))
-    least = lower_bound_table(found)
-    if least is not None:
-        bounds = paragraph(
-            "Bits needed over the capacity of a reading in bits. Up to the first reading on white, a reading answers "
-            "yes or no, with the largest probability of yes that any place has; after that, the capacity is the "
-            "sensor's."
-        )
-        sections.append(Section("Lower bound for any strategy", (least, bounds)))
-    sections.append(Section("How it was made", (definition_list([("command", command)]),)))
-    return page("How many measurements?", answer=study_sentence(found), key_figure=needed, sections=sections)
-
-
-def _study_legend() -> Markup:
-    return paragraph(
-        "± is the standard error. Every row uses the same circles and the same noise. On white: "
-        "a reading at least a tenth of the way from dark to bright. Error: of the worst length, median over the runs "
-        "that reached the target precision. Sure and wrong: stopped with a length off by more than 12 mm, with the "
-        "number that the runs' own posteriors predict and the number that chance exceeds in one study in a hundred."
-    )
 
 
 def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
     """Write an estimate, times a scale, with its error; without, if that is 0 or unknown."""
-    value, half = scale * estimate.value, scale * _half_width(estimate)
+    value, half = scale * estimate.value, scale * estimate.half_width
     return value_with_error(value, half) if half > 0 else number_text(value, 1)
-
-
-def _half_width(estimate: Estimate) -> float:
-    return 0.5 * (estimate.high - estimate.low)
 
 
 def concealed_page(results: Mapping[ConcealedTrial, Result], *, command: str) -> CampaignPage:
     """Return what a study of concealed effects comes to; `command` is the command line that made it."""
     rows, forms = concealed_rows(results), concealed_forms(results)
-    return CampaignPage(concealed_csv(rows), partial(concealed_html, rows, forms, command), concealed_sentence(rows))
 
+    def sure_and_wrong(doubts: bool) -> str:
+        own = [row for row in rows if (row.trust < 1) == doubts]
+        n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in own)
+        return f"{n_wrong} of {count_with_noun(sum(row.runs for row in own), 'run')}"
 
-def concealed_sentence(rows: Sequence[ConcealedRow]) -> str:
-    """Count in one sentence the runs that ended by the robot's rule but over 12 mm off: at full trust, and at less."""
-    wrong = {
-        doubts: _sure_and_wrong_text([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)
-    }
-    return (
-        f"Sure and wrong: {wrong[False]} where the robot trusts its sensor, {wrong[True]} where it doubts it, "
-        "on the same circles with the same noise."
+    sentence = (
+        f"Sure and wrong: {sure_and_wrong(False)} where the robot trusts its sensor, {sure_and_wrong(True)} where it "
+        "doubts it, on the same circles with the same noise."
     )
 
+    def html(draw: Draw) -> str:
+        drawn = figure(
+            draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
+            "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and "
+            "wrong: the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals "
+            "promise.",
+        )
+        sections = [Section("The table", (_doubt_against_trust_table(rows), paragraph(_CONCEALED_LEGEND)))]
+        if len({row.concealed for row in forms}) > 1:
+            sections.append(Section("By form", (_doubt_against_trust_table(forms), paragraph(_FORMS))))
+        sections.append(_how_it_was_made(command))
+        return page("A robot with a concealed fault", answer=sentence, key_figure=drawn, sections=sections)
 
-def concealed_html(rows: Sequence[ConcealedRow], forms: Sequence[ConcealedRow], command: str, draw: Draw) -> str:
-    """Return the HTML of the page of a study of concealed effects, also by their `forms` if there are several."""
-    drawn = figure(
-        draw("doubt against trust", lambda: png(doubt_against_trust(rows))),
-        "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
-        "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
-    )
-    sections = [
-        Section("The table", (_doubt_against_trust_table(rows), _concealed_table_legend())),
-        Section("How it was made", (definition_list([("command", command)]),)),
-    ]
-    if len({row.concealed for row in forms}) > 1:
-        sections.insert(1, Section("By form", (_doubt_against_trust_table(forms), paragraph(_FORMS))))
-    return page("A robot with a concealed fault", answer=concealed_sentence(rows), key_figure=drawn, sections=sections)
-
-
-def _sure_and_wrong_text(rows: Sequence[ConcealedRow]) -> str:
-    n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
-    return f"{n_wrong} of {count_with_noun(sum(row.runs for row in rows), 'run')}"
+    return CampaignPage(concealed_csv(rows), html, sentence)
 
 
 _FORMS = (
@@ -295,15 +284,12 @@ def _doubt_against_trust_table(rows: Sequence[ConcealedRow]) -> Markup:
     return table_of(_PAIRS, [(row, trusting[key]) for key, row in doubting.items()])
 
 
-def _concealed_table_legend() -> Markup:
-    return paragraph(
-        "Before the bar: the robot doubts its sensor; after it: it trusts it. Noticed: something left out is the most "
-        "probable, or the readings do not fit. In the credible set: what is concealed is among the fewest explanations "
-        "that hold 95 %. Seconds of processor time. The file concealed.csv has the intervals of all shares."
-    )
+_CONCEALED_LEGEND = (
+    "Before the bar: the robot doubts its sensor; after it: it trusts it. Noticed: something left out is the most "
+    "probable, or the readings do not fit. In the credible set: what is concealed is among the fewest explanations "
+    "that hold 95 %. Seconds of processor time. The file concealed.csv has the intervals of all shares."
+)
 
-
-Results: TypeAlias = Sequence[Result]
 
 _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
 
@@ -315,9 +301,42 @@ def challenge_page(
 
     `systems`: the cases are simulators, not light sensors.
     """
-    rows = score(results)
-    page_with = partial(challenge_html, results, rows, command, systems)
-    return CampaignPage(challenge_csv(rows), page_with, challenge_sentence(rows, len(results)))
+    rows, done = score(results), [r for r in results if "failed" not in r]
+    sentence = challenge_sentence(rows, len(results))
+
+    def html(draw: Draw) -> str:
+        sections = [Section("The table", (table_of(_TARGETS, rows), paragraph(_CHALLENGE_LEGEND)))]
+        if done:
+            counts = partial(confusion_counts, done, label=name_without_target if systems else str)
+            drawn = figure(
+                draw("confusion matrix", lambda: png(confusion_matrix(*counts()))),
+                "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
+                "truth." + (" Targets are left out." if systems else ""),
+            )
+            sections.append(Section("Confusion matrix", (drawn,)))
+            each = ("Case by case", _case_table(results)) if systems else (_AT_LAMBDA_8, _effect_table(done))
+            sections.append(Section(each[0], each[1:]))
+        failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
+        if failures:
+            sections.append(Section("Cases that failed", (definition_list(failures),)))
+        honest = figure(
+            draw("reliability", lambda: png(reliability_diagram(reliability_bins(done)))),
+            "How often the most probable hypothesis was right, against the probability stated for it, with 95 % "
+            "intervals.",
+        )
+        sections.append(_how_it_was_made(command))
+        return page("How good a diagnosis is", answer=sentence, key_figure=honest, sections=sections, terms_in=honest)
+
+    return CampaignPage(challenge_csv(rows), html, sentence)
+
+
+_AT_LAMBDA_8 = "Each effect at lambda 8"
+_CHALLENGE_LEGEND = (
+    "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is undecided. "
+    "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
+    "Rows on detection and covariates count effects on the mean; those on held-out gain, cases with white noise. "
+    "Aliases are effects that a plan of this many readings could tell apart by less than 3 nats."
+)
 
 
 def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
@@ -356,42 +375,6 @@ def challenge_csv(rows: Sequence[ScoreRow]) -> str:
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
-def challenge_html(results: Results, rows: Sequence[ScoreRow], command: str, systems: bool, draw: Draw) -> str:
-    """Return the HTML of a challenge's page from the cases' results and the table's `rows`."""
-    done = [r for r in results if "failed" not in r]
-    sections = [Section("The table", (table_of(_TARGETS, rows), _challenge_legend()))]
-    if done:
-        drawn = figure(
-            draw(
-                "confusion matrix",
-                lambda: png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
-            ),
-            "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
-            "truth." + (" Targets are left out." if systems else ""),
-        )
-        sections.append(Section("Confusion matrix", (drawn,)))
-        sections.append(
-            Section("Case by case", (_case_table(results),))
-            if systems
-            else Section("Each effect at lambda 8", (_effect_table(done),))
-        )
-    failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
-    if failures:
-        sections.append(Section("Cases that failed", (definition_list(failures),)))
-    sections.append(Section("How it was made", (definition_list([("command", command)]),)))
-    honest = figure(
-        draw("reliability", lambda: png(reliability_diagram(reliability_bins(done)))),
-        "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
-    )
-    return page(
-        "How good a diagnosis is",
-        answer=challenge_sentence(rows, len(results)),
-        key_figure=honest,
-        sections=sections,
-        terms_in=honest,
-    )
-
-
 def _effect_table(done: Results) -> Markup:
     return table(
         ("effect", "cases", "detected at alpha .01", "named first"),
@@ -427,16 +410,6 @@ def _case_cells(number: int, result: Result) -> tuple[str, ...]:
         f"{probability:.2f}",
         "yes" if right else "no",
         "" if gains is None else f"{gains[0]:.1f} of {gains[1]:.1f}",
-    )
-
-
-def _challenge_legend() -> Markup:
-    return paragraph(
-        "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is "
-        "undecided. "
-        "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
-        "Rows on detection and covariates count effects on the mean; those on held-out gain, cases with white noise. "
-        "Aliases are effects that a plan of this many readings could tell apart by less than 3 nats."
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -19,7 +20,8 @@ from probewise.diagnosis.sensors import default_sensor, starts_of_one_gaussian, 
 from probewise.diagnosis.templates import EffectTemplates, templates_of_effect
 from probewise.effects import AGAIN, VOCABULARY, Effect, Extent, LightEffect
 from probewise.errors import NotConvergedError
-from probewise.proof.systems.cases import DrawnSystem, SystemCase, SystemEffect
+from probewise.proof.systems.cases import DrawnSystem, SystemCase
+from probewise.proof.systems.forms import SystemEffect
 from probewise.proof.systems.kinds import SystemKind, SystemTable
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -49,19 +51,14 @@ class NullRefit:
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:
         """Return the null model's fit to `changed`, as if the model fitted `clean` exactly."""
-        null = self.null_fit(clean)
-        return _white_noise_fit(null.model, self.without_null_residuals(clean, changed), null.z)
+        return self.rivalry(clean, changed).found
 
-    def with_one_more_gaussian(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
-        """Return as `refit`, but with one Gaussian more in the SSF than `found`, the result of `refit`."""
-        fits = _fits_with_one_more_gaussian(found, self.without_null_residuals(clean, changed), Extent.of(clean))
-        return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
-
-    def without_null_residuals(self, clean: Recording, changed: Recording) -> Recording:
-        """Return `changed` minus the null model's residuals on `clean`."""
-        readings = changed.readings.copy()
-        readings[clean.usable] -= self.null_fit(clean).residuals
-        return Recording(changed.plan, readings)
+    def rivalry(self, clean: Recording, changed: Recording) -> _Rivalry:
+        """Return that fit with the readings to which it is made: `changed` minus the null's residuals on `clean`."""
+        null, readings = self.null_fit(clean), changed.readings.copy()
+        readings[clean.usable] -= null.residuals
+        without = Recording(changed.plan, readings)
+        return _Rivalry(_white_noise_fit(null.model, without, null.z), without)
 
     def null_fit(self, clean: Recording) -> Fit:
         """Return the null model's fit to the clean readings, cached for the last recording."""
@@ -111,7 +108,10 @@ class _Rivalry:
     def __init__(self, found: Fit, readings: Recording) -> None:
         self.found, self.readings = found, readings
         self._usable = np.flatnonzero(readings.usable)
-        self._problem = Linearised.of(found, white_noise(len(self._usable)))
+
+    @cached_property
+    def _problem(self) -> Linearised:
+        return Linearised.of(self.found, white_noise(len(self._usable)))
 
     def entries(self, effect: Effect) -> tuple[EffectTemplates, IntArray, float]:
         """Return the template bank of an effect, its entries from the best to the worst, and the cosine of the best."""
@@ -147,13 +147,12 @@ def cosines_with_vocabulary(
 ) -> dict[str, float]:
     """Return the cosine of an effect's residuals, after a refit of the null model, with every named effect on the mean.
 
-    `refit`: the null model's refit; `clean`, `changed`: noise-free readings without and with the effect; `vocabulary`:
-    the effects to compare with, by name; those that cannot act in this plan or act on the noise are left out. Returns
-    cosine rho by name: the square root of the share of the residual sum of squares that the named effect, at its best
-    fit and together with the null model, explains: from a full refit if the linearised rho is above 0.8. If "halo" or
-    "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF, which is no missing physics.
+    `clean`, `changed`: noise-free readings without and with the effect. Effects that cannot act in this plan or act on
+    the noise are left out. The cosine rho is the square root of the share of the residual sum of squares that the named
+    effect, at its best fit and together with the null model, explains: from a full refit if the linearised rho is above
+    0.8. If "halo" or "edge_blur" is above 0.8, also of "ssf_order": one more Gaussian in the SSF.
     """
-    rivalry = _Rivalry(refit.refit(clean, changed), refit.without_null_residuals(clean, changed))
+    rivalry = refit.rivalry(clean, changed)
     out: dict[str, float] = {}
     for name, kind in vocabulary.items():
         effect = kind.for_extent(Extent.of(clean))
@@ -165,21 +164,20 @@ def cosines_with_vocabulary(
             rho = rivalry.cosine(by)
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
-        out["ssf_order"] = rivalry.cosine(refit.with_one_more_gaussian(rivalry.found, clean, changed))
+        more = _fits_with_one_more_gaussian(rivalry.found, rivalry.readings, Extent.of(clean))
+        out["ssf_order"] = rivalry.cosine(min(more, key=lambda f: float(np.linalg.norm(f.residuals))))
     return out
 
 
 def residual_norms_with_one_named(
     refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
 ) -> dict[str, float]:
-    """Return the norm of two effects' residuals after a fit of the null model and one of them, in reading units.
+    """Return the norm of two effects' residuals after a fit of the null model and one of them, by its name.
 
-    `refit`: the null model's refit; `clean`, `both`: noise-free readings without any effect and with both; `names`:
-    effects fitted together with the null model, one at a time. Returns norm of the residuals by name of the fitted
-    effect; divided by the noise sd, it is the size of the other effect given this one. It may be much smaller than the
-    other's size alone: a saturation can hide a stain.
+    `clean`, `both`: noise-free readings without any effect and with both. Divided by the noise sd, the norm is the size
+    of the other effect given this one. It may be much smaller than its size alone: a saturation can hide a stain.
     """
-    rivalry = _Rivalry(refit.refit(clean, both), refit.without_null_residuals(clean, both))
+    rivalry = refit.rivalry(clean, both)
     out = {}
     for name in names:
         effect = VOCABULARY[name].for_extent(Extent.of(clean))
@@ -283,7 +281,7 @@ def rivals_with_nats(refit: SystemRefit, case: SystemCase, effect: SystemEffect)
     forms = refit.forms(found)
     for other in case.effects:
         if other is not effect and other.name in forms:  # it is known from readings with it alone
-            alone = drawn.simulate_diagnosed_rows([other.form_with_parameters])
+            alone = drawn.simulate_diagnosed_rows([other])
             with_other = _best_fit(refit.refit(drawn, alone), refit.recording(alone), [forms[other.name]])
             found = refit.refit(drawn, readings, beside=with_other)
     rivalry = _Rivalry(found, refit.recording(readings))

@@ -1,7 +1,6 @@
-"""What a finished task leaves in a campaign's file: its keys and their types, as JSON has them.
+"""What a finished task leaves in a campaign's file, which may have been changed by hand: keys and their types in JSON.
 
-A file may have been changed by hand, so that its lines are compared with these schemas before anything is counted. A
-schema is a dict of keys (one that ends with "?" may be missing), {str: schema} for any keys, [schema] for a list,
+A schema is a dict of keys (one that ends with "?" may be missing), {str: schema} for any keys, [schema] for a list,
 (schema, ...) for a list of so many, (schema, None) for null too, or bool, int, float, str.
 """
 
@@ -14,35 +13,31 @@ from probewise.errors import shown
 
 Schema: TypeAlias = Any
 
-# Of the lengths: largest error, posterior probability that one is off by more than 12 mm, whether each 95 % interval
-# holds the truth.
-_RUN = {"readings": int, "error_mm": float, "chance_wrong": float, "held": (bool, bool, bool)}
-
+_RUN = {
+    "readings": int,
+    "error_mm": float,  # of the worst length
+    "chance_wrong": float,  # posterior probability that a length is off by more than 12 mm
+    "held": (bool, bool, bool),  # whether the 95 % interval of each length holds the truth
+}
 TRIAL: Schema = {
-    "reached": bool,
+    "reached": bool,  # the target precision
     **_RUN,
-    "first_white": (int, None),
+    "first_white": (int, None),  # number of the first reading on white
     "bits": float,
-    "bits_at_white": (float, None),
+    "bits_at_white": (float, None),  # gained up to it
     "arm_s": float,
-    "cpu_s": float,
-    "widest_mm": [float],
-    "p_value": (float, None),
+    "cpu_s": float,  # median of the decisions
+    "widest_mm": [float],  # posterior sd after each reading
+    "p_value": (float, None),  # null: not tested
 }
-"""One run of a study. `first_white` is the number of the first reading on white, `bits_at_white` the information gained
-up to it; the widest posterior sd after each reading. `p_value` null: not tested. `cpu_s`: median of the decisions."""
-
 CONCEALED_TRIAL: Schema = {
-    "known": bool,
+    "known": bool,  # to the target precision
     **_RUN,
-    "p_truth": float,
-    "credible": [str],
-    "noticed": bool,
-    "cpu_s": (float, float),
+    "p_truth": float,  # probability of the right answer
+    "credible": [str],  # names in the credible set
+    "noticed": bool,  # a fault is reported
+    "cpu_s": (float, float),  # median and 95 % quantile of the decisions
 }
-"""One run with a concealed effect. `known`: whether the target precision was reached; `p_truth`: probability of the
-right answer; `credible`: names in the credible set; `noticed`: whether a fault is reported; `cpu_s`: median and 95 %
-quantile of the decisions."""
 
 _FAILURE = {"kind": str, "size": float, "other_noise": bool, "failed": str, "at": str}
 _STATEMENTS = {
@@ -85,17 +80,13 @@ SENSOR_CASE: Schema = {
     "noise_level": str,
     "alias": (str, None),
     "where": [str],
-    "overlap": (float, None),
+    "overlap": (float, None),  # of the place with the region of a local effect
     "parameters": {str: _INTERVALS},
     "sensor": _INTERVALS,
     "held_out": dict.fromkeys(("angle", "pattern", "direction"), _LOG_DENSITIES),
     "settled": (_SETTLED, None),
 }
-"""A case of a sensor; `overlap` of the place with the region of a local effect, else null."""
-
-ROUNDS_CASE: Schema = {**_CASE, "rounds": [{"settled": bool, **_SETTLED}]}
-"""A case of a sensor in rounds; what is said is that of the last."""
-
+ROUNDS_CASE: Schema = {**_CASE, "rounds": [{"settled": bool, **_SETTLED}]}  # what is said is that of the last
 SYSTEM_CASE: Schema = {
     **_CASE,
     "system": str,
@@ -105,7 +96,6 @@ SYSTEM_CASE: Schema = {
     "formula": bool,
     "held_out": dict.fromkeys(("inside", "beyond"), _LOG_DENSITIES),
 }
-"""A case of a system."""
 
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 

@@ -15,7 +15,7 @@ from probewise._version import __version__
 from probewise.errors import ParameterError, require
 from probewise.proof.campaign import Campaign, Result
 from probewise.proof.configurations import MOST_CIRCLES, SearchConfiguration
-from probewise.proof.estimates import Estimate, estimated_share, mean_with_error, median_with_interval
+from probewise.proof.estimates import Estimate, estimated_share, grouped, mean_with_error, median_with_interval
 from probewise.proof.results import TRIAL, misfit
 from probewise.proof.trial import WRONG_MM, Trial, run_trial
 
@@ -62,23 +62,23 @@ def summarise(trials: Sequence[Result], *, max_readings: int) -> Summary:
     sure = [t for t in trials if t["reached"]]
     needed = np.array([t["readings"] if t["reached"] else max_readings for t in trials], dtype=np.float64)
     after = [t["readings"] - t["first_white"] for t in sure if t["first_white"] is not None]
-    met = np.array([max_readings if t["first_white"] is None else t["first_white"] for t in trials], dtype=np.float64)
+    met = [max_readings if t["first_white"] is None else t["first_white"] for t in trials]
     errors = np.array([t["error_mm"] for t in sure])
     expected = float(sum(t["chance_wrong"] for t in sure))
     return Summary(
         n_runs=len(trials),
-        reached=estimated_share([bool(t["reached"]) for t in trials]),
+        reached=estimated_share(t["reached"] for t in trials),
         mean=mean_with_error(needed),
         median=median_with_interval(needed),
         to_white=mean_with_error(met),
-        after_white=mean_with_error(np.array(after, dtype=np.float64)),
-        bits_each=mean_with_error(np.array([t["bits"] / t["readings"] for t in trials])),
+        after_white=mean_with_error(after),
+        bits_each=mean_with_error(t["bits"] / t["readings"] for t in trials),
         error_mm=float(np.median(errors)) if len(errors) else math.nan,
         wrong=int((errors > WRONG_MM).sum()),
         wrong_expected=expected,
         wrong_limit=int(poisson.isf(_CHANCE, expected)) if expected > 0 else 0,
-        held=mean_with_error(np.array([np.mean(t["held"]) for t in sure])),
-        arm_s=mean_with_error(np.array([t["arm_s"] for t in trials])),
+        held=mean_with_error(float(np.mean(t["held"])) for t in sure),
+        arm_s=mean_with_error(t["arm_s"] for t in trials),
         cpu_s=float(np.median([t["cpu_s"] for t in trials])),
     )
 
@@ -91,10 +91,7 @@ def summaries(results: Mapping[Trial, Result]) -> dict[SearchConfiguration, Summ
 
 def trials_by_row(results: Mapping[Trial, Result]) -> dict[SearchConfiguration, list[Result]]:
     """Return the results of each row, in the order of the circles."""
-    own: dict[SearchConfiguration, list[Result]] = {}
-    for trial, result in results.items():
-        own.setdefault(trial.row, []).append(result)
-    return own
+    return grouped((trial.row, result) for trial, result in results.items())
 
 
 def study(
@@ -117,4 +114,4 @@ def study(
     # Circle by circle, so that an interrupted study has equally many runs in each row.
     trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
     settings = {"study": __version__, "max_readings": max_readings}
-    return Campaign(run_trial, trials, settings, partial(misfit, schema=TRIAL))
+    return Campaign(run_trial, {trial.key: trial for trial in trials}, settings, partial(misfit, schema=TRIAL))

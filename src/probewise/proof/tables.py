@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -18,9 +17,11 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.prior_odds import Names
 from probewise.effects import VOCABULARY
 from probewise.proof.campaign import Result
-from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic
+from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic, grouped
 from probewise.proof.sensors.effects import NO_PHYSICS, SINGLES
 from probewise.proof.sensors.sensors import NOISE_NAMES
+
+Results: TypeAlias = Sequence[Result]
 
 NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation", "random_walk", "noise_per_run"}
 """Effects on the noise."""
@@ -30,18 +31,16 @@ HONEST_NATS = 3.0
 
 _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the one inside (section 4)
 
-COUNTERPARTS: Mapping[str, str] = MappingProxyType(
-    {
-        "bent_rail": "bent_rails",
-        "twisted_rail": "bent_rails",
-        "place_step": "missing_tooth",
-        "stick_slip": "stick_slip",
-        "slipped_paper": "arm_knock",
-        "ghost": "reflection",
-        "cross_talk": "polarisation",
-        "after_glow": "overshoot",
-    }
-)
+COUNTERPARTS: Mapping[str, str] = {
+    "bent_rail": "bent_rails",
+    "twisted_rail": "bent_rails",
+    "place_step": "missing_tooth",
+    "stick_slip": "stick_slip",
+    "slipped_paper": "arm_knock",
+    "ghost": "reflection",
+    "cross_talk": "polarisation",
+    "after_glow": "overshoot",
+}
 """The rare effect of a diagnosis that acts as a concealed effect out of vocabulary does."""
 
 
@@ -55,9 +54,8 @@ def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
     if hidden["in_vocabulary"]:
         squared = hidden["size_lambda"] ** 2 / 2
         return frozenset({hidden["name"], *(n for n, rho in cosines.items() if squared * (1 - rho**2) < HONEST_NATS)})
-    alike = frozenset(n for n, rho in cosines.items() if rho >= _LIKE)
-    counterpart = COUNTERPARTS.get(hidden["name"])
-    return (alike or frozenset({"unknown"})) | ({counterpart} if counterpart is not None else set())
+    alike = {name for name, rho in cosines.items() if rho >= _LIKE} or {"unknown"}
+    return frozenset(alike | {COUNTERPARTS[name] for name in [hidden["name"]] if name in COUNTERPARTS})
 
 
 def right_names_of_each_effect(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
@@ -93,31 +91,37 @@ def are_names_right(result: Result, names: Sequence[str], *, noise: bool = True)
     """
     if names_match(names, right_names_of_each_effect(result, merged=True, noise=noise)):
         return True
-    physics = sorted(set(names) - NOISE)
-    if len(physics) > len(result["hidden"]):
-        return False
+    physics, hidden = sorted(set(names) - NOISE), result["hidden"]
+    strange = (0.5 * float(h["size_lambda"]) ** 2 * (1 - _LIKE**2) for h in hidden if not h["in_vocabulary"])
     nats = result.get("alternative_nats", {}).get("+".join(physics), math.inf)
     due = set(result["truth"]) & NOISE if noise else set()
-    return bool(nats < _most_nats_of_alias(result)) and set(names) & NOISE == due
+    alias = len(physics) <= len(hidden) and nats < max(HONEST_NATS, *strange, 0.0)
+    return bool(alias and set(names) & NOISE == due)
 
 
-def _most_nats_of_alias(result: Result) -> float:
-    """Return the loss, in nats, below which another name explains a case as well as the concealed effects."""
-    sizes = [float(hidden["size_lambda"]) for hidden in result["hidden"] if not hidden["in_vocabulary"]]
-    return max(HONEST_NATS, *(0.5 * size**2 * (1 - _LIKE**2) for size in sizes), 0.0)
+def names_in_label(label: str) -> Names:
+    """Split a label of a credible set, such as "lag+backlash", into names; "clean" has none."""
+    return () if label == "clean" else tuple(label.split("+"))
 
 
 def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
     """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
+    labels = [names_in_label(label) for label in result["credible_set"]]
     if merged:
-        return any(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
+        return any(are_names_right(result, names) for names in labels)
     wanted = right_names_of_each_effect(result, merged=False)
-    return any(names_match(names_in_label(label), wanted) for label in result["credible_set"])
+    return any(names_match(names, wanted) for names in labels)
+
+
+def credible_set_size_with_aliases_merged(result: Result) -> float:
+    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
+    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
+    return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
 def has_false_extra_effect(result: Result) -> bool:
     """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
-    named = [name for name in leading_hypothesis(result, clean=True)[0] if name not in NOISE]
+    named = _without_noise(leading_hypothesis(result, clean=True)[0])
     return count_extra_names(named, right_names_of_each_effect(result, merged=True, noise=False)) > 0
 
 
@@ -142,9 +146,9 @@ def is_out_of_vocabulary(result: Result) -> bool:
 
 def is_recognised_as_out_of_vocabulary(result: Result) -> bool:
     """Return whether the verdict is unknown, or names the rare effect that acts as the concealed one does."""
-    physics = set(result["combination"]) - NOISE
     right = {COUNTERPARTS[hidden["name"]] for hidden in result["hidden"] if hidden["name"] in COUNTERPARTS}
-    return result["verdict"] == "unknown" or (result["verdict"] == "named" and bool(right) and physics == right)
+    named = result["verdict"] == "named" and bool(right) and set(result["combination"]) - NOISE == right
+    return result["verdict"] == "unknown" or named
 
 
 def acts_on_mean(result: Result) -> bool:
@@ -158,6 +162,10 @@ def leading_hypothesis(result: Result, *, clean: bool) -> tuple[Names, float]:
     return max(options, key=lambda option: option[1], default=((), 0.0))
 
 
+def _without_noise(names: Iterable[str]) -> Names:
+    return tuple(name for name in names if name not in NOISE)
+
+
 def is_leading_name_right(result: Result) -> bool:
     """Return whether the right names, or aliases, rank first among the hypotheses that are not clean.
 
@@ -169,7 +177,7 @@ def is_leading_name_right(result: Result) -> bool:
     due = is_distinguishable_from_ssf(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
-        key = tuple(name for name in names if name not in NOISE)
+        key = _without_noise(names)
         if key or not due:
             joined[key] = joined.get(key, 0.0) + p
     first = max(joined, key=lambda key: joined[key], default=())
@@ -190,19 +198,7 @@ def names_effect_on_mean(result: Result) -> bool:
 def is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect, or an alias, has a probability above 0.9; "clean" and "unknown" do not count."""
     probability, right = leading_probability_and_correctness(result)
-    names = leading_hypothesis(result, clean=True)[0]
-    return probability > 0.9 and not right and names not in ((), ("unknown",))
-
-
-def credible_set_size_with_aliases_merged(result: Result) -> float:
-    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
-    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
-    return float(len(result["credible_set"]) - max(right - 1, 0))
-
-
-def names_in_label(label: str) -> Names:
-    """Split a label of a credible set, such as "lag+backlash", into names; "clean" has none."""
-    return () if label == "clean" else tuple(label.split("+"))
+    return probability > 0.9 and not right and leading_hypothesis(result, clean=True)[0] not in ((), ("unknown",))
 
 
 _EDGES = np.linspace(0, 1, 11)
@@ -216,32 +212,26 @@ class Bin:
     right: Estimate
 
 
-def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
+def reliability_bins(results: Results) -> tuple[Bin, ...]:
     """Bin cases by the probability of their leading hypothesis into ten equal bins, ascending, without empty bins."""
     said = [leading_probability_and_correctness(result) for result in results]
-    of_case = _bin_numbers(np.array([p for p, _ in said]))
+    bins = grouped(zip(_bin_numbers(np.array([p for p, _ in said])).tolist(), said, strict=True))
     return tuple(
-        Bin(
-            float(np.mean([p for (p, _), at in zip(said, of_case, strict=True) if at == k])),
-            estimated_share([right for (_, right), at in zip(said, of_case, strict=True) if at == k]),
-        )
-        for k in np.unique(of_case)
+        Bin(float(np.mean([p for p, _ in own])), estimated_share(right for _, right in own))
+        for _, own in sorted(bins.items())
     )
 
 
-def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
+def calibration_error(results: Results) -> Estimate:
     """Estimate the expected calibration error: abs(mean stated - share right) of each bin, averaged over the cases."""
-    found = estimated_statistic(
-        np.array([leading_probability_and_correctness(result) for result in results], dtype=np.float64).reshape(-1, 2),
-        _calibration_error_of_rows,
-    )
+
+    def error_of_rows(said: FloatArray) -> float:
+        off = np.bincount(_bin_numbers(said[:, 0]), said[:, 0] - said[:, 1])
+        return float(np.abs(off).sum()) / len(said)
+
+    said = [leading_probability_and_correctness(result) for result in results]
+    found = estimated_statistic(np.array(said, dtype=np.float64).reshape(-1, 2), error_of_rows)
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
-
-
-def _calibration_error_of_rows(said: FloatArray) -> float:
-    """Return the calibration error of rows (probability, 1 if right or 0), (n, 2)."""
-    off = np.bincount(_bin_numbers(said[:, 0]), said[:, 0] - said[:, 1])
-    return float(np.abs(off).sum()) / len(said)
 
 
 def _bin_numbers(probability: FloatArray) -> IntArray:
@@ -252,40 +242,36 @@ OUTSIDE, SEVERAL = "outside", "several"
 
 
 def confusion_counts(
-    results: Sequence[Mapping[str, Any]], *, label: Callable[[str], str] = str
+    results: Results, *, label: Callable[[str], str] = str
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
     """Count answers by truth, over cases of kind "clean", "single" and "outside".
 
-    An answer that is an alias of the truth counts as the truth. Only names that occur have a row or a column. `label`
-    maps a name to that of its row and column, e.g. to merge several.
-
-    Returns truths, in the order of the vocabulary; answers; counts, (n_truths, n_answers).
+    An answer that is an alias of the truth counts as the truth. `label` maps a name to that of its row and column, e.g.
+    to merge several. Returns the truths and answers that occur, and counts, (n_truths, n_answers).
     """
     counts: Counter[tuple[str, str]] = Counter()
-    for result in results:
-        if result["kind"] in ("clean", "single", "outside"):
-            truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
-            counts[label(truth), label(_stated_name(result, truth))] += 1
-    order = ["clean", *SINGLES, OUTSIDE]
-    said_order = ["clean", *SINGLES, "unknown", SEVERAL]
-    said = {s for _, s in counts}
-    columns = tuple([s for s in said_order if s in said] + sorted(said - set(said_order)))
-    concealed = {t for t, _ in counts}
-    truths = tuple([t for t in order if t in concealed] + sorted(concealed - set(order)))
+    for result in _of(results, "clean", "single", "outside"):
+        truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
+        counts[label(truth), label(_stated_name(result, truth))] += 1
+
+    def in_order(found: set[str], order: Sequence[str]) -> tuple[str, ...]:
+        return (*(name for name in order if name in found), *sorted(found - set(order)))
+
+    columns = in_order({s for _, s in counts}, ["clean", *SINGLES, "unknown", SEVERAL])
+    truths = in_order({t for t, _ in counts}, ["clean", *SINGLES, OUTSIDE])
     return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
 
 
-def _stated_name(result: Mapping[str, Any], truth: str) -> str:
+def _stated_name(result: Result, truth: str) -> str:
     """Return the name for which a leading hypothesis counts: `truth` if right, "clean", its one name, or `SEVERAL`.
 
     If the concealed effects act on the mean, names of noise effects are ignored.
     """
-    names = leading_hypothesis(result, clean=True)[0]
-    if acts_on_mean(result):
-        names = tuple(name for name in names if name not in NOISE)
-    if truth not in ("clean", OUTSIDE) and names_match(
-        names, right_names_of_each_effect(result, merged=True, noise=not acts_on_mean(result))
-    ):
+    names, on_mean = leading_hypothesis(result, clean=True)[0], acts_on_mean(result)
+    if on_mean:
+        names = _without_noise(names)
+    wanted = right_names_of_each_effect(result, merged=True, noise=not on_mean)
+    if truth not in ("clean", OUTSIDE) and names_match(names, wanted):
         return truth
     return SEVERAL if len(names) > 1 else "".join(names) or "clean"
 
@@ -303,11 +289,10 @@ def oracle_name_rate(hidden: Hidden) -> float:
 
 def oracle_covariate_rate(hidden: Hidden) -> float:
     """Return the probability that the effect ranks before its most similar rival without any of its covariates."""
-    shown = set(hidden["shows_in"])
-    named = [name for name in hidden["cosines"] if name in VOCABULARY]
-    covariates = {name: VOCABULARY[name].covariates for name in named}
+    covariates = {name: VOCABULARY[name].covariates for name in hidden["cosines"] if name in VOCABULARY}
     covariates["ssf_order"] = ("edge_distance",)
-    return _rate_against_closest_rival(hidden, {name for name, own in covariates.items() if shown & set(own)})
+    alike = {name for name, own in covariates.items() if set(hidden["shows_in"]) & set(own)}
+    return _rate_against_closest_rival(hidden, alike)
 
 
 def oracle_credible_set_size(hidden: Hidden) -> float:
@@ -329,7 +314,7 @@ def oracle_credible_set_size(hidden: Hidden) -> float:
     return float(np.mean(inside.sum(axis=1) - np.maximum(n_right - 1, 0)))
 
 
-def readings_to_separate_alias(result: Mapping[str, Any]) -> float:
+def readings_to_separate_alias(result: Result) -> float:
     """Return how many readings of the same plan would separate a case's aliased pair by 3 nats (inf if identical)."""
     size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
     apart = size**2 * (1 - rho**2) / 2
@@ -337,9 +322,8 @@ def readings_to_separate_alias(result: Mapping[str, Any]) -> float:
 
 
 def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
-    return min(
-        (float(ndtr(d / 2)) for name, d in _distances_of_rivals(hidden).items() if name not in right), default=1.0
-    )
+    apart = (d for name, d in _distances_of_rivals(hidden).items() if name not in right)
+    return min((float(ndtr(d / 2)) for d in apart), default=1.0)
 
 
 def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
@@ -349,11 +333,8 @@ def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
     """
     if "rival_nats" in hidden:
         return {name: float(np.sqrt(2 * nats)) for name, nats in hidden["rival_nats"].items()}
-    cosines: Mapping[str, float] = hidden["cosines"]
-    size = float(hidden["size_lambda"])
-    return {
-        name: size * float(np.sqrt(max(1 - rho**2, 0.0))) for name, rho in cosines.items() if name != hidden["name"]
-    }
+    size, rivals = float(hidden["size_lambda"]), {n: r for n, r in hidden["cosines"].items() if n != hidden["name"]}
+    return {name: size * float(np.sqrt(max(1 - rho**2, 0.0))) for name, rho in rivals.items()}
 
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
@@ -392,33 +373,25 @@ class ScoreRow:
 
 
 def _share(name: str, hits: Iterable[bool], least: float = -math.inf, most: float = math.inf) -> ScoreRow:
-    return ScoreRow(name, estimated_share(list(hits)), least, most)
+    return ScoreRow(name, estimated_share(hits), least, most)
 
 
 def _mean(name: str, values: Iterable[float], least: float = -math.inf, most: float = math.inf) -> ScoreRow:
-    return ScoreRow(name, estimated_mean(list(values)), least, most)
+    return ScoreRow(name, estimated_mean(values), least, most)
+
+
+def _of(results: Iterable[Result], *kinds: str, **wanted: object) -> list[Result]:
+    """Return the results of these kinds of cases, with the wanted values of their parts."""
+    return [r for r in results if r["kind"] in kinds and all(r[name] == value for name, value in wanted.items())]
 
 
 def _rejected(results: Iterable[Result], alpha: float) -> list[bool]:
     return [r["p_value"] <= alpha for r in results]
 
 
-def _of_kind(results: Iterable[Result], *kinds: str) -> list[Result]:
-    return [r for r in results if r["kind"] in kinds]
-
-
-def _with_one_effect(results: Iterable[Result], size: float) -> list[Result]:
-    return [r for r in _of_kind(results, "single") if r["size"] == size]
-
-
-def _clean_with_white_and_other_noise(done: list[Result]) -> tuple[list[Result], list[Result]]:
-    clean = _of_kind(done, "clean")
-    return [r for r in clean if not r["other_noise"]], [r for r in clean if r["other_noise"]]
-
-
-def _alarms_by_noise(other: list[Result], most: float = math.inf) -> Iterator[ScoreRow]:
-    for model in sorted({r["noise_model"] for r in other}):
-        yield _share(f"  {model}", _rejected([r for r in other if r["noise_model"] == model], 0.05), most=most)
+def _alarms_by_noise(other: Results, most: float = math.inf) -> Iterator[ScoreRow]:
+    for model, own in sorted(grouped((r["noise_model"], r) for r in other).items()):
+        yield _share(f"  {model}", _rejected(own, 0.05), most=most)
 
 
 def _first_covariate_is_right(result: Result) -> bool:
@@ -437,14 +410,14 @@ def _unknown(results: Iterable[Result]) -> list[bool]:
     return [r["verdict"] == "unknown" for r in results]
 
 
-def _rows(results: Sequence[Result], *parts: Callable[[list[Result]], Iterator[ScoreRow]]) -> tuple[ScoreRow, ...]:
+def _rows(results: Results, *parts: Callable[[list[Result]], Iterator[ScoreRow]]) -> tuple[ScoreRow, ...]:
     """Return the rows of these parts of a table, and that of the cases that failed."""
     done = [r for r in results if "failed" not in r]
     failed = _share("cases that failed", ["failed" in r for r in results])
     return (*(row for part in parts for row in part(done)), failed)
 
 
-def score(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
+def score(results: Results) -> tuple[ScoreRow, ...]:
     """Return the rows of a challenge of the light sensor, from results of `run_case`."""
     parts = _alarms_and_detection, _names, _probabilities, _places_and_intervals, _held_out_scans
     return _rows(results, *parts, _pairs_aliases_and_unlisted, _seconds_by_plan)
@@ -456,30 +429,27 @@ def _seconds_by_plan(done: list[Result]) -> Iterator[ScoreRow]:
         yield _mean(f"processor time of a diagnosis, {plan} plan (s)", seconds, most=most)
 
 
-def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
+def detected_and_named_by_effect(results: Results, size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
     """Return by name of single effects of this size: (share detected at alpha .01, share with the right name first)."""
-    cases: dict[str, list[Result]] = {}
-    for r in _with_one_effect((r for r in results if "failed" not in r), size):
-        cases.setdefault(r["hidden"][0]["name"], []).append(r)
+    singles = _of((r for r in results if "failed" not in r), "single", size=size)
     return {
-        name: (estimated_share(_rejected(rs, 0.01)), estimated_share([is_leading_name_right(r) for r in rs]))
-        for name, rs in cases.items()
+        name: (estimated_share(_rejected(own, 0.01)), estimated_share(map(is_leading_name_right, own)))
+        for name, own in grouped((r["hidden"][0]["name"], r) for r in singles).items()
     }
 
 
 def _alarms_and_detection(done: list[Result]) -> Iterator[ScoreRow]:
-    white, other = _clean_with_white_and_other_noise(done)
+    white, other = (_of(done, "clean", other_noise=is_other) for is_other in (False, True))
     yield _share("false alarms, clean, alpha .05", _rejected(white, 0.05), 0.04, 0.06)
     yield _share("false alarms, clean, alpha .01", _rejected(white, 0.01), 0.006, 0.015)
     yield _share("false alarms, other noise, alpha .05", _rejected(other, 0.05), most=0.06)
     yield from _alarms_by_noise(other, most=0.06)
-    yield _share("physics named, clean", map(names_effect_on_mean, _of_kind(done, "clean")), most=0.005)
-    more = _of_kind(done, "ssf_order")
-    yield _share("physics named, one Gaussian more", map(names_effect_on_mean, more), most=0.01)
+    for kind, words, most in (("clean", "clean", 0.005), ("ssf_order", "one Gaussian more", 0.01)):
+        yield _share(f"physics named, {words}", map(names_effect_on_mean, _of(done, kind)), most=most)
     # The p-value does not test the noise, and one more Gaussian in the SSF imitates some effects.
     visible = [r for r in done if acts_on_mean(r) and is_distinguishable_from_ssf(r)]
     for size, least in ((5.0, 0.8), (6.0, 0.93), (8.0, 0.995)):
-        found = _rejected(_with_one_effect(visible, size), 0.01)
+        found = _rejected(_of(visible, "single", size=size), 0.01)
         yield _share(f"detection, alpha .01, lambda {size:g}", found, least)
     each = [detected for detected, _ in detected_and_named_by_effect(visible).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=estimated_share([]))
@@ -489,7 +459,7 @@ def _alarms_and_detection(done: list[Result]) -> Iterator[ScoreRow]:
 def _names(done: list[Result]) -> Iterator[ScoreRow]:
     shares = []
     for size, least in ((6.0, 0.9), (8.0, 0.97), (12.0, 0.99), (20.0, 0.995)):
-        singles = _with_one_effect(done, size)
+        singles = _of(done, "single", size=size)
         yield (row := _share(f"right name first, lambda {size:g}", map(is_leading_name_right, singles), least))
         oracle = [oracle_name_rate(r["hidden"][0]) for r in singles]
         yield _mean(f"  oracle against the hardest rival, lambda {size:g}", oracle)
@@ -510,7 +480,7 @@ def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
 def _probabilities(done: list[Result]) -> Iterator[ScoreRow]:
     yield _share("95 % credible set holds the truth", [credible_set_holds_truth(r, merged=False) for r in done], 0.95)
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
-        singles = _with_one_effect(done, size)
+        singles = _of(done, "single", size=size)
         merged = map(credible_set_size_with_aliases_merged, singles)
         oracle = [oracle_credible_set_size(r["hidden"][0]) for r in singles]
         yield _mean(f"size of the credible set, lambda {size:g}", _set_sizes(singles), most=most)
@@ -522,16 +492,13 @@ def _probabilities(done: list[Result]) -> Iterator[ScoreRow]:
 
 def _places_and_intervals(done: list[Result]) -> Iterator[ScoreRow]:
     for size, least in ((12.0, 0.8), (20.0, 0.9)):
-        overlaps = [r["overlap"] for r in _with_one_effect(done, size) if r["overlap"] is not None]
+        overlaps = [r["overlap"] for r in _of(done, "single", size=size) if r["overlap"] is not None]
         yield _mean(f"overlap of the place, lambda {size:g}", overlaps, least)
-    shown = [r for r in _with_one_effect(done, 8.0) if acts_on_mean(r)]
+    shown = [r for r in _of(done, "single", size=8.0) if acts_on_mean(r)]
     yield _share("right covariate first, lambda 8", map(_first_covariate_is_right, shown), 0.98)
     yield _mean("  oracle against the hardest rival", [oracle_covariate_rate(r["hidden"][0]) for r in shown])
-    right = [
-        r
-        for r in done
-        if names_match(r["combination"], right_names_of_each_effect(r, merged=False)) and not is_out_of_vocabulary(r)
-    ]
+    named = (r for r in done if names_match(r["combination"], right_names_of_each_effect(r, merged=False)))
+    right = [r for r in named if not is_out_of_vocabulary(r)]
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
     of_effects = (interval for r in right for effect in r["parameters"].values() for interval in effect.values())
     of_sensors = (interval for r in gaussian for interval in r["sensor"].values())
@@ -540,14 +507,14 @@ def _places_and_intervals(done: list[Result]) -> Iterator[ScoreRow]:
 
 
 def _held_out_scans(done: list[Result]) -> Iterator[ScoreRow]:
-    inside = [r for r in _of_kind(done, "single", "pair") if acts_on_mean(r)]
+    inside = [r for r in _of(done, "single", "pair") if acts_on_mean(r)]
     gains = _gains_by_scan([r for r in inside if all("right" in s for s in r["held_out"].values())], "right")
     yield ScoreRow("held-out gain, share of the right model's", estimated_statistic(gains, _ratio_of_gains), 0.98)
     for k, scan in enumerate(_SCANS):
         yield ScoreRow(f"  a new {scan}", estimated_statistic(gains[:, k], _ratio_of_gains))
     shares = {
         "  share of what the truth itself would gain": inside,
-        "  the same, outside the vocabulary": _of_kind(done, "outside"),
+        "  the same, outside the vocabulary": _of(done, "outside"),
     }
     for name, cases in shares.items():
         of_truth = _gains_by_scan([r for r in cases if r["noise_model"] == "white"], "true")
@@ -559,7 +526,7 @@ def _held_out_scans(done: list[Result]) -> Iterator[ScoreRow]:
     yield _share("  of the right model, fitted to the same", by_chance)
 
 
-def _gains_by_scan(results: Sequence[Result], best: str) -> FloatArray:
+def _gains_by_scan(results: Results, best: str) -> FloatArray:
     """Return the gains in nats over the null of the repaired model and of model `best`, (n_cases, n_scans, 2)."""
     gains = [[_summed_gains(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
@@ -576,7 +543,7 @@ def _ratio_of_gains(gains: FloatArray) -> float:
 
 
 def _pairs_aliases_and_unlisted(done: list[Result]) -> Iterator[ScoreRow]:
-    pairs, aliased = _of_kind(done, "pair"), _of_kind(done, "alias")
+    pairs, aliased = _of(done, "pair"), _of(done, "alias")
     # Each effect keeps most of its size when the other is in the model.
     shown = [r for r in pairs if all(h.get("size_beside", 0) >= _BESIDE * h["size_lambda"] for h in r["hidden"])]
     yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.95)
@@ -595,7 +562,7 @@ def _pairs_aliases_and_unlisted(done: list[Result]) -> Iterator[ScoreRow]:
     yield _mean("  readings advised, of those that repeating the plan needs", needed, most=0.25)
 
 
-def score_rounds(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
+def score_rounds(results: Results) -> tuple[ScoreRow, ...]:
     """Return the rows of a challenge in rounds: each target after the last round and the first, then costs."""
     return _rows(results, _rounds)
 
@@ -613,18 +580,17 @@ def _rounds(last: list[Result]) -> Iterator[ScoreRow]:
 
 
 def _of_round(results: list[Result]) -> Iterator[ScoreRow]:
-    small, large = _with_one_effect(results, 8.0), _with_one_effect(results, 12.0)
-    pairs, on_mean = _of_kind(results, "pair"), filter(acts_on_mean, small)
-    holds = [credible_set_holds_truth(r, merged=False) for r in results]
+    small, large = (_of(results, "single", size=size) for size in (8.0, 12.0))
+    pairs, holds = _of(results, "pair"), [credible_set_holds_truth(r, merged=False) for r in results]
     yield _share("right name first, lambda 8", map(is_leading_name_right, small), 0.985)
     yield _share("right name first, lambda 12", map(is_leading_name_right, large), 0.995)
     yield _mean("size of the credible set, lambda 8", _set_sizes(small), most=1.15)
     yield _mean("size of the credible set, lambda 12", _set_sizes(large), most=1.05)
     yield _share("95 % credible set holds the truth", holds, 0.95)
-    yield _share("detection, alpha .01, lambda 8", _rejected(on_mean, 0.01), 0.995)
+    yield _share("detection, alpha .01, lambda 8", _rejected(filter(acts_on_mean, small), 0.01), 0.995)
     yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.96)
     yield _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03)
-    yield _share("physics named, clean", map(names_effect_on_mean, _of_kind(results, "clean")), most=0.005)
+    yield _share("physics named, clean", map(names_effect_on_mean, _of(results, "clean")), most=0.005)
 
 
 def _bootstrapped_median(values: FloatArray) -> Estimate:
@@ -635,7 +601,7 @@ def _bootstrapped_median(values: FloatArray) -> Estimate:
     return Estimate(float(np.median(values)), float(low), float(high), int(values.size))
 
 
-def score_systems(results: Sequence[Result]) -> tuple[ScoreRow, ...]:
+def score_systems(results: Results) -> tuple[ScoreRow, ...]:
     """Return the rows of a challenge of systems, from results of `run_system_case`."""
     parts = _alarms_and_names_of_systems, _probabilities_and_intervals_of_systems, _held_out_runs
     return _rows(results, *parts, _unlisted_laws, _seconds_by_law)
@@ -653,7 +619,7 @@ def name_without_target(name: str) -> str:
 
 
 def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
-    white, other = _clean_with_white_and_other_noise(done)
+    white, other = (_of(done, "clean", other_noise=is_other) for is_other in (False, True))
     yield _share("false alarms, no effect, white noise, alpha .05", _rejected(white, 0.05), 0.03, 0.06)
     yield _share("false alarms, no effect, other noise, alpha .05", _rejected(other, 0.05), most=0.06)
     yield from _alarms_by_noise(other)
@@ -662,22 +628,22 @@ def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
     noise_is_right = [leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]
     yield _share("noise named right, no effect, other noise", noise_is_right)
     for size, least in ((6.0, -math.inf), (8.0, 0.9), (12.0, 0.95), (20.0, 0.98)):
-        singles = _with_one_effect(done, size)
+        singles = _of(done, "single", size=size)
         yield _share(f"right name and target first, lambda {size:g}", map(is_leading_name_right, singles), least)
         if oracle := [oracle_name_rate(hidden) for hidden in _effects_with_rivals(singles)]:
             yield _mean(f"  oracle against the hardest rival, lambda {size:g}", oracle)
-    shown, pairs = _with_one_effect(done, 12.0), _of_kind(done, "pair")
+    shown, pairs = _of(done, "single", size=12.0), _of(done, "pair")
     yield _share("right covariate first, lambda 12", map(_first_covariate_is_right, shown), 0.95)
     yield _share("two effects, lambda 12 each: both named", map(is_leading_name_right, pairs), 0.85)
 
 
-def _effects_with_rivals(singles: Sequence[Result]) -> list[Result]:
+def _effects_with_rivals(singles: Results) -> list[Result]:
     """List the concealed effects of cases with one effect whose rivals are on file."""
     return [r["hidden"][0] for r in singles if "rival_nats" in r["hidden"][0]]
 
 
 def _probabilities_and_intervals_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
-    singles = _with_one_effect(done, 12.0)
+    singles = _of(done, "single", size=12.0)
     holds, holds_in_all = ([credible_set_holds_truth(r, merged=True) for r in rs] for rs in (singles, done))
     yield _share("95 % credible set holds the truth or its alias, lambda 12", holds, 0.95)
     yield _share("  the same, all cases", holds_in_all)
@@ -706,22 +672,19 @@ def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | N
     return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
 
 
-def _all_gains(results: Iterable[Result], best: str) -> list[tuple[float, float]]:
-    return [g for g in (gains_on_held_out_runs(r, best) for r in results) if g is not None]
-
-
 def _held_out_runs(done: list[Result]) -> Iterator[ScoreRow]:
-    named = _all_gains(_of_kind(done, "single", "pair"), "right")
-    shares = np.array([repaired / right for repaired, right in named if right >= _LEAST_NATS])
+    named = (gains_on_held_out_runs(r, "right") for r in _of(done, "single", "pair"))
+    shares = np.array([gains[0] / gains[1] for gains in named if gains is not None and gains[1] >= _LEAST_NATS])
     found = estimated_statistic(shares, lambda values: float(np.median(values)))
     yield ScoreRow("held-out runs: median share of the right model's gain", found, 0.95)
-    every, clean = _all_gains(done, "true"), _all_gains(_of_kind(done, "clean"), "true")
-    yield _share("held-out worse than the null by over 3 nats", [bool(g < -3.0) for g, _ in every])
-    yield _share("  of those without an effect on the mean", [bool(g < -3.0) for g, _ in clean])
+    clean = "held-out worse than the null by over 3 nats", "  of those without an effect on the mean"
+    for name, cases in zip(clean, (done, _of(done, "clean")), strict=True):
+        each = (gains_on_held_out_runs(r, "true") for r in cases)
+        yield _share(name, [bool(gains[0] < -3.0) for gains in each if gains is not None])
 
 
 def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:
-    outside = _of_kind(done, "outside")
+    outside = _of(done, "outside")
     good = [_gains_as_much_as_true_law(r) for r in outside]
     recognised = [g or unknown for g, unknown in zip(good, _unknown(outside), strict=True)]
     name = "out of vocabulary, lambda 20: unknown, a right name, or 0.8 of the held-out gain"

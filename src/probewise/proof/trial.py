@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic
-from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm
+from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm, Speed
 from probewise.experiment import (
     AdjustedMixture,
     Experiment,
@@ -28,13 +28,12 @@ from probewise.experiment import (
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.nested import NESTED_STOP
-from probewise.proof.configurations import FIELD, POPULATIONS, SearchConfiguration, noise_of_run_in_sds
+from probewise.proof.configurations import FIELD, POPULATIONS, SEED, SearchConfiguration, true_circle
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
 from probewise.world import Blob, Spot, World, gaussian_spot
 
-SEED = 2013
 WRONG_MM = 12.0
 """Three times the 4 mm of the stopping rule: a run that ends with a larger error is sure and wrong."""
 # The study's sensor: one Gaussian, in mm and LEGO units; the world uses the same numbers, rasterised to pixels.
@@ -43,6 +42,7 @@ BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)
 _ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
 _PIXEL_MM = 0.5
 _UNROUNDED = ReadingScale(-math.inf, math.inf, None)
+_EVERYWHERE = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,14 @@ class Trial:
     @property
     def truth(self) -> FloatArray:
         """The true circle: x_mm, y_mm, radius_mm, (3,)."""
-        return np.asarray(POPULATIONS[self.row.population].circles(self.circle + 1)[self.circle])
+        return true_circle(self.row.population, self.circle)
 
 
 @lru_cache(maxsize=16)
 def experiment_of(row: SearchConfiguration) -> Experiment:
     """Build the experiment of a row; cached per process."""
-    scene = HypothesisScene(POPULATIONS[row.population].shape)
+    shape = POPULATIONS[row.population]
+    scene = HypothesisScene(shape)
     common: dict[str, Any] = {
         "noise_sd": row.noise_sd,
         "grid": Grid(FIELD.width_mm, FIELD.height_mm),
@@ -75,23 +76,17 @@ def experiment_of(row: SearchConfiguration) -> Experiment:
         "batch": row.batch,
         "method": NestedSampling(stop=NESTED_STOP[row.nested_stop]) if row.method == "paper" else None,
     }
-    shape = POPULATIONS[row.population].shape
+    levels, known = FixedLevels(DARK, BRIGHT), GaussianKnown(row.noise_sd)
     if row.model == "naive":
         likelihood = Naive(DARK, row.noise_sd, BRIGHT, row.noise_sd)
-        model = NaiveSensor(FixedLevels(DARK, BRIGHT), scene)
         # A reading on the edge fits neither level, and the naive model has no partial coverage.
-        return Experiment(shape, model, likelihood, **common, doubt_p=0.0)
+        return Experiment(shape, NaiveSensor(levels, scene), likelihood, **common, doubt_p=0.0)
     mixture = mixture_of((BLOB,), row.width)
-    if not row.learn_sensor:
-        levels = FixedLevels(DARK, BRIGHT)
-        chain = Chain(mixture, levels, scene, n_nodes=FAST_NODES)
-        if row.method == "paper":
-            return Experiment(shape, chain, student_t_likelihood(levels, None), **common)
-        return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
-    free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
-    return Experiment(
-        shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=sensor_change_prior((DARK, BRIGHT))
-    )
+    if row.learn_sensor:
+        free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
+        return Experiment(shape, free, known, **common, sensor_prior=sensor_change_prior((DARK, BRIGHT)))
+    chain = Chain(mixture, levels, scene, n_nodes=FAST_NODES)
+    return Experiment(shape, chain, student_t_likelihood(levels, None) if row.method == "paper" else known, **common)
 
 
 def mixture_of(blobs: Sequence[Blob], width: float = 1.0) -> FixedMixture:
@@ -119,12 +114,11 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     """Search for a circle; return a `results.TRIAL`."""
     experiment = experiment_of_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
-    for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):
-        last = step
+    for last, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):
         cpu.append(cpu_s)
-        widest.append(round(step.largest_sd_mm, 3))
-        if first_white is None and step.reading.value > _ON_WHITE:
-            first_white, bits_at_white = step.number, round(step.bits, 3)
+        widest.append(round(last.largest_sd_mm, 3))
+        if first_white is None and last.reading.value > _ON_WHITE:
+            first_white, bits_at_white = last.number, round(last.bits, 3)
     return {
         "reached": has_reached_target(last, experiment),
         "readings": last.number,
@@ -162,8 +156,7 @@ def has_reached_target(last: Step, experiment: Experiment) -> bool:
 
 def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
     """Return `error_mm`, `chance_wrong` and `held` of `run_trial`, from the last posterior and the true shape, (3,)."""
-    columns = experiment.shape_columns
-    theta, weight = last.posterior.theta[:, columns], last.posterior.weight
+    theta, weight = last.posterior.theta[:, experiment.shape_columns], last.posterior.weight
     held = []
     for values, true in zip(theta.T, truth, strict=True):
         below = float(weight[values < true].sum() + 0.5 * weight[values == true].sum())
@@ -175,19 +168,28 @@ def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> 
     }
 
 
+def disc_of(circle_mm: FloatArray) -> Disc:
+    """Return a circle, (3,), as a pattern."""
+    x_mm, y_mm, radius_mm = circle_mm.tolist()
+    return Disc((x_mm, y_mm), radius_mm)
+
+
+def arm_that_reads(light_reading: Callable[[Pose, float, float], float], *, speed: Speed | None = None) -> SimulatedArm:
+    """Return a simulated arm that reaches the whole grid, with the readings of this function."""
+    return SimulatedArm(light_reading, reach=_EVERYWHERE, speed=speed, scale=None)
+
+
 def arm_of(trial: Trial) -> SimulatedArm:
-    """Return a simulated arm that reaches the whole grid over the circle, with the noise that all rows share."""
+    """Return a simulated arm over the circle, with noise that depends on the circle and is the same in all rows."""
     world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
-    x_mm, y_mm, radius_mm = trial.truth.tolist()
-    disc = Disc((x_mm, y_mm), radius_mm)
-    noise, number = noise_of_run_in_sds(trial.circle, trial.max_readings), itertools.count()
+    disc, number = disc_of(trial.truth), itertools.count()
+    noise = np.random.default_rng([trial.circle, 99]).standard_normal(trial.max_readings)
 
     def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
         clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)
         return clean + trial.row.noise_sd * float(noise[next(number)])
 
-    everywhere = Reach((FIELD.width_mm, FIELD.height_mm), nearest_mm=0.0, farthest_mm=2 * FIELD.width_mm)
-    return SimulatedArm(light_reading, reach=everywhere, scale=None)
+    return arm_that_reads(light_reading)
 
 
 @lru_cache(maxsize=2)

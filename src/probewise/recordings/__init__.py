@@ -10,17 +10,7 @@ from probewise.recordings.files import (
     write_recording,
 )
 from probewise.recordings.io import parse_json_file_text, parse_strict_json, read_bytes, read_text, shipped
-from probewise.recordings.patterns import (
-    Disc,
-    HalfPlane,
-    Image,
-    Pattern,
-    Polygon,
-    Quadrant,
-    Ramp,
-    Stripes,
-    Uniform,
-)
+from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
 from probewise.recordings.prediction import Prediction, read_prediction_columns, write_prediction

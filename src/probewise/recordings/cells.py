@@ -94,11 +94,10 @@ def plain_cells(
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Rewrite columns of numbers as plain numbers: decimal commas, thousands, units, words for what is missing.
 
-    Where all numbers of a column can be read with either decimal mark, it has that of the other columns.
-
-    `odd`: cells by name of the columns that are not written as plain numbers throughout; `usual`: returns those that
-    are. Returns the rewritten columns by name, and notes on how they were read. Raises UnclearCellError if a comma may
-    be a decimal comma or separate thousands.
+    `odd` are the cells by name of the columns that are not plain numbers throughout; `usual` returns those that are.
+    Where all numbers of a column can be read with either decimal mark, it has that of the other columns. Returns the
+    rewritten columns by name, and notes on how they were read; UnclearCellError if a comma may be a decimal comma or
+    separate thousands.
     """
     columns = dict(odd)
     read = {name: found for name, cells in odd.items() if (found := _Quantities.of(cells)) is not None}

@@ -31,11 +31,9 @@ class TableLike(Protocol):
 
     def keys(self) -> Iterable[Any]:
         """Return the names of the columns."""
-        ...
 
     def __getitem__(self, name: Any, /) -> Any:
         """Values of a column."""
-        ...
 
 
 def is_commanded(name: str, controls: Sequence[str]) -> bool:
@@ -74,7 +72,7 @@ def columns_by_name(table: TableLike) -> dict[str, Any]:
 def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
     """Convert to one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
 
-    Raises ParameterError if a value is not a number, ShapeError for another shape, or a length other than n_points.
+    Raises ParameterError if a value is not a number, ShapeError for another shape or length.
     """
     out = floats(values, name)
     if out.ndim == 0 and n_points is not None:
@@ -95,8 +93,7 @@ def texts_to_numbers(values: ArrayLike) -> ArrayLike:
     if isinstance(cells, str) or cells is None or cells.ndim != 1 or cells.dtype.kind not in "OUT":
         return values
     try:
-        read = [_number_or_nan(cell) for cell in cells.tolist()]
-        return np.array(read, dtype=np.float64)
+        return np.array([_number_or_nan(cell) for cell in cells.tolist()], dtype=np.float64)
     except (ValueError, OverflowError):
         return values
 
@@ -113,10 +110,7 @@ def _number_or_nan(cell: Any) -> Any:
 
 
 def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
-    """Convert a user's covariates to arrays of one number per reading, by name; {} for None.
-
-    Raises ParameterError if they are not given by name, or if a name is a recording's own column, such as "x_mm".
-    """
+    """Convert a user's covariates, none with the name of a recording's own column, to arrays by name; {} for None."""
     if columns is None:
         return {}
     require_mapping(
@@ -129,10 +123,7 @@ def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -
 
 
 def selected_row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
-    """Convert a selection of rows (row numbers, one truth value per row, or a slice) to row numbers, (n_rows,).
-
-    Raises ParameterError if the selection is none of these, or a row does not exist.
-    """
+    """Convert a selection of rows (numbers, a truth value per row, or a slice) to row numbers, (n_rows,)."""
     allowed = f"numbers of rows in a list, up to {n_points - 1}; {n_points} truth values; or a slice"
     if isinstance(rows, slice):
         return np.arange(n_points)[rows]
@@ -151,8 +142,7 @@ def numeric_covariates_and_notes(
 ) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """Return the numeric columns by name, without a recording's own but for `session`, and notes on the others.
 
-    Raises ParameterError if a column that was commanded, `led`, `height_mm` or one of `controls`, or a `session` that
-    differs between readings, is text.
+    ParameterError if a column that was commanded, or a `session` that differs between readings, is text.
     """
     out, notes = {}, []
     for name, values in columns.items():
@@ -181,8 +171,8 @@ def _led_words_to_numbers(values: ArrayLike) -> ArrayLike:
 def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
     """Assign scan numbers: every change of name, even to an earlier one, begins a new scan; a single name is one scan.
 
-    Returns the number of each reading's scan, (n_points,), and the scans' names. Raises ShapeError if there is neither
-    a single name nor one per reading; ParameterError if a name is missing, or empty where others are not.
+    Returns the number of each reading's scan, (n_points,), and the scans' names. ShapeError for another number of
+    names; ParameterError if a name is missing, or empty where others are not.
     """
     if names is None or isinstance(names, str):
         return np.zeros(n_points, dtype=np.int64), (_checked_name("scan", names or "scan"),)
@@ -194,10 +184,7 @@ def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) ->
 
 
 def sessions_of_scans(session: FloatArray, scan: IntArray) -> tuple[int, ...]:
-    """Return the session of each scan, by scan number, given that of each reading, (n_points,); () if all are one.
-
-    Raises ParameterError where a reading's session is no whole number from 0, or not that of its scan's first.
-    """
+    """Return the session of each scan, given each reading's, (n_points,), the same within a scan; () if all are one."""
     _, rows, which = np.unique(scan, return_index=True, return_inverse=True)
     first = session[rows]
     whole = np.isfinite(session) & (session >= 0) & (session == np.floor(session))
@@ -215,10 +202,7 @@ def require_patterns(patterns: Mapping[str, Pattern]) -> None:
 
 
 def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:
-    """Return the index in `patterns` of each reading's pattern, (n_points,).
-
-    Raises ParameterError if a name is not described, or there are several patterns and no names.
-    """
+    """Return the index in `patterns` of each reading's pattern, (n_points,); ParameterError for an unknown name."""
     known = list(patterns)
     if names is None:
         if len(known) > 1:

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +23,8 @@ FORMAT = "recording/1"
 _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
 
 
-@dataclass(frozen=True)
-class Description:
-    """A parsed description: instrumentation, patterns by name, and notes on fields that are ignored."""
-
-    instrumentation: Instrumentation
-    patterns: Mapping[str, Pattern]
-    notes: tuple[str, ...] = ()
-
-
 def shortest_degrees(angle_rad: float) -> float:
-    """Convert to the degrees of fewest digits that convert back to exactly the same radians.
-
-    The package works in radians and its files hold degrees; a plain conversion there and back
-    can change an angle by a rounding error.
-    """
+    """Convert to the degrees of fewest digits that convert back to exactly the same radians, for files."""
     plain = math.degrees(angle_rad)
     candidates = [round(plain, digits) for digits in range(16)]
     candidates += [plain, math.nextafter(plain, math.inf), math.nextafter(plain, -math.inf)]
@@ -120,11 +107,8 @@ def _parse_pattern(found: _Object, kind: type[Pattern]) -> Pattern:
         raise found.error(error.name, error.allowed) from error
 
 
-def read_description(path: Path) -> Description:
-    """Read NAME.json, the description beside NAME.csv: instrumentation, patterns, and notes on what is not used.
-
-    Raises FileError if it is missing, does not parse, or a field is missing or invalid.
-    """
+def read_description(path: Path) -> tuple[Instrumentation, dict[str, Pattern], tuple[str, ...]]:
+    """Read NAME.json beside NAME.csv: instrumentation, patterns, notes; FileError for a field missing or invalid."""
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     top = _Object(path, "", parse_json_file_text(path, text, "strict JSON, each name once"))
     top.value("format", f'"{FORMAT}"', lambda v: v == FORMAT)
@@ -152,34 +136,35 @@ def read_description(path: Path) -> Description:
         for name in instrumentation.controls
         if name not in _CONTROLS
     ]
-    return Description(instrumentation, patterns, tuple(notes))
+    return instrumentation, patterns, tuple(notes)
 
 
 def _parse_instrumentation(top: _Object) -> Instrumentation:
     reading, sensor = (_Object(top.path, name, top.content.get(name, {})) for name in ("reading", "sensor"))
-    places = {name: (reading, name) for name in ("unit", "min", "max", "step")}
-    places |= {"sensor": (sensor, "name"), "height_mm": (sensor, "height_mm")}
-    places |= {name: (top, name) for name in ("description", "controls")}
-    values: dict[str, Any] = {}
-    for field, (where, name) in places.items():
-        if field == "controls" and name in top.content:
-            allowed = "a list of texts"
-            values[field] = tuple(top.value(name, allowed, lambda v: isinstance(v, list) and all(map(_is_text, v))))
-        elif field != "controls" and where.content.get(name) is not None:
-            text = field in ("unit", "sensor", "description")
-            values[field] = where.value(name, *(("a text", _is_text) if text else ("a finite number", _is_number)))
+    number, text = ("a finite number", _is_number), ("a text", _is_text)
+    texts = ("a list of texts", lambda v: isinstance(v, list) and all(map(_is_text, v)))
+    places: dict[str, tuple[_Object, str, str, Callable[[Any], bool]]] = {
+        "unit": (reading, "unit", *text),
+        **{name: (reading, name, *number) for name in ("min", "max", "step")},
+        "sensor": (sensor, "name", *text),
+        "height_mm": (sensor, "height_mm", *number),
+        "description": (top, "description", *text),
+        "controls": (top, "controls", *texts),
+    }
+    values = {
+        field: where.value(name, allowed, fits)
+        for field, (where, name, allowed, fits) in places.items()
+        if name in where.content and (field == "controls" or where.content[name] is not None)
+    }
     try:
         return Instrumentation(**{"unit": "", **values})
     except ParameterError as error:
-        where, name = places[error.name]
+        where, name, *_ = places[error.name]
         raise where.error(name, error.allowed) from error
 
 
 def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:
-    """Return the text of NAME.json, with numbers in full precision.
-
-    Raises ParameterError for a pattern that is of none of the format's kinds.
-    """
+    """Return the text of NAME.json, with numbers in full precision; ParameterError for a pattern of no known kind."""
     inst = instrumentation
     reading = {"unit": inst.unit, "min": inst.min, "max": inst.max, "step": inst.step}
     sensor = {"name": inst.sensor, "height_mm": inst.height_mm}

@@ -44,11 +44,11 @@ PathLike = str | os.PathLike[str]
 
 
 def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
-    """Read a recording: NAME.csv, and NAME.json beside it.
+    """Read a recording: NAME.csv, and NAME.json beside it; `progress` is called as rows are read.
 
     Missing readings become NaN, readings outside the declared range keep their value; both are counted in the notes and
-    are not `usable`. `progress` is called as rows are read. Raises FileError if either file cannot be used; it names
-    the file, row and column, what was found and what is allowed.
+    are not `usable`. Raises FileError, with row, column, what was found and what is allowed, if either file cannot be
+    used.
     """
     plan, readings, notes = _read_with_json(path, progress)
     if readings is None:
@@ -76,31 +76,23 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
 def write_recording(recording: Recording, path: PathLike) -> None:
     """Write NAME.csv, NAME.json and the images of its patterns, each file atomically, in full precision.
 
-    Raises ParameterError if the format cannot hold the recording (an unknown pattern, a name with line ends); FileError
-    if the files cannot be written.
+    ParameterError if the format cannot hold it (an unknown pattern, a name with line ends); FileError if files cannot
+    be written.
     """
     require_recording(recording)
-    inst = recording.plan.instrumentation
-    largest = math.inf if len(inst.declared_ends) == 2 else LARGEST
+    largest = math.inf if len(recording.plan.instrumentation.declared_ends) == 2 else LARGEST
     readings = _number_cells("readings", recording.readings, largest)
     _write_with_json(recording.plan, checked_path("path", path), plan_columns(recording.plan) | {"reading": readings})
 
 
 def write_plan(plan: Plan, path: PathLike) -> None:
-    """Write a plan as NAME.csv, NAME.json and the images of its patterns, each file atomically.
-
-    Raises ParameterError if the format cannot hold the plan (an unknown pattern, a name with line ends); FileError if
-    the files cannot be written.
-    """
+    """Write a plan as NAME.csv, NAME.json and the images of its patterns; raises as `write_recording`."""
     require_plan(plan)
     _write_with_json(plan, checked_path("path", path), plan_columns(plan))
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
-    """Format the rows of a plan as cells (texts) by column of its CSV file, in full precision.
-
-    Raises ParameterError if the format cannot hold the plan.
-    """
+    """Format the rows of a plan as cells by column of its CSV file, in full precision; ParameterError if it cannot."""
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         require(name == name.strip() and name.isprintable(), "name", name, _A_NAME)
     clash = [name for name in plan.covariates if name in (*_KNOWN, SESSION, "")]
@@ -114,23 +106,19 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     for k in np.unique(plan.scan).tolist():  # one like the scan's before gains a word, as a file would join the two
         again = bool(names) and plan.scan_names[k] == names[max(names)]
         names[k] = plan.scan_names[k] + " (again)" * again
+    turns, which = np.unique(plan.orientation_rad, return_inverse=True)  # few: each conversion is a search
+    degrees = [number_text(shortest_degrees(angle)) for angle in turns.tolist()]
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
         "x_mm": _number_cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
         "y_mm": _number_cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
-        "orientation_deg": _degree_cells(plan.orientation_rad),
+        "orientation_deg": [degrees[k] for k in which.reshape(-1).tolist()],
         "time_s": _number_cells("time_s", plan.time_s),
     }
     if len({plan.sessions[k] for k in names} if plan.sessions else ()) > 1:
         columns[SESSION] = [str(plan.sessions[k]) for k in plan.scan]
     return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
-
-
-def _degree_cells(angles_rad: FloatArray) -> list[str]:
-    distinct, which = np.unique(angles_rad, return_inverse=True)  # few: each conversion is a search
-    cells = [number_text(shortest_degrees(angle)) for angle in distinct.tolist()]
-    return [cells[k] for k in which.reshape(-1).tolist()]
 
 
 def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]:
@@ -157,10 +145,7 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
 
 
 def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
-    """Return the images among patterns by the name of their file.
-
-    Raises ParameterError if a file is no plain name, or two images that differ name one file.
-    """
+    """Return the images among patterns by their file's plain name, which two that differ do not share."""
     images: dict[str, Image] = {}
     for name, pattern in patterns.items():
         if not isinstance(pattern, Image):
@@ -185,8 +170,8 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
     table.require_columns("x_mm", "y_mm", allowed=_OF_A_LIGHT_SENSOR)
     if not len(table):
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
-    description = read_description(path.with_suffix(".json"))
-    notes = [*table.notes, *description.notes]
+    instrumentation, patterns, ignored = read_description(path.with_suffix(".json"))
+    notes = [*table.notes, *ignored]
     time_s = table.column_of_numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
@@ -195,13 +180,13 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         raise FileError(path, "it is in radians", "orientation_deg, in degrees", row=1, column="orientation_rad")
     turned = "orientation_deg" in table.columns
     orientation_deg = table.column_of_numbers("orientation_deg") if turned else np.zeros(len(table))
-    covariates = _covariate_columns(table, description.instrumentation.controls, notes)
+    covariates = _covariate_columns(table, instrumentation.controls, notes)
     try:
         scan, scan_names = scan_codes_and_names(table.columns.get("scan"), len(table))
         sessions = sessions_of_scans(covariates.pop(SESSION, np.zeros(len(table))), scan)
-        pattern = pattern_codes(table.columns.get("pattern"), description.patterns, len(table))
+        pattern = pattern_codes(table.columns.get("pattern"), patterns, len(table))
     except ParameterError as error:
-        raise _error_in_table(table, error, list(description.patterns)) from error
+        raise _error_in_table(table, error, list(patterns)) from error
     plan = Plan(
         x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
         y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
@@ -210,10 +195,10 @@ def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray 
         scan=scan,
         scan_names=scan_names,
         pattern=pattern,
-        pattern_names=tuple(description.patterns),
-        patterns=description.patterns,
+        pattern_names=tuple(patterns),
+        patterns=patterns,
         covariates=covariates,
-        instrumentation=description.instrumentation,
+        instrumentation=instrumentation,
         sessions=sessions,
     )
     notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
@@ -250,8 +235,8 @@ def _error_in_table(table: CSVTable, error: ParameterError, described: Sequence[
 def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str]) -> dict[str, FloatArray]:
     """Return the numeric columns that are not the format's own but for `session`, by name; add `notes` on the rest.
 
-    A column is numeric if most of its cells hold numbers. FileError if one that was commanded, `led`, `height_mm` or
-    one of `controls`, or a `session` that differs between rows, is not.
+    A column is numeric if most of its cells hold numbers. FileError if a commanded one, or a `session` that differs
+    between rows, is not.
     """
     out: dict[str, FloatArray] = {}
     if "led" in table.columns:
@@ -278,8 +263,8 @@ def _covariate_columns(table: CSVTable, controls: Sequence[str], notes: list[str
 def fingerprint(recording: Recording) -> str:
     """Return the SHA-256, in hexadecimal, of a recording's content, written in a fixed order.
 
-    The content is its rows, readings, scans, sessions, covariates, patterns and instrument; not the free-text
-    description, file names, column order or line ends.
+    That is its rows, readings, scans, sessions, covariates, patterns and instrument; not the free-text description,
+    file names, column order or line ends.
     """
     plan = recording.plan
     columns = plan_columns(plan) | {"reading": [number_text(value) for value in recording.readings]}

@@ -31,10 +31,8 @@ def is_file_name_without_path(name: str) -> bool:
 def read_image(path: Path) -> FloatArray:
     """Read an image as albedo 0 to 1, shape (n_rows, n_columns), first row on top.
 
-    Grey values 0 to 255 are linear in albedo; colours are averaged over their channels; transparent
-    pixels have albedo 0, as outside the image.
-
-    Raises FileError if it is not such an image, is damaged, or has values outside 0 to 255.
+    Grey values 0 to 255 are linear in albedo; colours are averaged over their channels; transparent pixels have albedo
+    0, as outside the image. FileError if it is not such an image, or is damaged.
     """
     content = read_bytes(path, _ALLOWED)
     if path.suffix.lower() == ".npy":
@@ -47,8 +45,7 @@ def read_image(path: Path) -> FloatArray:
 def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     """Encode albedo (n_rows, n_columns) as the file that `read_image` reads back: '.npy' or '.png'.
 
-    Raises ParameterError if `suffix` is another, an albedo is outside 0 to 1, or `suffix` is '.png' and the albedo is
-    not in steps of 1/255.
+    ParameterError for another suffix, an albedo outside 0 to 1, or, of a '.png', one not in steps of 1/255.
     """
     bad = ~((albedo >= 0) & (albedo <= 1))
     if bad.any():

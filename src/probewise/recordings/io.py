@@ -62,13 +62,7 @@ _MOST_DIGITS = 400  # more digits than any finite float has before the point
 def parse_json_file_text(
     path: str | os.PathLike[str], text: str | bytes, allowed: str, *, row: int | None = None
 ) -> Any:
-    """Parse a JSON text, or UTF-8 bytes, from a file.
-
-    Raises FileError if it is not strict JSON; see `parse_strict_json`.
-
-    `path`, `row`: its place, for messages; without `row`, the row of the error within the text; `text`: the text;
-    `allowed`: what the file should contain, for messages.
-    """
+    """Parse strict JSON from a file, or its line `row`; FileError says where it is wrong and what is `allowed`."""
     try:
         return parse_strict_json(text)
     except json.JSONDecodeError as error:
@@ -130,12 +124,9 @@ def _parse_finite_number(digits: str) -> float:
 
 
 def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
-    """Run a user's file as `import` would, and return the names that it defines.
+    """Run a user's file as `import` would, its folder on the search path, and return the names that it defines.
 
-    Its folder is added to the module search path, as by `python FILE.py`.
-
-    `path`: the file; `what`: what the file should be, for messages. Raises FileError if it cannot be read or run; the
-    error names the line if there is one.
+    Raises FileError, with the line, if it cannot be read or run; `what` says what the file should be.
     """
     path = checked_path("path", path, what)
     return run_python_text(read_text(path, what), path)
@@ -195,9 +186,7 @@ def shipped(name: str) -> Path:
 
     Both are simulated (world/shipped.py). `paper`: readings of the paper's plan, 404 over the black-and-white boundary
     and four over the quadrants. `concealed`: 961 readings of scans out and back, with one effect that the sensor model
-    leaves out, drawn from a seed.
-
-    Raises ParameterError if there is no recording of that name.
+    leaves out, drawn from a seed. ParameterError for another name.
     """
     require(name in SHIPPED, "name", name, " or ".join(repr(known) for known in SHIPPED))
     return Path(str(resources.files("probewise"))) / "data" / f"{name}.csv"

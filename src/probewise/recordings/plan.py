@@ -91,10 +91,10 @@ class Instrumentation:
 class Plan:
     """Pose, time and pattern of every reading, in the order they are taken (the order matters for lag and backlash).
 
-    All arrays have shape (n_points,). `scan` numbers the scans from 0 in the order they are taken
-    (a name that returns later is a new scan); `pattern` indexes `pattern_names`. A pattern name may be missing from
-    `patterns` only if hypotheses describe that pattern. `sessions` numbers the recording that
-    each scan is from, from 0, where several were joined; empty for one recording.
+    All arrays have shape (n_points,). `scan` numbers the scans from 0 in the order they are taken (a name that returns
+    later is a new scan); `pattern` indexes `pattern_names`. A pattern name may be missing from `patterns` only if
+    hypotheses describe that pattern. `sessions` numbers the recording that each scan is from, from 0, where several
+    were joined; empty for one recording.
     """
 
     x_mm: FloatArray

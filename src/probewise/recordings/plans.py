@@ -15,12 +15,7 @@ from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Quadrant, Un
 from probewise.recordings.plan import Instrumentation, Plan
 
 LEGO = Instrumentation(
-    unit="LEGO",
-    min=0.0,
-    max=100.0,
-    sensor="LEGO 9844 light sensor",
-    height_mm=14.0,
-    controls=("orientation_deg",),
+    unit="LEGO", min=0.0, max=100.0, sensor="LEGO 9844 light sensor", height_mm=14.0, controls=("orientation_deg",)
 )
 PATTERNS: dict[str, Pattern] = {
     "boundary": HalfPlane(0.0, 0.0),  # paper, S_BW
@@ -42,12 +37,10 @@ _Scan: TypeAlias = tuple[str, FloatArray, tuple[str, ...], float, float]
 def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
     """Return the plan of the paper's 408 readings (section "Data Collection for SSF Estimation").
 
-    Four scans across the black-and-white boundary from -50 to 50 mm in steps of 1 mm with the sensor
-    at 0, 90, 180 and 270 degrees, `edge_0` to `edge_270`, then one reading on each of the four
-    quadrant patterns at 0 degrees, `quadrants`.
-
-    `reading_s`: seconds from one reading to the next; about 1.2 for the paper's arm; `break_s`: seconds to turn the
-    sensor between scans, or to change the pattern.
+    Four scans across the black-and-white boundary from -50 to 50 mm in steps of 1 mm with the sensor at 0, 90, 180 and
+    270 degrees, `edge_0` to `edge_270`, then one reading on each of the four quadrant patterns at 0 degrees,
+    `quadrants`. `reading_s`: seconds from one reading to the next; about 1.2 for the paper's arm; `break_s`: seconds to
+    turn the sensor between scans, or to change the pattern.
     """
     line = _line_places(-50, 50, 1)
     scans: list[_Scan] = [(f"edge_{deg}", line, ("boundary",), deg, reading_s) for deg in ORIENTATIONS_DEG]
@@ -58,12 +51,9 @@ def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
 def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
     """Return a plan of 961 readings that distinguishes lag from backlash and gain from offset.
 
-    For each orientation: the boundary out and back (the way back at double speed for 180 and 270
-    degrees, since lag depends on speed and backlash does not), plain white and plain black every 8 mm.
-    Then the four quadrants, and a scan along Y across a disc, the only one that moves in Y.
-
-    `reading_s`: seconds from one reading to the next; `break_s`: seconds to turn the sensor between scans, or to change
-    the pattern.
+    For each orientation: the boundary out and back (the way back at double speed for 180 and 270 degrees, since lag
+    depends on speed and backlash does not), plain white and plain black every 8 mm. Then the four quadrants, and a scan
+    along Y across a disc, the only one that moves in Y. `reading_s`, `break_s` as of `paper_plan`.
     """
     out, flat = _line_places(-50, 50, 1), _line_places(-40, 40, 8)
     scans: list[_Scan] = []
@@ -82,10 +72,7 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
 def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
     """Return the plan with jittered time intervals; its covariate `battery_mv`, if any, is computed anew, with noise.
 
-    Raises ParameterError if `share` is outside 0 to 1.
-
-    `plan`: A plan in order of time; `rng`: source of randomness; `share`: largest change of an interval as a share of
-    it, 0 to 1.
+    `share`, 0 to 1 (else ParameterError), is the largest change of an interval as a share of it.
     """
     require(0 <= share <= 1, "share", share, "0 to 1")
     intervals = np.diff(plan.time_s, prepend=0.0)

@@ -22,9 +22,9 @@ from probewise.recordings.table import csv_text, number_text, read_table
 class Prediction(ShowsItself):
     """Predictive mean and sd of each row's reading; all arrays have shape (n_points,).
 
-    `sd` includes noise and parameter uncertainty. `log_density` is the natural log of the marginal
-    predictive density of that row's reading, per unit of the reading; NaN where the reading is missing
-    or out of range, and everywhere for a plan. `readings` are the scored readings, NaN where there is none.
+    `sd` includes noise and parameter uncertainty. `log_density` is the natural log of the marginal predictive density
+    of that row's reading, per unit of the reading; NaN where it is missing or out of range, and everywhere for a plan.
+    `readings` are the scored readings, NaN where there is none.
     """
 
     plan: Plan
@@ -72,10 +72,7 @@ def prediction_summary(readings: FloatArray, mean: FloatArray, sd: FloatArray, l
 
 
 def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:
-    """Write a CSV file of the plan's rows in order, with `mean`, `sd` and `log_density`, in full precision.
-
-    Raises FileError if the file cannot be written.
-    """
+    """Write a CSV file of the plan's rows in order, with `mean`, `sd` and `log_density`, in full precision."""
     columns = plan_columns(prediction.plan)
     for name in ("mean", "sd", "log_density"):
         columns[name] = [number_text(value) for value in getattr(prediction, name)]

@@ -74,20 +74,10 @@ class CSVTable:
     def column_of_numbers(
         self, name: str, *, missing: bool = False, largest: float | None = LARGEST, allowed: str = ""
     ) -> FloatArray:
-        """Read a column as numbers, shape (n_rows,).
+        """Read a column as numbers, (n_rows,); FileError, which says what is `allowed`, at the first cell that is none.
 
-        Raises FileError at the first cell that is not such a number.
-
-        Parameters
-        ----------
-        name
-            The column.
-        missing
-            Whether an empty cell, `nan`, `na` or `n/a` is allowed; it becomes NaN.
-        largest
-            Largest magnitude allowed; None: any finite number.
-        allowed
-            What is allowed, for the error; "": in words of the other arguments.
+        With `missing` an empty cell, `nan`, `na` or `n/a` is allowed and becomes NaN; `largest` is the largest
+        magnitude allowed, None: any finite number.
         """
         cells = self.columns[name]
         most = np.finfo(np.float64).max if largest is None else largest
@@ -111,71 +101,61 @@ def cell_in_words(cell: object) -> str:
     return "the cell is empty" if cell == "" else shown(cell)
 
 
-@dataclass(frozen=True, eq=False)
 class _Layout:
-    """Where the header of a file is, and how its cells are separated; rows are indices of records.
+    """Where the header of a file is, and how its cells are separated, by its first rows; rows are indices of records.
 
-    `declared` says whether the file itself names its separator, `blanks` which blanks are one. `numeric` are the
-    columns that hold numbers or times, `width` the number of cells of a row below the header, `above` and `units` the
-    rows above the header and those between it and the first reading.
+    `declared`: whether the file itself names its separator, `mark`; `blanks`: which blanks are one; `numeric`: columns
+    of numbers or times; `width`: cells of a row below the header; `above`, `units`: rows above the header, and below it
+    those without readings.
     """
 
-    mark: str
-    blanks: str = ""
-    declared: bool = False
-    header: Sequence[str] = ()
-    at: int = -1
-    first: int = 2**62
-    width: int = 0
-    numeric: frozenset[int] = frozenset()
-    above: Sequence[Sequence[str]] = ()
-    units: Sequence[Sequence[str]] = ()
+    def __init__(
+        self, sample: str, wanted: Sequence[str], mark: str, blanks: str = "", *, declared: bool = False
+    ) -> None:
+        self.mark, self.blanks, self.declared = mark, blanks, declared
+        self.header, self.at, self.first, self.width = list[str](), -1, 2**62, 0
+        self.numeric, self.above, self.units = frozenset[int](), list[list[str]](), list[list[str]]()
+        rows: list[list[str]] = []
+        with contextlib.suppress(csv.Error):
+            for row in csv.reader(io.StringIO(_separated(sample, blanks), newline=""), delimiter=mark, strict=True):
+                rows.append([cell.strip() for cell in row])
+        full = [k for k, row in enumerate(rows) if any(row) and not _DECLARED.match(mark.join(row) + "\n")]
+        if not full:
+            return
+        last = [rows[k] for k in full[-_N_LAST:]]
+        counts = Counter(map(len, last))
+        self.width = max(counts, key=lambda n: (counts[n], n))
+        columns = zip(*(row for row in last[-max(1, len(last) // 2) :] if len(row) == self.width), strict=True)
+        self.numeric = frozenset(j for j, cells in enumerate(columns) if _are_numbers(cells))
+        readings = [k for k in full if len(rows[k]) == self.width and _holds_numbers(rows[k], self.numeric)]
+        at = full[0]
+        if self.numeric and readings and (heads := [k for k in full if k < readings[0]]):
+            at = heads[-1]
+            if len(heads) > 1 and len(rows[heads[-2]]) == len(rows[at]) > 1 and all(rows[heads[-2]]):
+                at = heads[-2]  # below it the units
+        n_wanted = {k: len(set(wanted) & set(_names(rows[k], wanted, self.width))) for k in full}
+        if max(n_wanted.values()) > n_wanted[at]:
+            at = max(full, key=lambda k: n_wanted[k])
+        self.at, self.header = at, _names(rows[at], wanted, self.width)
+        below = [k for k in full if k > at]
+        self.first = next((k for k in below if not _holds_units(rows[k], self.numeric)), at + 1)
+        unnamed = mark != "," and len(self.header) + 1 == self.width
+        if unnamed and _count_up([row[0] for row in last if len(row) == self.width]):
+            self.header = ["", *self.header]
+        self.above, self.units = [rows[k] for k in full if k < at], [rows[k] for k in below if k < self.first]
 
     @classmethod
     def of_text(cls, text: str, wanted: Sequence[str]) -> _Layout:
         """Find the layout of a file by its first rows; where several would do, by the columns that are wanted."""
         end = max(text.rfind("\n", 0, _SAMPLE), text.rfind("\r", 0, _SAMPLE)) + 1
         sample = text[:end] if end and len(text) > _SAMPLE else text
-        declared = _DECLARED.match(sample)
-        candidates = [cls(declared[1], declared=True)] if declared else [cls(m, blanks) for m, blanks in _SEPARATORS]
-        found = [layout._fitted_to(sample, wanted) for layout in candidates if layout.mark in layout.separated(sample)]
+        if declared := _DECLARED.match(sample):
+            found = [cls(sample, wanted, declared[1], declared=True)]
+        else:
+            found = [cls(sample, wanted, *marks) for marks in _SEPARATORS if marks[0] in _separated(sample, marks[1])]
         fitting = [layout for layout in found if min(layout.width, len(layout.header)) > 1]
         known = [layout for layout in fitting if set(wanted) <= set(layout.header)]
-        return next(iter((*known, *fitting)), None) or cls(",")._fitted_to(sample, wanted)
-
-    def separated(self, text: str) -> str:
-        """Return a text with its cells separated by `mark`."""
-        return re.sub(self.blanks, "\t", re.sub(r"(?m)^[ \t]+|[ \t]+$", "", text)) if self.blanks else text
-
-    def _fitted_to(self, sample: str, wanted: Sequence[str]) -> _Layout:
-        rows: list[list[str]] = []
-        with contextlib.suppress(csv.Error):
-            for row in csv.reader(io.StringIO(self.separated(sample), newline=""), delimiter=self.mark, strict=True):
-                rows.append([cell.strip() for cell in row])
-        full = [k for k, row in enumerate(rows) if any(row) and not _DECLARED.match(self.mark.join(row) + "\n")]
-        if not full:
-            return self
-        last = [rows[k] for k in full[-_N_LAST:]]
-        counts = Counter(map(len, last))
-        width = max(counts, key=lambda n: (counts[n], n))
-        columns = zip(*(row for row in last[-max(1, len(last) // 2) :] if len(row) == width), strict=True)
-        numeric = frozenset(j for j, cells in enumerate(columns) if _are_numbers(cells))
-        readings = [k for k in full if len(rows[k]) == width and _holds_numbers(rows[k], numeric)]
-        at = full[0]
-        if numeric and readings and (heads := [k for k in full if k < readings[0]]):
-            at = heads[-1]
-            if len(heads) > 1 and len(rows[heads[-2]]) == len(rows[at]) > 1 and all(rows[heads[-2]]):
-                at = heads[-2]  # below it the units
-        n_wanted = {k: len(set(wanted) & set(_names(rows[k], wanted, width))) for k in full}
-        if max(n_wanted.values()) > n_wanted[at]:
-            at = max(full, key=lambda k: n_wanted[k])
-        header = _names(rows[at], wanted, width)
-        below = [k for k in full if k > at]
-        first = next((k for k in below if not _holds_units(rows[k], numeric)), at + 1)
-        if self.mark != "," and len(header) + 1 == width and _count_up([row[0] for row in last if len(row) == width]):
-            header = ["", *header]
-        above, units = [rows[k] for k in full if k < at], [rows[k] for k in below if k < first]
-        return replace(self, header=header, at=at, first=first, width=width, numeric=numeric, above=above, units=units)
+        return next(iter((*known, *fitting)), None) or cls(sample, wanted, ",")
 
     def fitted_row(self, row: tuple[str, ...]) -> tuple[str, ...]:
         """Return a row with as many cells as the header, if it has more that are empty, or lacks but comments."""
@@ -209,6 +189,11 @@ class _Layout:
         out = [f"cells separated by {separator}"] * (self.mark != "," or self.declared)
         out += [f"header in row {self.at + 1}, rows above it left out"] * bool(self.above)
         return out + [f"row {_in_words(row)} below the header left out" for row in self.units]
+
+
+def _separated(text: str, blanks: str) -> str:
+    """Return a text with a tab where some of these blanks separate its cells."""
+    return re.sub(blanks, "\t", re.sub(r"(?m)^[ \t]+|[ \t]+$", "", text)) if blanks else text
 
 
 def _is_value(cell: str) -> bool:
@@ -268,27 +253,16 @@ def read_table(
     """Read a table with one header row, as loggers and spreadsheets write it; blank lines are skipped.
 
     Cells may be separated by commas, semicolons, tabs or blanks. The header is the row above the numbers, or the one
-    with more of the `wanted` columns. Numbers and times are rewritten as plain numbers; `notes` says how.
+    with more of the `wanted` columns. Numbers and times are rewritten as plain numbers, but for the columns `names`,
+    which are texts; `notes` says how. The column `time` holds numbers, or dates or clocks, which count from the first
+    row in `time_unit`. `progress` is called as rows are read.
 
     Raises FileError if it cannot be read, has no header or a repeated column, a row is too short or too long, quotes do
     not close, or a cell can be read in several ways.
-
-    Parameters
-    ----------
-    path
-        The file.
-    wanted
-        Columns by which the header is known.
-    names
-        Columns that are texts, whatever they look like.
-    time, time_unit
-        Name of a column of numbers, or of dates or clocks, which count from the first row in this unit.
-    progress
-        Called as rows are read.
     """
     text = read_text(path, "a CSV file")
     layout = _Layout.of_text(text, wanted)
-    text, header = layout.separated(text), layout.header
+    text, header = _separated(text, layout.blanks), layout.header
     if twice := next((name for name, n in Counter(header).items() if name and n > 1), None):
         cure = "each column once: rename or delete one of them"
         raise FileError(path, "the column comes twice in the header", cure, row=layout.at + 1, column=twice)
@@ -340,8 +314,7 @@ def read_table(
     if time and time not in named and time_unit == "s" and is_time:
         named = {time if name == _X_VALUE else name: cells for name, cells in named.items()}
         notes.append(f"{_X_VALUE}, in s, is {time}")
-    table = CSVTable(path, named, rows, layout.at + 1)
-    return _with_plain_numbers(table, notes, names, time, time_unit)
+    return _with_plain_numbers(CSVTable(path, named, rows, layout.at + 1), notes, names, time, time_unit)
 
 
 def _with_plain_numbers(

@@ -48,8 +48,8 @@ def require_unit_of_time(name: str, unit: str, wanted: str) -> None:
 def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[ArrayLike, str]:
     """Convert dates, clocks and time differences (NumPy's, Python's, texts) to the time since the first, in `unit`.
 
-    Returns the times, (n_points,), and a note on how they were read; anything else unchanged, and "". Raises
-    ParameterError if a cell is missing or can be read in several ways, or some dates have a time zone and others none.
+    Returns the times, (n_points,), and a note on how they were read; anything else unchanged, and "". ParameterError if
+    a cell is missing or can be read in several ways, or some dates have a time zone and others none.
     """
     array = array_or_none(values)
     if array is None:
@@ -77,9 +77,7 @@ def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[Arr
 
 
 def texts_to_times(name: str, cells: Sequence[str], unit: str) -> tuple[FloatArray, str] | None:
-    """Convert dates or clocks to the time since the first in `unit`, (n_points,), with a note on how they were read.
-
-    None if the first is neither.
+    """Convert dates or clocks to the time since the first in `unit`, (n_points,), with a note; or None if it is none.
 
     Raises UnclearCellError at the first cell of another form, or one that can be read in several ways.
     """

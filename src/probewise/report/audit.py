@@ -74,11 +74,6 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
         f"alias: at size λ = {LAMBDA:g} these readings favour the row over the column by less than {ENOUGH_NATS:g} "
         "nats.",
     )
-    helped = (
-        Section("Effects that cannot be told apart", _alias_class_elements(audit))
-        if audit.classes is not None
-        else Section("The fewest extra readings that would help", _extra_readings_elements(audit))
-    )
     assumed = {
         "plan": source,
         "readings": f"{len(audit.plan)} in {count_with_noun(len(audit.plan.scan_names), audit.words.run)}",
@@ -90,38 +85,39 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
         f"Audit of {source}",
         answer=summary_sentence(audit),
         key_figure=shown,
-        sections=[helped, every, Section("What was assumed", (assumed,))],
+        sections=[_help_section(audit), every, Section("What was assumed", (assumed,))],
         terms_in=f"{summary_sentence(audit)} {shown}",
     )
 
 
-def _alias_class_elements(audit: PlanAudit) -> Sequence[str]:
-    if not audit.classes:
-        return ("These rows tell apart all effects that they can detect.",)
-    rows = ((str(k), ", ".join(map(spoken_name, names))) for k, names in enumerate(audit.classes, start=1))
-    opening = "Classes of aliased effects, directly or through others in the class:"
-    return (opening, table(("class", "effects"), rows))
-
-
-def _extra_readings_elements(audit: PlanAudit) -> Sequence[str]:
-    plan = audit.cure_plan
+def _help_section(audit: PlanAudit) -> Section:
+    """List the aliased effects of rows that nobody plans, else the fewest extra readings that would help."""
+    if audit.classes is not None:
+        said: tuple[str, ...] = ("These rows tell apart all effects that they can detect.",)
+        if audit.classes:
+            rows = ((str(k), ", ".join(map(spoken_name, names))) for k, names in enumerate(audit.classes, start=1))
+            opening = "Classes of aliased effects, directly or through others in the class:"
+            said = (opening, table(("class", "effects"), rows))
+        return Section("Effects that cannot be told apart", said)
+    plan, title = audit.cure_plan, "The fewest extra readings that would help"
     if plan is None and all(effect.detectability == "fine" for effect in audit.effects):
-        return ("None are needed: this plan is fine for every effect.",)
+        return Section(title, ("None are needed: this plan is fine for every effect.",))
     if plan is None:
-        return (
+        nothing = (
             "No scan that this arm can take (repeated, reversed, faster or turned) and no other position of the "
-            "sheet would help enough.",
+            "sheet would help enough."
         )
+        return Section(title, (nothing,))
     left = [spoken_name(e.name) for e in audit.after if e.detectability != "fine"]
-    rows = (
+    steps = (
         (str(k), typeset_numbers(cure.description), str(len(cure.plan)), ", ".join(map(spoken_name, cure.cured)) or "–")
         for k, cure in enumerate(audit.cures, start=1)
     )
-    return (
-        table(("step", "what to do", "readings", "effects that are then fine"), rows),
+    summed = (
         f"{count_with_noun(len(plan), 'reading')}, about {number_text(audit.extra_minutes, 0)} minutes; "
-        f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}.",
+        f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}."
     )
+    return Section(title, (table(("step", "what to do", "readings", "effects that are then fine"), steps), summed))
 
 
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import PurePath
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from probewise._words import count_with_noun, unit_after_number
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
-from probewise.report.html import Markup, Section, figure, notes_in_words, page, table
+from probewise.report.html import Markup, Section, figures, notes_in_words, page, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.readings import (
     predicted_and_recorded_by_scan,
@@ -29,6 +29,20 @@ from probewise.report.words import (
     words_without_unit,
 )
 
+_CAPTIONS = {
+    "ssf.png": "Spatial sensitivity function (SSF): how much each point below the sensor counts in a reading. White "
+    "lines: a half and a tenth of the peak; white cross: the package's centre.",
+    "ssf_by_order.png": "Mean SSF of each number of Gaussians, in the sensor frame seen from above. White lines: a "
+    "half and a tenth of the peak; white cross: the package's centre.",
+    "readings.png": "Readings as recorded, along the scans; single readings are below.",
+    "predicted.png": "Recorded readings, and what the model predicts.",
+    "residuals.png": "Standardised residuals in the order of the readings; 95 % should lie between the dashed lines.",
+}
+_SSF = (
+    "Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, and of the "
+    "angle of the long axis from the x' axis, anticlockwise."
+)
+
 
 def summary_sentence(sensor: FittedSensor) -> str:
     """Summarise a calibration: number of Gaussians, lead in ln Z over the next best, SSF's centre and sds, noise."""
@@ -40,22 +54,15 @@ def summary_sentence(sensor: FittedSensor) -> str:
         lead = chosen.log_z - others[0].log_z
         error = math.hypot(chosen.log_z_error, others[0].log_z_error)
         said += f", ahead of {others[0].n_gaussians} by {value_with_error(lead, error)} in ln Z"
-    center_x, center_y, widths = ssf_centre_and_axis_sds_mm(sensor)
-    digits, noise_sd = decimals_to_show(widths[0], 1), float(sensor.noise_sd.mean())
+    short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0)).tolist()
+    digits, noise_sd = decimals_to_show(long, 1), float(sensor.noise_sd.mean())
+    u, v = (number_unsigned_zero(float(at), digits) for at in sensor.field.mean_mm)
     return (
-        f"{said}: centred at ({number_unsigned_zero(center_x, digits)}, {number_unsigned_zero(center_y, digits)}) mm "
-        "on the sensor, "
-        f"{number_text(widths[0], digits)} by {number_text(widths[1], digits)} mm (sd), "
+        f"{said}: centred at ({u}, {v}) mm on the sensor, "
+        f"{number_text(long, digits)} by {number_text(short, digits)} mm (sd), "
         f"noise {number_text(noise_sd, decimals_to_show(noise_sd, 2))} "
         f"{sensor.instrumentation.unit_after_number} per reading."
     )
-
-
-def ssf_centre_and_axis_sds_mm(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
-    """Return u, v of the mean SSF's centre in the sensor's frame, and its sds (long axis, short axis), in mm."""
-    u, v = sensor.field.mean_mm
-    short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0))
-    return float(u), float(v), (float(long), float(short))
 
 
 def figure_drawers(
@@ -81,51 +88,6 @@ def draw_ssf_by_n_gaussians(calibration: Calibration) -> AxesGrid:
     )
 
 
-def sections(
-    sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
-) -> list[Section]:
-    """Build the sections of a calibration's page, below the first screen; `drawn` is from `figure_drawers`."""
-    ok = recording.usable
-    z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
-    by_order = (
-        "Mean SSF of each number of Gaussians, in the sensor frame seen from above. White lines: a half "
-        "and a tenth of the peak; white cross: the package's centre."
-    )
-    chi_square = (
-        f"Chi-square per reading is {number_text(float(np.mean(z**2)), 3)} over "
-        f"{count_with_noun(int(ok.sum()), 'reading')} "
-        "(near 1 where the model and its noise are right; they were fitted, so a little below)."
-    )
-    residuals = "Standardised residuals in the order of the readings; 95 % should lie between the dashed lines."
-    own = {"reading": sensor.instrumentation.unit}  # a prior's unit is that of the table of parameters
-    priors = (
-        (
-            p.parameter,
-            _printed_unit(own.get(p.unit, p.unit)),
-            typeset_numbers(p.distribution),
-            typeset_numbers(p.reason),
-        )
-        for p in sensor.priors
-    )
-    run = {
-        "recording": PurePath(sensor.source).name or "unnamed",
-        "its fingerprint": sensor.fingerprint,
-        "seed": str(seed),
-        "version": f"probewise {sensor.version}",
-    }
-    recorded = figure(drawn["readings.png"], "Readings as recorded, along the scans; single readings are below.")
-    predicted = figure(drawn["predicted.png"], "Recorded readings, and what the model predicts.")
-    parameters = (ssf_centre_and_width_table(sensor), parameter_table(sensor), *notes_in_words(sensor.notes))
-    return [
-        Section("Which number of Gaussians", (figure(drawn["ssf_by_order.png"], by_order), evidence_table(sensor))),
-        Section("Readings", (recorded, *notes_in_words(recording.notes))),
-        Section("Predicted against recorded", (predicted, chi_square, figure(drawn["residuals.png"], residuals))),
-        Section("Parameters", parameters),
-        Section("Prior", (table(("parameter", "unit", "prior", "why"), priors),)),
-        Section("This run", (run,)),
-    ]
-
-
 def evidence_table(sensor: FittedSensor) -> Markup:
     """Build a calibration's table by number of Gaussians: ln Z ± error, ln Z below the best, number of parameters."""
     best = max((o.log_z for o in sensor.orders), default=0.0)
@@ -147,33 +109,56 @@ def evidence_table(sensor: FittedSensor) -> Markup:
 def parameter_table(sensor: FittedSensor) -> Markup:
     """Build the table of a fitted sensor model's parameters: posterior medians and 95 % intervals."""
     median, ends = sensor.median(), sensor.interval()
-    return table(
-        ("parameter", "unit", "median", "95 % interval"),
-        (
-            (n, _printed_unit(sensor.unit_of_parameter(n)), *value_and_interval_texts(median[n], *ends[n]))
-            for n in sensor.names
-        ),
-        caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
-        "[[A, C], [C, B]].",
+    rows = [(n, sensor.unit_of_parameter(n), median[n], ends[n]) for n in sensor.names]
+    caption = (
+        "Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of [[A, C], [C, B]]."
     )
+    return _posterior_table("parameter", rows, caption)
 
 
-def ssf_centre_and_width_table(sensor: FittedSensor) -> Markup:
-    """Build the table of the SSF's centre, widths and angle: medians and 95 % intervals."""
-    return table(
-        ("SSF", "unit", "median", "95 % interval"),
-        (
-            (words_without_unit(q.name), _printed_unit(q.unit), *value_and_interval_texts(q.median, *q.interval95))
-            for q in sensor.ssf_quantities()
-        ),
-        caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "
-        "and of the angle of the long axis from the x' axis, anticlockwise.",
-    )
+def _posterior_table(first: str, rows: Iterable[tuple[str, str, float, tuple[float, float]]], caption: str) -> Markup:
+    """Build a table of posteriors; `rows` are names, units, medians and 95 % intervals."""
+    cells = [(name, _printed_unit(unit), *value_and_interval_texts(value, *ends)) for name, unit, value, ends in rows]
+    return table((first, "unit", "median", "95 % interval"), cells, caption=caption)
 
 
 def _printed_unit(unit: str) -> str:
     """Return a unit as the report prints it: "mm⁻²" for "mm^-2", nothing for "1", else `unit_name`."""
     return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_after_number(unit))
+
+
+def sections(
+    sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
+) -> list[Section]:
+    """Build the sections of a calibration's page, below the first screen; `drawn` is from `figure_drawers`."""
+    ok, shown = recording.usable, figures(drawn, _CAPTIONS)
+    z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
+    chi_square = (
+        f"Chi-square per reading is {number_text(float(np.mean(z**2)), 3)} over "
+        f"{count_with_noun(int(ok.sum()), 'reading')} "
+        "(near 1 where the model and its noise are right; they were fitted, so a little below)."
+    )
+    own = {"reading": sensor.instrumentation.unit}  # a prior's unit is that of the table of parameters
+    priors = (
+        (p.parameter, _printed_unit(own.get(p.unit, p.unit)), *map(typeset_numbers, (p.distribution, p.reason)))
+        for p in sensor.priors
+    )
+    run = {
+        "recording": PurePath(sensor.source).name or "unnamed",
+        "its fingerprint": sensor.fingerprint,
+        "seed": str(seed),
+        "version": f"probewise {sensor.version}",
+    }
+    of_ssf = ((words_without_unit(q.name), q.unit, q.median, q.interval95) for q in sensor.ssf_quantities())
+    parameters = (_posterior_table("SSF", of_ssf, _SSF), parameter_table(sensor), *notes_in_words(sensor.notes))
+    return [
+        Section("Which number of Gaussians", (shown["ssf_by_order.png"], evidence_table(sensor))),
+        Section("Readings", (shown["readings.png"], *notes_in_words(recording.notes))),
+        Section("Predicted against recorded", (shown["predicted.png"], chi_square, shown["residuals.png"])),
+        Section("Parameters", parameters),
+        Section("Prior", (table(("parameter", "unit", "prior", "why"), priors),)),
+        Section("This run", (run,)),
+    ]
 
 
 def page_html(
@@ -183,10 +168,6 @@ def page_html(
     return page(
         f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
         answer=summary_sentence(calibration.sensor),
-        key_figure=figure(
-            drawn["ssf.png"],
-            "Spatial sensitivity function (SSF): how much each point below the sensor counts in a reading. White "
-            "lines: a half and a tenth of the peak; white cross: the package's centre.",
-        ),
+        key_figure=figures(drawn, _CAPTIONS)["ssf.png"],
         sections=sections(calibration.sensor, recording, prediction, drawn, seed=seed),
     )

@@ -72,9 +72,9 @@ def covariate_values(diagnosis: Diagnosis, place: Place) -> FloatArray:
 
 
 def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
-    """Return the names, by value, of a place's covariate if it is scan, run, direction, or up to 24 orientations.
+    """Return the names, by ascending value, of a place's covariate: scan, run, direction, or up to 24 orientations.
 
-    Values ascend. None for other covariates; of a table's covariates, only the run has names.
+    None for other covariates; of a table's covariates, only the run has names.
     """
     words = diagnosis.apparatus.words
     if place.covariate == words.run:
@@ -93,9 +93,9 @@ def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, st
 class CovariateView:
     """A covariate against which residuals are drawn.
 
-    `at` holds its values, (n_points,), NaN in rows not drawn; `label` is the axis label. `names` gives each value's
-    name if the covariate is categorical. `window` is the interval to shade, in the covariate's unit or, if categorical,
-    in positions on the axis. `place` is the window with significant residuals that is drawn; None: another view.
+    `at` holds its values, (n_points,), NaN in rows not drawn; `label` is the axis label; `names` each value's name if
+    the covariate is categorical. `window` is the interval to shade, in the covariate's unit or, if categorical, in
+    positions on the axis. `place` is the window with significant residuals that is drawn; None: another view.
     """
 
     at: FloatArray
@@ -110,111 +110,92 @@ class CovariateView:
         return None if self.names is None else [self.names[v] for v in _distinct_values(self.at)]
 
 
-@dataclass(frozen=True, eq=False)
 class ResidualNoise:
-    """Noise of residuals, for the band of chance about their means.
+    """Noise of a diagnosis's residuals, for the band of chance about their means.
 
-    `sd`, (n_points,), is the noise sd of each reading, `rho` the AR(1) correlation within scans. `absorbed`,
-    (n_samples, n_points), holds posterior predictions, whose variance narrows the band; None: it is not narrowed.
+    `sd`, (n_points,), is the noise sd of each reading by the repaired model, `rho` its AR(1) correlation within scans.
+    `absorbed`, (n_samples, n_points), holds posterior predictions of the calibrated model, whose variance narrows the
+    band; None: it is not narrowed.
     """
 
-    sd: FloatArray
-    rho: float
-    absorbed: FloatArray | None
-
-    @classmethod
-    def of_diagnosis(cls, diagnosis: Diagnosis) -> ResidualNoise:
-        """Take the repaired model's noise sds and correlation, and posterior predictions of the calibrated model."""
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        self.diagnosis, plan, null = diagnosis, diagnosis.recording.plan, diagnosis.null
         noise = {p.name: p.mean for p in diagnosis.noise.parameters}
-        plan = diagnosis.recording.plan
-        sd = float(diagnosis.repaired.noise_sd.mean()) * diagnosis.recording.relative_sd
+        noise_sd = float(diagnosis.repaired.noise_sd.mean())
+        sd = noise_sd * diagnosis.recording.relative_sd
         sd = sd * np.array([noise.get(f"values[{name}]", 1.0) for name in plan.scan_names])[plan.scan]
         if "ratio" in noise:
             level = diagnosis.after.readings
-            share = (level - level.min()) / (float(np.ptp(level)) or 1.0)
-            sd = sd * np.sqrt(1 + noise["ratio"] * share)
-        sd = np.hypot(sd, noise.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
-        if "sd_per_row" in noise:  # beside a walk the readings leave the mean open, not the residuals
-            return cls(sd, noise.get("rho", 0.0), None)
-        null = diagnosis.null
-        theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
-        # The null's spread is that of its own noise sd, which the misfit inflates.
-        narrower = min(1.0, float(diagnosis.repaired.noise_sd.mean() / null.noise_sd.mean()))
-        return cls(sd, noise.get("rho", 0.0), narrower * null.chain.predict(theta, plan))
+            sd = sd * np.sqrt(1 + noise["ratio"] * ((level - level.min()) / (float(np.ptp(level)) or 1.0)))
+        self.sd = np.hypot(sd, noise.get("step", 0.0) / np.sqrt(12))  # the noise sd is that before rounding
+        self.rho, self.absorbed = noise.get("rho", 0.0), None
+        if "sd_per_row" not in noise:  # beside a walk the readings leave the mean open, not the residuals
+            theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
+            # The null's spread is that of its own noise sd, which the misfit inflates.
+            self.absorbed = min(1.0, float(noise_sd / null.noise_sd.mean())) * null.chain.predict(theta, plan)
 
-    def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
+    def means_in(self, view: CovariateView, *, after: bool = False) -> ResidualMeans:
         """Average the calibrated model's residuals in bins of a view; with `after`, also the repaired model's."""
         return mean_residuals(
             view.at,
-            diagnosis.before.residuals,
-            diagnosis.after.residuals if after and diagnosis.repair_changes_predictions else None,
+            self.diagnosis.before.residuals,
+            self.diagnosis.after.residuals if after and self.diagnosis.repair_changes_predictions else None,
             sd=self.sd,
             rho=self.rho,
-            scan=diagnosis.recording.plan.scan,
+            scan=self.diagnosis.recording.plan.scan,
             names=view.names,
             window=None if view.names else view.window,
             absorbed=self.absorbed,
         )
 
-    def largest_mean_in_sds(self, diagnosis: Diagnosis, view: CovariateView) -> float:
-        """Return the calibrated model's largest mean residual in a view, in sds of that mean by chance."""
-        return self.mean_residuals(diagnosis, view, after=False).largest_mean_in_sds
+    def first_view(self) -> CovariateView:
+        """Choose the first figure's covariate: the first candidate with a mean of 2.3 sds or more, else the largest.
 
+        Candidates in order: time, X or a column, folded at a named effect's period; covariates with significant
+        residuals, those on which an unknown effect most probably depends first; the repair's change of the predicted
+        readings. Without any, the predicted reading.
+        """
+        diagnosis, before, after = self.diagnosis, self.diagnosis.before, self.diagnosis.after
+        candidates = _views_at_period(diagnosis)
+        for place in sorted(diagnosis.where, key=lambda place: -_probability_unknown_depends_on(diagnosis, place)):
+            if diagnosis.verdict != "clean" or place.p_value < ALARM:
+                candidates += views_of_place(diagnosis, place)
+        if diagnosis.repair_changes_predictions and diagnosis.verdict != "clean":
+            change = after.readings_with_walk - before.readings_with_walk
+            unit = diagnosis.recording.plan.instrumentation.unit_after_number
+            candidates.append(CovariateView(change, f"change that the repair makes ({unit})"))
+        if not candidates:
+            return CovariateView(np.array(before.readings), axis_label(diagnosis, "level"))
+        sizes = [self.means_in(view).largest_mean_in_sds for view in candidates]
+        seen = [view for view, size in zip(candidates, sizes, strict=True) if size >= _SEEN]
+        return seen[0] if seen else candidates[np.argmax(sizes)]
 
-def choose_first_figure_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
-    """Choose the covariate of the first figure: the first candidate with a mean of 2.3 sds or more, else the largest.
+    def ranked_places(self) -> list[tuple[Place, bool]]:
+        """List the places with significant residuals, each with True if a mean residual reaches 2.3 sds.
 
-    Candidates in order: time, X or a column, folded at a named effect's period; covariates with significant residuals,
-    those on which an unknown effect most probably depends first; the repair's change of the predicted readings. Without
-    any, the predicted reading.
-    """
-    alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
-    candidates = _views_at_period(diagnosis)
-    for place in sorted(alarming, key=lambda place: -_probability_unknown_depends_on(diagnosis, place)):
-        candidates += views_of_place(diagnosis, place)
-    before, after = diagnosis.before, diagnosis.after
-    if diagnosis.repair_changes_predictions and diagnosis.verdict != "clean":
-        change = after.readings_with_walk - before.readings_with_walk
-        unit = diagnosis.recording.plan.instrumentation.unit_after_number
-        candidates.append(CovariateView(change, f"change that the repair makes ({unit})"))
-    if not candidates:
-        return CovariateView(np.array(before.readings), axis_label(diagnosis, "level"))
-    sizes = [chance.largest_mean_in_sds(diagnosis, view) for view in candidates]
-    return next((v for v, size in zip(candidates, sizes, strict=True) if size >= _SEEN), candidates[np.argmax(sizes)])
-
-
-def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
-    """List the places with significant residuals, each with True if a mean residual reaches 2.3 sds.
-
-    First those on whose covariate the unknown effect most probably depends, then those with True. Of places that are
-    the same interval, one is kept.
-    """
-    seen = {
-        place.figure_name: any(
-            chance.largest_mean_in_sds(diagnosis, view) >= _SEEN for view in views_of_place(diagnosis, place)
+        First those on whose covariate the unknown effect most probably depends, then those with True. Of places that
+        are the same interval, one is kept.
+        """
+        found, shown = self.diagnosis, list[tuple[Place, bool]]()
+        seen = [
+            any(self.means_in(v).largest_mean_in_sds >= _SEEN for v in views_of_place(found, p)) for p in found.where
+        ]
+        ranked = sorted(
+            zip(found.where, seen, strict=True), key=lambda k: (-_probability_unknown_depends_on(found, k[0]), not k[1])
         )
-        for place in diagnosis.where
-    }
-    shown: list[Place] = []
-    order = sorted(
-        diagnosis.where, key=lambda p: (-_probability_unknown_depends_on(diagnosis, p), not seen[p.figure_name])
-    )
-    for place in order:  # with one scan, a place in all scans and one in that scan are the same
-        values = covariate_values(diagnosis, place)
-        if place.start is None or not any(
-            (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
-            and np.array_equal(values, covariate_values(diagnosis, other), equal_nan=True)
-            for other in shown
-        ):
-            shown.append(place)
-    return [(place, seen[place.figure_name]) for place in shown]
+        for place, is_seen in ranked:  # with one scan, a place in all scans and one in that scan are the same
+            values = covariate_values(found, place)
+            if place.start is None or not any(
+                (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
+                and np.array_equal(values, covariate_values(found, other), equal_nan=True)
+                for other, _ in shown
+            ):
+                shown.append((place, is_seen))
+        return shown
 
 
 def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:
-    """List a place's views: `view_along_scan` if it is a whole scan or run; then, for every place, along its covariate.
-
-    Residuals that change sign within a scan show in the former.
-    """
+    """List a place's views: along its scan or run, if it is a whole one; then, for every place, along its covariate."""
     at, names = covariate_values(diagnosis, place), category_name_by_value(diagnosis, place)
     label = axis_label(diagnosis, place.covariate, place.scan)
     if place.without_effect:
@@ -260,10 +241,7 @@ def is_scan_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
 
 
 def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float:
-    """Return the probability that the unknown effect depends on a place's covariate.
-
-    It is 0 unless the verdict is `unknown` and the most probable form of the effect is a family of bases.
-    """
+    """Return the probability that the unknown effect, if that is the verdict, depends on a place's covariate."""
     shares = diagnosis.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in RARE_EFFECTS:
         return 0.0
@@ -272,10 +250,7 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
 
 
 def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
-    """List views of time, X or a column, folded at the period of each periodic effect of the verdict.
-
-    Only where the recording spans more than three periods.
-    """
+    """List views of time, X or a column, folded at periods of the verdict of which the recording spans three."""
     plan = diagnosis.recording.plan
     folded: list[tuple[FloatArray, float, str, str]] = []
     for effect in diagnosis.effects:

@@ -16,14 +16,14 @@ from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.words import hypothesis_in_words
-from probewise.experiment import Exploration, left_out_after_step
-from probewise.inquiry import Grid, UtilityMap, entropy_map
+from probewise.experiment import Exploration, Step, left_out_after_step
+from probewise.inquiry import Grid, entropy_map
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.diagnosis_figures import before_and_after
 from probewise.report.exploration import draw_robot_view, errors_text
-from probewise.report.html import Markup, Section, element, figure, fragment, page, paragraph, slideshow, table
+from probewise.report.html import Markup, Section, element, figures, fragment, page, paragraph, slideshow, table
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, lay_out, png
@@ -33,26 +33,44 @@ from probewise.report.plots.search import draw_field_legend, information_gained,
 from probewise.report.words import number_text, typeset_numbers
 from probewise.scene import outlines
 
-FIRST = 3  # as in the paper's figure
 SATURATION = 40.0
 """Reading at which the concealed effect of the third world, saturation, sets in; the model expects 60 over white."""
+_FIRST = 3  # as in the paper's figure
+_FINER = 2  # times as many places per side as the robot's grid, which is coarser than an edge is wide
+_MARGIN_MM = 30.0
+_OUTLINE = 0.45
+_HEADER = (
+    *("sensor model", "readings", "until the first white", "bits", "bits per reading", "the paper's count"),
+    *("largest error", "errors"),
+)
 _SENSOR = (
     "The sensor sees a blurred patch of the surface. Its spatial sensitivity function (SSF) is the weight that each "
     "point of the patch has in a reading; a calibration infers it from readings over patterns that are known."
 )
-HEADER = (
-    "sensor model",
-    "readings",
-    "until the first white",
-    "bits",
-    "bits per reading",
-    "the paper's count",
-    "largest error",
-    "errors",
-)
-_FINER = 2  # times as many places per side as the robot's grid, which is coarser than an edge is wide
-_MARGIN_MM = 30.0
-_OUTLINE = 0.45
+_CAPTIONS = {
+    "arm.png": "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the "
+    "links, and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light from the "
+    "photodiode.",
+    "orientations.png": "The sensor in its four orientations, seen from above through its package, and the symbols of "
+    "their readings below (paper, figure 3). It crosses the edge between black and white in steps of 1 mm.",
+    "quadrants.png": "Four patterns that tell the SSF from its mirror images (paper, figure 4): one reading each at "
+    "the cross, with the sensor at 0°. The number in the white part is the reading.",
+    "first_three.png": "Both robots start with the same reading on white, then follow the paper's rule: read where the "
+    "entropy is highest (paper, figures 2 and 8). With the naive model (left) the circles cut the field into cells of "
+    "uniform entropy, at most 1 bit. With the SSF model (right) the circles' edges are bright: a reading there also "
+    "measures how much white the sensor sees. The inference differs from the paper's: posterior samples are reweighted "
+    "after each reading. The paper's own, a new nested sampling run after each reading, is probewise explore --method "
+    "paper.",
+    "progress.png": "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the "
+    "circle.",
+    "explanations.png": "Probability of each explanation; they sum to one.",
+    "scans.png": "Residuals (recorded minus predicted) along the scans that the repair changes most: each reading, and "
+    "running means. Orange: the calibrated model. Blue: the repaired model.",
+    "doubt.png": "The posterior of each robot at its end: left the trusting robot, right the doubting one. Blue: 50 "
+    "circles drawn from the posterior. Dashed white: the hidden circle.",
+    "belief.png": "What the doubting robot believes about its sensor after each reading. A dashed line marks a reading "
+    "that changed the most probable effect.",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +87,11 @@ class RobotSearch:
     levels: tuple[float, float]
 
     @property
+    def n(self) -> int:
+        """Number of readings."""
+        return len(self.run.steps)
+
+    @property
     def largest_error_mm(self) -> float:
         """Largest absolute error, estimate against truth, of the parameters in mm (places, lengths) at the end."""
         last = self.run.last
@@ -81,13 +104,12 @@ class RobotSearch:
     @property
     def readings_until_first_white(self) -> int:
         """Number, from 1, of the first reading closer to white than to black; that of the last one if none is."""
-        middle = sum(self.levels) / 2
-        seen = [r.value > middle for r in self.run.readings]
+        seen = [r.value > sum(self.levels) / 2 for r in self.run.readings]
         return seen.index(True) + 1 if any(seen) else len(seen)
 
-    def step_number_after(self, n: int) -> int:
-        """Return the number of the step after `n` readings, or of the last step if the run ended earlier."""
-        return min(n, len(self.run.steps))
+    def step_after(self, n: int) -> Step:
+        """Return the step after `n` readings, or the last one if the run ended earlier."""
+        return self.run.steps[min(n, self.n) - 1]
 
     def draw_view(self, number: int, *, title: str, ax: Axes, **options: Any) -> Axes:
         """Draw the robot's view after reading `number`, from 1, with the true shape; return the axes."""
@@ -96,12 +118,16 @@ class RobotSearch:
         return draw_robot_view(self.run.steps[number - 1], self.run.experiment, seen, **options)
 
 
-def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
-    """Return the cells of the table of searches, in the order of `HEADER`, one row per search."""
+def _sd_text(step: Step) -> str:
+    return f"{number_text(step.largest_sd_mm, 1)} mm"
+
+
+def _comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
+    """Return the cells of the table of searches, in the order of `_HEADER`, one row per search."""
     return [
         (
             s.model,
-            str(len(s.run.steps)),
+            str(s.n),
             str(s.readings_until_first_white),
             number_text(s.run.last.bits, 1),
             number_text(s.run.bits_per_reading, 2),
@@ -113,21 +139,9 @@ def search_comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, .
     ]
 
 
-_CAPTION = (
-    "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
-    "the whole search, whatever the run. Errors: estimate minus truth, ± posterior sd (mm). One run each: the "
-    "number of readings varies from circle to circle, most of all until the first white reading."
-)
-
-
-def search_comparison_table(searches: Sequence[RobotSearch], caption: str = _CAPTION) -> Markup:
-    """Build the table that compares the robots' searches, a row each; the default caption explains bits and errors."""
-    return table(HEADER, search_comparison_rows(searches), caption=caption)
-
-
 def search_comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
     """Write the comparison of searches as lines of text: a table of each one's cost, then another of its errors."""
-    rows = [HEADER, *search_comparison_rows(searches)]
+    rows = [_HEADER, *_comparison_rows(searches)]
     return [
         "A whole search, from an empty field (bits: information gained; the paper's count: 25 bits over the readings)",
         *_aligned_lines([row[:-2] for row in rows]),
@@ -143,7 +157,7 @@ def _aligned_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def draw_widths_and_information(searches: Sequence[RobotSearch]) -> AxesGrid:
+def _draw_widths_and_information(searches: Sequence[RobotSearch]) -> AxesGrid:
     """Draw the widest posterior sd, and the information, after each reading of each search; return the axes, (1, 2)."""
     steps = {f"{s.model} model": s.run.steps for s in searches}
     axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
@@ -153,7 +167,7 @@ def draw_widths_and_information(searches: Sequence[RobotSearch]) -> AxesGrid:
     return axes
 
 
-def draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
+def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
     """Draw the paper's view after each of `numbers` readings (rows) of each search (columns); return the axes."""
     window = window_around_runs_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
@@ -161,36 +175,29 @@ def draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) ->
     axes = grid_of_axes(len(numbers), len(searches), size_in=size)
     for row, n in zip(axes, numbers, strict=True):
         for ax, search in zip(row, searches, strict=True):
-            paper_view(search, search.step_number_after(n), window_mm=window, ax=ax)
+            paper_view(search, min(n, search.n), window_mm=window, ax=ax)
     return axes
 
 
 def paper_view(search: RobotSearch, number: int, *, window_mm: tuple[float, float, float, float], ax: Axes) -> Axes:
-    """Draw the robot's view after a reading as the paper does: a fine entropy map, with the sampled circles.
+    """Draw the robot's view after a reading as the paper does (figures 2 and 8): a fine entropy map, and the circles.
 
-    `number` is that of the reading, from 1; `window_mm` are the limits shown: left, right, lower, upper.
+    `number` is that of the reading, from 1; `window_mm` are the limits shown: left, right, lower, upper. The run's
+    sensor model has no parameters to learn.
     """
-    known = f"sd up to {number_text(search.run.steps[number - 1].largest_sd_mm, 1)} mm"
-    title = f"{search.model} model, {count_with_noun(number, 'reading')}: {known}"
-    search.draw_view(number, title=title, ax=ax, drawn=fine_entropy_map(search.run, number), lego_scale=True)
-    ax.collections[0].set_linewidth(_OUTLINE)
-    left, right, low, high = window_mm
-    ax.set(xlim=(left, right), ylim=(low, high))
-    return ax
-
-
-def fine_entropy_map(run: Exploration, number: int) -> UtilityMap:
-    """Compute the entropy map of the circles sampled after a reading, on a grid twice as fine (paper, figures 2 and 8).
-
-    The run's sensor model has no parameters to learn; `number` is that of the reading, from 1.
-    """
-    step, coarse = run.steps[number - 1], run.experiment.grid
+    step, experiment = search.run.steps[number - 1], search.run.experiment
+    coarse = experiment.grid
     grid = Grid(coarse.width_mm, coarse.height_mm, _FINER * coarse.n_x - 1, _FINER * coarse.n_y - 1)
     # A fine place is within reach as the nearest place of the coarse grid is.
-    rows = np.rint(np.linspace(0, coarse.n_y - 1, grid.n_y)).astype(np.int64)
-    columns = np.rint(np.linspace(0, coarse.n_x - 1, grid.n_x)).astype(np.int64)
-    reachable = step.map.reachable[: coarse.n_places].reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel()
-    return entropy_map(run.experiment.model, step.samples, grid, grid.plan("field"), reachable=reachable)
+    sides = ((coarse.n_y, grid.n_y), (coarse.n_x, grid.n_x))
+    nearest = np.ix_(*(np.rint(np.linspace(0, few - 1, many)).astype(np.int64) for few, many in sides))
+    reachable = step.map.reachable[: coarse.n_places].reshape(coarse.n_y, coarse.n_x)[nearest].ravel()
+    drawn = entropy_map(experiment.model, step.samples, grid, grid.plan("field"), reachable=reachable)
+    title = f"{search.model} model, {count_with_noun(number, 'reading')}: sd up to {_sd_text(step)}"
+    search.draw_view(number, title=title, ax=ax, drawn=drawn, lego_scale=True)
+    ax.collections[0].set_linewidth(_OUTLINE)
+    ax.set(xlim=window_mm[:2], ylim=window_mm[2:])
+    return ax
 
 
 def window_around_runs_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
@@ -200,22 +207,20 @@ def window_around_runs_mm(runs: Sequence[Exploration], first: int) -> tuple[floa
     """
     grid = runs[0].experiment.grid
     drawn = [outline for run in runs for outline in outlines(run.experiment.shape.region(run.steps[first - 1].samples))]
-    places = [[r.pose.x_mm, r.pose.y_mm] for run in runs for r in run.readings]
-    points = np.concatenate([*drawn, np.array(places)])
+    points = np.concatenate([*drawn, np.array([[r.pose.x_mm, r.pose.y_mm] for run in runs for r in run.readings])])
     (left, low), (right, high) = points.min(axis=0) - _MARGIN_MM, points.max(axis=0) + _MARGIN_MM
     return max(left, 0.0), min(right, grid.width_mm), max(low, 0.0), min(high, grid.height_mm)
 
 
 def draw_final_posteriors(searches: Sequence[RobotSearch]) -> AxesGrid:
     """Draw each robot's view after its last reading, all of the same part of the field; return the axes, (1, n)."""
-    ends = np.array([window_around_runs_mm([s.run], len(s.run.steps)) for s in searches])
+    ends = np.array([window_around_runs_mm([s.run], s.n) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
     axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.4 + 3.3 * (high - low) / (right - left)))
-    for ax, search in zip(axes[0], searches, strict=True):
-        n = len(search.run.steps)
-        title = f"{search.model} robot, after {count_with_noun(n, 'reading')}"
-        search.draw_view(n, title=title, ax=ax).set(xlim=(left, right), ylim=(low, high))
+    for ax, s in zip(axes[0], searches, strict=True):
+        title = f"{s.model} robot, after {count_with_noun(s.n, 'reading')}"
+        s.draw_view(s.n, title=title, ax=ax).set(xlim=(left, right), ylim=(low, high))
     draw_field_legend(axes)
     return axes
 
@@ -249,7 +254,7 @@ class DemoRun:
 
 def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """State in one sentence how many readings the SSF and the naive robot needed after the same first reading."""
-    naive, ssf = (len(s.run.steps) - 1 for s in searches)
+    naive, ssf = (s.n - 1 for s in searches)
     how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
     return (
         f"After the same first reading on white, the robot that knows what its sensor sees needed {ssf} more readings "
@@ -257,14 +262,12 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     )
 
 
-def sds_after_equal_readings_text(searches: Sequence[RobotSearch]) -> str:
+def _sds_after_equal_readings_text(searches: Sequence[RobotSearch]) -> str:
     """Compare both robots' widest posterior sds (mm) after as many readings as the SSF robot, the second, needed."""
     naive, ssf = searches
-    n = len(ssf.run.steps)
-    widest = naive.run.steps[naive.step_number_after(n) - 1].largest_sd_mm
     return (
-        f"After {count_with_noun(n, 'reading')} each, the naive robot knows the circle to {number_text(widest, 1)} mm, "
-        f"the other to {number_text(ssf.run.last.largest_sd_mm, 1)} mm (widest posterior sd)."
+        f"After {count_with_noun(ssf.n, 'reading')} each, the naive robot knows the circle to "
+        f"{_sd_text(naive.step_after(ssf.n))}, the other to {_sd_text(ssf.run.last)} (widest posterior sd)."
     )
 
 
@@ -273,7 +276,7 @@ def main_findings_by_key(run: DemoRun) -> dict[str, str | int]:
     return {
         "seed": run.seed,
         "search": summary_sentence(run.started_alike),
-        "equal_readings": sds_after_equal_readings_text(run.started_alike),
+        "equal_readings": _sds_after_equal_readings_text(run.started_alike),
         "verdict": run.diagnosis.verdict,
         "combination": "+".join(run.diagnosis.combination),
         "concealed": run.concealed,
@@ -287,16 +290,16 @@ def figure_drawers(run: DemoRun) -> dict[str, Callable[[], bytes]]:
     """List all figures of the demo by file name, as functions that draw PNGs."""
     recording, diagnosis, started_alike, doubt = run.recording, run.diagnosis, run.started_alike, run.doubt
     hidden = started_alike[0].truth_mm
-    n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
+    n_first = [k for k in range(1, _FIRST + 1) if all(k < s.n for s in started_alike)]
     names = [hypothesis_in_words(h.effects) for h in diagnosis.hypotheses]
     before, after = diagnosis.before.readings, diagnosis.after.readings
     drawings: dict[str, Callable[[], Any]] = {
         "arm.png": lambda: arm_and_sensor(run.geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden),
         "orientations.png": lambda: sensor_orientations(recording),
         "quadrants.png": lambda: quadrant_patterns(recording),
-        "first_three.png": lambda: draw_paper_views(started_alike, n_first),
-        "equal_readings.png": lambda: draw_paper_views(started_alike, [len(started_alike[-1].run.steps)]),
-        "progress.png": lambda: draw_widths_and_information(run.searches),
+        "first_three.png": lambda: _draw_paper_views(started_alike, n_first),
+        "equal_readings.png": lambda: _draw_paper_views(started_alike, [started_alike[-1].n]),
+        "progress.png": lambda: _draw_widths_and_information(run.searches),
         "explanations.png": lambda: hypothesis_probabilities(names, [h.probability for h in diagnosis.hypotheses]),
         "scans.png": lambda: residuals_by_scan(diagnosis.recording, before, after),
         "before_after.png": lambda: lay_out(before_and_after(diagnosis)),
@@ -310,6 +313,15 @@ def figure_drawers(run: DemoRun) -> dict[str, Callable[[], bytes]]:
 
 def page_html(run: DemoRun, drawn: Mapping[str, bytes], *, frames: Sequence[Sequence[bytes]], seconds: float) -> str:
     """Return the HTML of the demo's page; `drawn` is from `figure_drawers`, `frames` has a PNG of each step."""
+    captions = {
+        "equal_readings.png": f"{_sds_after_equal_readings_text(run.started_alike)} Left the naive model, right the "
+        "SSF model. Blue: 50 circles drawn from the posterior; where errors of centre and radius add up, their edges "
+        "spread over several sds. Copper: entropy of the readings that these circles predict; brighter places promise "
+        "more information. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
+        "circle.",
+        "before_after.png": diagnosis_report.before_and_after_caption(run.diagnosis),
+    }
+    shown = figures(drawn, _CAPTIONS | captions)
     facts = {
         "seed": str(run.seed),
         "time": f"{number_text(seconds, 0)} s",
@@ -317,104 +329,72 @@ def page_html(run: DemoRun, drawn: Mapping[str, bytes], *, frames: Sequence[Sequ
         "the models",
         "version": f"probewise {run.calibration.sensor.version}",
     }
-    sections = [
-        _sensor_section(run, drawn),
-        _search_section(run, frames, drawn),
-        _diagnosis_section(run.diagnosis, drawn, run.concealed),
-        doubt_section(run.doubt, drawn),
-        Section("This run", (facts,)),
-    ]
-    caption = (
-        f"{sds_after_equal_readings_text(run.started_alike)} Left the naive model, right the SSF model. "
-        "Blue: 50 circles drawn from the posterior; where errors of centre and radius add up, their edges spread over "
-        "several sds. Copper: entropy of the readings that these circles predict; "
-        "brighter places promise more information. Squares: readings by their brightness. Green: the next place. "
-        "Dashed white: the hidden circle."
-    )
     return page(
         "Modeling a sensor to improve its efficacy",
         answer=summary_sentence(run.started_alike),
-        key_figure=figure(drawn["equal_readings.png"], caption),
-        sections=sections,
+        key_figure=shown["equal_readings.png"],
+        sections=[
+            _sensor_section(run, drawn, shown),
+            _search_section(run, frames, shown),
+            _diagnosis_section(run.diagnosis, shown, run.concealed),
+            doubt_section(run.doubt, drawn),
+            Section("This run", (facts,)),
+        ],
     )
 
 
-def _sensor_section(run: DemoRun, drawn: Mapping[str, bytes]) -> Section:
+def _sensor_section(run: DemoRun, drawn: Mapping[str, bytes], shown: Mapping[str, Markup]) -> Section:
     sensor = run.calibration.sensor
-    shown = calibration_report.sections(sensor, run.recording, run.prediction, drawn, seed=run.seed)
-    arm = (
-        "The arm as its geometry file describes it (paper, figure 1): one motor turns the base, two move the links, "
-        "and parallel rods keep the sensor level. A LED lights the surface; a ridge keeps its light from the "
-        "photodiode."
-    )
-    orientations = (
-        "The sensor in its four orientations, seen from above through its package, and the symbols of their "
-        "readings below (paper, figure 3). It crosses the edge between black and white in steps of 1 mm."
-    )
-    quadrants = (
-        "Four patterns that tell the SSF from its mirror images (paper, figure 4): one reading each at the "
-        "cross, with the sensor at 0°. The number in the white part is the reading."
-    )
-    taken = (figure(drawn["orientations.png"], orientations), figure(drawn["quadrants.png"], quadrants))
     parts = (
-        Section("The arm and its sensor", (figure(drawn["arm.png"], arm),)),
-        Section("How the recording was taken", taken),
-        *shown[:-1],
+        Section("The arm and its sensor", (shown["arm.png"],)),
+        Section("How the recording was taken", (shown["orientations.png"], shown["quadrants.png"])),
+        *calibration_report.sections(sensor, run.recording, run.prediction, drawn, seed=run.seed)[:-1],
     )
     return Section("The sensor", (_SENSOR, calibration_report.summary_sentence(sensor)), parts)
 
 
-def _search_section(run: DemoRun, frames: Sequence[Sequence[bytes]], drawn: Mapping[str, bytes]) -> Section:
+def _search_section(run: DemoRun, frames: Sequence[Sequence[bytes]], shown: Mapping[str, Markup]) -> Section:
     searches = naive, ssf = run.searches
     introduction = (
         "A white circle lies somewhere on the black field. The naive robot believes that its sensor sees a point, "
         "black or white. The other predicts each reading with the calibrated SSF. Both choose their own readings and "
         "stop when centre and radius are known to 4 mm each."
     )
-    first = (
-        "Both robots start with the same reading on white, then follow the paper's rule: read where the "
-        "entropy is highest (paper, figures 2 and 8). With the naive model (left) the circles cut the field "
-        "into cells of uniform entropy, at most 1 bit. With the SSF model (right) the circles' edges are "
-        "bright: a reading there also measures how much white the sensor sees. The inference differs from the "
-        "paper's: posterior samples are reweighted after each reading. The paper's own, a new nested sampling "
-        "run after each reading, is probewise explore --method paper."
+    counted = (
+        "Bits: prior minus posterior differential entropy of the circle's parameters. The paper counts 25 bits for "
+        "the whole search, whatever the run. Errors: estimate minus truth, ± posterior sd (mm). One run each: the "
+        "number of readings varies from circle to circle, most of all until the first white reading."
     )
-    panels = (figure(drawn["first_three.png"], first), search_comparison_table(run.started_alike))
     texts = [
         "; ".join(
-            f"{s.model} model, {count_with_noun(k := s.step_number_after(n), 'reading')}: "
-            f"{number_text(s.run.steps[k - 1].largest_sd_mm, 1)} mm" + (" (ended)" if n > len(s.run.steps) else "")
+            f"{s.model} model, {count_with_noun(min(n, s.n), 'reading')}: {_sd_text(s.step_after(n))}"
+            + (" (ended)" if n > s.n else "")
             for s in searches
         )
-        for n in range(1, max(len(s.run.steps) for s in searches) + 1)
+        for n in range(1, max(naive.n, ssf.n) + 1)
     ]
     whole = (
         f"From an empty field, finding the circle at all takes luck, whatever the model: the naive robot met "
-        f"it at reading {naive.readings_until_first_white} of {len(naive.run.steps)}, the SSF robot at "
-        f"reading {ssf.readings_until_first_white} of {len(ssf.run.steps)}. These robots choose by "
-        f"the default rule: the expected information of a reading or, near the end, the probability that it "
-        f"ends the run. The colour bar names the one shown.",
+        f"it at reading {naive.readings_until_first_white} of {naive.n}, the SSF robot at reading "
+        f"{ssf.readings_until_first_white} of {ssf.n}. These robots choose by the default rule: the expected "
+        "information of a reading or, near the end, the probability that it ends the run. The colour bar names the one "
+        "shown.",
         slideshow(
             list(zip(join_side_by_side(*frames), texts, strict=True)),
             "Each step of both searches; the length below the picture is the widest posterior sd.",
         ),
-        figure(
-            drawn["progress.png"],
-            "Left: widest posterior sd after each reading; a run ends below 4 mm. Right: information about the circle.",
-        ),
-        search_comparison_table(searches, "From an empty field; columns as in the table above."),
+        shown["progress.png"],
+        table(_HEADER, _comparison_rows(searches), caption="From an empty field; columns as in the table above."),
     )
-    return Section(
-        "The search",
-        (introduction,),
-        (
-            Section("As in the paper: the first three readings", panels),
-            Section("A whole search, step by step", whole),
-        ),
+    alike = table(_HEADER, _comparison_rows(run.started_alike), caption=counted)
+    parts = (
+        Section("As in the paper: the first three readings", (shown["first_three.png"], alike)),
+        Section("A whole search, step by step", whole),
     )
+    return Section("The search", (introduction,), parts)
 
 
-def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> Section:
+def _diagnosis_section(diagnosis: Diagnosis, shown: Mapping[str, Markup], concealed: str) -> Section:
     gain = diagnosis.improvement
     held = (
         f"On scans that were held out of the fit, the repaired model gains "
@@ -422,35 +402,31 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
         "nats per reading. (A nat is a unit of log probability: "
         "one nat more makes a reading e = 2.7 times as probable.)"
     )
-    scans = (
-        "Residuals (recorded minus predicted) along the scans that the repair changes most: each reading, and "
-        "running means. Orange: the calibrated model. Blue: the repaired model."
-    )
     link = element("a", "the full report of the diagnosis", href="diagnosis/report.html")
-    more = fragment("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
     repair = (
-        figure(drawn["before_after.png"], diagnosis_report.before_and_after_caption(diagnosis)),
+        shown["before_after.png"],
         *((held,) if diagnosis.repair_changes_predictions and gain.heldout_by_scan else ()),
-        figure(drawn["scans.png"], scans),
-        paragraph(more),
+        shown["scans.png"],
+        paragraph(
+            fragment("Where the residuals lie, which effects are aliased and what to measure next:  ", link, ".")
+        ),
     )
     said = (
         f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
         "not know that."
     )
-    explanations = figure(drawn["explanations.png"], "Probability of each explanation; they sum to one.")
     return Section(
         "A mismatch, found and repaired",
         (diagnosis_report.summary_sentence(diagnosis), said),
-        (Section("What it could be", (explanations,)), Section("The repair", repair)),
+        (Section("What it could be", (shown["explanations.png"],)), Section("The repair", repair)),
     )
 
 
 def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
     """Say in one sentence how both robots ended (readings, largest error, widest sd), the trusting one first."""
     trusting, doubting = (
-        f"{count_with_noun(len(s.run.steps), 'reading')}, off by {number_text(s.largest_error_mm, 1)} mm "
-        f"(posterior sd up to {number_text(s.run.last.largest_sd_mm, 1)} mm)"
+        f"{count_with_noun(s.n, 'reading')}, off by {number_text(s.largest_error_mm, 1)} mm "
+        f"(posterior sd up to {_sd_text(s.run.last)})"
         for s in searches
     )
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
@@ -458,8 +434,7 @@ def doubt_sentence(searches: Sequence[RobotSearch]) -> str:
 
 def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
     """Build the demo's section from both searches, the trusting robot's first, and from `figure_drawers`."""
-    doubting = searches[-1].run
-    missing = left_out_after_step(doubting.last, doubting.experiment.trust)
+    doubting, shown = searches[-1].run, figures(drawn, _CAPTIONS)
     introduction = (
         f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
         f"{number_text(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. "
@@ -470,34 +445,21 @@ def doubt_section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -
     rows = table(
         ("robot", "readings", "largest error", "widest posterior sd", "stopped because"),
         (
-            (
-                s.model,
-                str(len(s.run.steps)),
-                f"{number_text(s.largest_error_mm, 1)} mm",
-                f"{number_text(s.run.last.largest_sd_mm, 1)} mm",
-                s.run.stop_reason,
-            )
+            (s.model, str(s.n), f"{number_text(s.largest_error_mm, 1)} mm", _sd_text(s.run.last), s.run.stop_reason)
             for s in searches
         ),
         caption="Both robots look for the circle of the searches above, from the same first reading on it. One run "
         "each; probewise study --concealed repeats it for many circles and effects.",
     )
-    fields = (
-        "The posterior of each robot at its end: left the trusting robot, right the doubting one. Blue: 50 circles "
-        "drawn from the posterior. Dashed white: the hidden circle."
-    )
-    belief = (
-        "What the doubting robot believes about its sensor after each reading. A dashed line marks a reading that "
-        "changed the most probable effect."
-    )
+    reported = left_out_after_step(doubting.last, doubting.experiment.trust).sentence
     return Section(
         "A robot that doubts its sensor",
         (
             introduction,
             doubt_sentence(searches),
-            figure(drawn["doubt.png"], fields),
+            shown["doubt.png"],
             rows,
-            figure(drawn["belief.png"], belief),
-            f"At its end the doubting robot reports: {missing.sentence}",
+            shown["belief.png"],
+            f"At its end the doubting robot reports: {reported}",
         ),
     )

@@ -40,7 +40,6 @@ from probewise.report.covariates import (
     ResidualNoise,
     category_name_by_value,
     covariate_in_words_and_unit,
-    ranked_places_with_visibility,
     term_family_in_words,
 )
 from probewise.report.diagnosis_figures import figure_drawers, first_figure_content, noun_of_held_out_part
@@ -130,10 +129,9 @@ def _walk_note(diagnosis: Diagnosis) -> str:
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """List pairs of a reader's question and its answer in words: what to measure next, what was found, ..."""
     gain, changes = diagnosis.improvement, diagnosis.repair_changes_predictions
-    found = diagnosis.reason.partition(TO_SEPARATE)[0]
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
-        ("What was found", _as_sentence(diagnosis, found)),
+        ("What was found", _as_sentence(diagnosis, diagnosis.reason.partition(TO_SEPARATE)[0])),
     ]
     if diagnosis.formula is not None:
         facts.append(("As a formula", _formula_in_words(diagnosis.formula)))
@@ -235,39 +233,33 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
     credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.credible]
     likely = [e for e in diagnosis.effects if e.probability > _LIKELY]
+    rest = [e for e in diagnosis.effects if e.probability <= _LIKELY]
     told = [f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}" for e in likely]
     listed = [h for h in diagnosis.hypotheses[:8] if h.probability > 1e-3]
     probabilities = ((hypothesis_in_words(h.effects), probability_text(h.probability)) for h in listed)
-    return (
-        *(_as_sentence(diagnosis, said) for said in told),
-        html.table(("explanation", "probability"), probabilities),
-        _credible_set(credible),
-        *_unknown_effect_candidates(diagnosis),
-        *(  # effects in the repaired model's samples that are not among the diagnosis's
-            _as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}")
-            for _, share, sentence in diagnosis.unstated_effects
-        ),
-        *_laplace_and_nested_table(diagnosis),
-        *_effect_elements(diagnosis),
-    )
-
-
-def _credible_set(names: Sequence[str]) -> str:
-    listed = "; ".join(names)
-    if len(names) <= _MOST_CREDIBLE:
-        return f"95 % credible set (the fewest explanations that hold 0.95): {listed}."
-    return html.details(f"95 % credible set: {len(names)} explanations", html.paragraph(f"{listed}."))
-
-
-def _unknown_effect_candidates(diagnosis: Diagnosis) -> Sequence[str]:
-    """Write a sentence on the likely candidates for an unknown effect; empty if none is likely."""
+    held: str = f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(credible)}."
+    if len(credible) > _MOST_CREDIBLE:
+        names = html.paragraph(f"{'; '.join(credible)}.")
+        held = html.details(f"95 % credible set: {len(credible)} explanations", names)
     candidates = ", ".join(
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
         for name, p in diagnosis.unknown_candidates
         if p > _LIKELY
     )
     opening = "Candidates for the unknown effect (a covariate that it depends on, or a form)"
-    return (f"{opening}: {candidates}.",) if candidates else ()
+    return (
+        *(_as_sentence(diagnosis, said) for said in told),
+        html.table(("explanation", "probability"), probabilities),
+        held,
+        *([f"{opening}: {candidates}."] if candidates else []),
+        *(  # effects in the repaired model's samples that are not among the diagnosis's
+            _as_sentence(diagnosis, f"In {share:.0%} of the repaired model's samples: {sentence}")
+            for _, share, sentence in diagnosis.unstated_effects
+        ),
+        *_laplace_and_nested_table(diagnosis),
+        *([_effect_table(likely)] if likely else []),
+        *([html.details(f"{len(rest)} less likely effects", _effect_table(rest))] if rest else []),
+    )
 
 
 def _laplace_and_nested_table(diagnosis: Diagnosis) -> Sequence[str]:
@@ -293,7 +285,7 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
         return ("No residual is larger than noise explains.",)
     shown = [
         html.figure(drawn[place.figure_name], _place_caption(diagnosis, place, seen=seen))
-        for place, seen in ranked_places_with_visibility(diagnosis, ResidualNoise.of_diagnosis(diagnosis))
+        for place, seen in ResidualNoise(diagnosis).ranked_places()
     ]
     opening = (
         f"Residuals of the {diagnosis.apparatus.words.unrepaired} model against each covariate in which they are "
@@ -369,18 +361,12 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
     return (typeset_numbers(test), *found, html.figure(drawn["noise.svg"], caption))
 
 
-def _effect_elements(diagnosis: Diagnosis) -> Sequence[str]:
-    likely = [effect for effect in diagnosis.effects if effect.probability > _LIKELY]
-    rest = [effect for effect in diagnosis.effects if effect.probability <= _LIKELY]
-    shown = [_effect_table(likely)] if likely else []
-    return [*shown, *([html.details(f"{len(rest)} less likely effects", _effect_table(rest))] if rest else [])]
-
-
 def _effect_table(effects: Sequence[EffectFound]) -> html.Markup:
     rows = []
     for effect in effects:
+        named, own = effect_in_words(effect.name), name_without_copy_suffix(effect.name)  # in diagnosis.json
         said = (
-            _effect_words_and_name(effect.name),
+            f"{named} ({own})" if named != own else own,
             probability_text(effect.probability),
             number_text(effect.size_lambda, 1),
         )
@@ -389,13 +375,6 @@ def _effect_table(effects: Sequence[EffectFound]) -> html.Markup:
             rows.append((*said, parameter_in_words(effect.name, p.name, p.unit), *values))
             said = ("", "", "")
     return html.table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
-
-
-def _effect_words_and_name(name: str) -> str:
-    """Name an effect in words, followed by its name in diagnosis.json."""
-    said = effect_in_words(name)
-    own = name_without_copy_suffix(name)
-    return f"{said} ({own})" if said != own else own
 
 
 def _value_and_interval_texts(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
@@ -416,20 +395,16 @@ def _alias_elements(diagnosis: Diagnosis) -> Sequence[str]:
 
 
 def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
-    def readings_needed(n: int) -> str:
-        return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
-
     rows = (
         (
             " and ".join(map(effect_in_words, a.effects)),
             number_text(a.cosine, 3),
             typeset_numbers(a.settle_by),
-            readings_needed(a.readings),
+            "–" if not a.readings else str(a.readings) if a.readings < MOST_READINGS else f"{MOST_READINGS} or more",
         )
         for a in aliases
     )
-    header = ("aliased in these readings", "cosine", "what would separate them", "readings needed")
-    return html.table(header, rows)
+    return html.table(("aliased in these readings", "cosine", "what would separate them", "readings needed"), rows)
 
 
 def _audit_elements(audit: PlanAudit) -> Sequence[str | Mapping[str, str]]:

@@ -19,13 +19,12 @@ from probewise.report.covariates import (
     CovariateView,
     ResidualNoise,
     axis_label,
-    choose_first_figure_view,
     is_scan_along_line,
     view_along_scan,
     views_of_place,
 )
 from probewise.report.plots import residuals as plots
-from probewise.report.plots.canvas import BLUE, AxesGrid, stack_of_axes, svg
+from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, stack_of_axes, svg
 from probewise.report.plots.probabilities import hypothesis_probabilities, n_further_lines
 from probewise.systems import RunTable
 from probewise.systems.forms import Form
@@ -37,16 +36,13 @@ _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readin
 
 
 def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
-    """List a diagnosis's figures by file name, as functions that draw SVGs.
-
-    These are: first, before and after, residuals, noise, gain, places.
-    """
-    chance = cache(partial(ResidualNoise.of_diagnosis, diagnosis))
+    """List a diagnosis's figures by file name, as functions that draw SVGs."""
+    chance = cache(partial(ResidualNoise, diagnosis))
     drawers: dict[str, Callable[[], bytes]] = {
-        "first.svg": lambda: _first_figure_svg(diagnosis, chance()),
+        "first.svg": lambda: _first_figure_svg(chance()),
         "before_after.svg": lambda: svg(before_and_after(diagnosis)),
         "residuals.svg": lambda: _all_residuals_svg(diagnosis),
-        "noise.svg": lambda: _noise_tests_svg(diagnosis, chance()),
+        "noise.svg": lambda: _noise_tests_svg(chance()),
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
@@ -55,7 +51,7 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     for effect in cast(Sequence[Form], diagnosis.repaired.chain.effects):
         if effect.name.startswith("curve:"):
             drawers[figure_name_of(effect.name)] = partial(_curve_svg, diagnosis, effect)
-    return drawers | {place.figure_name: partial(_place_svg, diagnosis, chance, place) for place in diagnosis.where}
+    return drawers | {place.figure_name: partial(_place_svg, chance, place) for place in diagnosis.where}
 
 
 def noun_of_held_out_part(diagnosis: Diagnosis) -> str:
@@ -74,40 +70,38 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
         return max(diagnosis.combination, key=lambda name: sizes.get(name, 0.0))
-    return choose_first_figure_view(diagnosis, ResidualNoise.of_diagnosis(diagnosis) if chance is None else chance)
+    return (chance or ResidualNoise(diagnosis)).first_view()
 
 
-def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+def _first_figure_svg(chance: ResidualNoise) -> bytes:
     """Draw the first figure's content (`first_figure_content`) and, below it, the probability of each explanation."""
+    diagnosis = chance.diagnosis
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
-    names = [hypothesis_in_words(h.effects) for h in listed]
-    n_bars = min(len(listed), _MOST_BARS) + (len(diagnosis.hypotheses) > min(len(listed), _MOST_BARS))
+    names, most = [hypothesis_in_words(h.effects) for h in listed], min(len(listed), _MOST_BARS)
+    n_bars = most + (len(diagnosis.hypotheses) > most)
     lines = n_further_lines(names[:_MOST_BARS], width_in=_FIGURE_IN)
     above, below = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3) + 0.16 * lines], width_in=_FIGURE_IN)
     shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
         plots.readings_in_order(diagnosis.recording, ax=above)
     elif isinstance(shown, str):
-        _noise_panel_drawer(diagnosis, chance, shown)(above)
+        _draw_noise_panel(chance, shown, above)
     else:
-        _draw_means_along(diagnosis, chance, shown, after=True, each=False, ax=above)
+        _draw_means_along(chance, shown, after=True, each=False, ax=above)
     # All are passed on: the last bar adds up those that are not drawn.
-    rest = [h.probability for h in diagnosis.hypotheses[len(listed) :]]
-    hypothesis_probabilities(
-        [*names, *("" for _ in rest)],
-        [*(h.probability for h in listed), *rest],
-        most=min(len(listed), _MOST_BARS),
-        ax=below,
-    )
+    names += [""] * (len(diagnosis.hypotheses) - len(listed))
+    probabilities = [h.probability for h in (*listed, *diagnosis.hypotheses[len(listed) :])]
+    hypothesis_probabilities(names, probabilities, most=most, ax=below)
     return svg(above)
 
 
-def _place_svg(diagnosis: Diagnosis, noise: Callable[[], ResidualNoise], place: Place) -> bytes:
+def _place_svg(chance: Callable[[], ResidualNoise], place: Place) -> bytes:
     """Draw the calibrated model's residuals in each view of a place: readings, means, the band of chance."""
-    views = views_of_place(diagnosis, place)
+    noise = chance()
+    views = views_of_place(noise.diagnosis, place)
     axes = stack_of_axes([2.4, 2.6][-len(views) :])
     for ax, view in zip(axes, views, strict=True):
-        _draw_means_along(diagnosis, noise(), view, after=False, each=True, ax=ax)
+        _draw_means_along(noise, view, after=False, each=True, ax=ax)
     return svg(axes)
 
 
@@ -120,20 +114,22 @@ def _curve_svg(diagnosis: Diagnosis, curve: Form) -> bytes:
     change = curve.apply(np.zeros((len(samples), len(plan))), samples, plan)[:, rows]
     low, middle, high = np.quantile(change - change.mean(axis=1, keepdims=True), [0.025, 0.5, 0.975], axis=0)
     (ax,) = stack_of_axes([2.6])
-    ax.fill_between(at[rows], low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 %")
+    ax.fill_between(at[rows], low, high, label="95 %", **FILLED)
     ax.plot(at[rows], middle, color=BLUE, label=f"{name} of {column}")
     ax.set(xlabel=axis_label(diagnosis, curve.covariates[0]), ylabel=f"added {reading.unit_after_number}".rstrip())
     ax.legend()
     return svg(ax)
 
 
-def _draw_means_along(
-    diagnosis: Diagnosis, chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes
-) -> Axes:
-    names = view.category_names_on_axis
-    at = view.at if names is None else _spread_within_categories(view.at)
-    return plots.mean_residuals_along(
-        chance.mean_residuals(diagnosis, view, after=after),
+def _draw_means_along(chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes) -> None:
+    diagnosis, names, at = chance.diagnosis, view.category_names_on_axis, view.at
+    if names is not None:  # rows of the k-th value are spread evenly, in row order, about k
+        at = np.full(view.at.shape, np.nan)
+        for k, value in enumerate(np.unique(view.at[np.isfinite(view.at)])):
+            rows = np.flatnonzero(view.at == value)
+            at[rows] = k + np.linspace(-0.4, 0.4, rows.size) if rows.size > 1 else k
+    plots.mean_residuals_along(
+        chance.means_in(view, after=after),
         label=view.label,
         unit=diagnosis.recording.plan.instrumentation.unit_after_number,
         each=(at, diagnosis.before.residuals) if each else None,
@@ -143,15 +139,6 @@ def _draw_means_along(
         after=diagnosis.after_in_words,
         ax=ax,
     )
-
-
-def _spread_within_categories(at: FloatArray) -> FloatArray:
-    """Return positions on the axis, (n_points,): rows of the k-th value spread evenly, in row order, about k."""
-    out = np.full(at.shape, np.nan)
-    for k, value in enumerate(np.unique(at[np.isfinite(at)])):
-        rows = np.flatnonzero(at == value)
-        out[rows] = k + np.linspace(-0.4, 0.4, rows.size) if rows.size > 1 else k
-    return out
 
 
 def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
@@ -176,9 +163,9 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
 
 
 def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
-    """Return row numbers of the scan with the largest sum of squares of `change`; of the longest if nothing changes.
+    """Return row numbers of the scan, if possible along a line, with the largest sum of squares of `change`.
 
-    `change`, (n_points,), is the repair's change of each predicted reading. Scans along a line are preferred.
+    `change`, (n_points,), is the repair's change of each predicted reading; without any, it is the longest scan.
     """
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
     lines = [rows for rows in scans if is_scan_along_line(plan, rows)]
@@ -197,34 +184,35 @@ def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     return svg(plots.residuals_against_covariates(covariates, models, unit=unit))
 
 
-def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+def _noise_tests_svg(chance: ResidualNoise) -> bytes:
     """Draw the tests of the noise model: autocorrelation, spread by predicted reading, histogram."""
     axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):
-        _noise_panel_drawer(diagnosis, chance, name)(ax)
+        _draw_noise_panel(chance, name, ax)
     return svg(axes)
 
 
-def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
-    """Return a function that draws a noise effect's panel on axes; for other names, spread by predicted reading."""
-    recording, residuals = diagnosis.recording, np.array(diagnosis.after.residuals)
+def _draw_noise_panel(chance: ResidualNoise, name: str, ax: Axes) -> None:
+    """Draw a noise effect's panel; for other names, spread by predicted reading."""
+    diagnosis, recording = chance.diagnosis, chance.diagnosis.recording
+    predicted, residuals, sd = diagnosis.after.readings, np.array(diagnosis.after.residuals), float(chance.sd.mean())
     unit = recording.plan.instrumentation.unit_after_number
     found = {p.name: p.mean for p in diagnosis.noise.parameters}
     if "share" in found and "value" in found:  # lost readings carry no information on the noise of the others
-        lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * float(chance.sd.mean()))
-        lost &= np.abs(residuals) > _LOST * float(chance.sd.mean())
+        lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * sd)
+        lost &= np.abs(residuals) > _LOST * sd
         residuals[lost] = np.nan
         lost[list(recording.left_out)] = True
         if name == "dropouts":
-            return lambda ax: plots.lost_readings_against_predicted(
-                diagnosis.after.readings, recording.readings, lost, unit=unit, ax=ax
-            )
+            plots.lost_readings_against_predicted(predicted, recording.readings, lost, unit=unit, ax=ax)
+            return
     if name == "quantisation" and "step" in found:
-        return lambda ax: plots.readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
-    if name in ("correlated_noise", "random_walk"):
+        plots.readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
+    elif name in ("correlated_noise", "random_walk"):
         walking = residuals + diagnosis.after.walk
-        return lambda ax: plots.residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
-    if name == "outliers":
-        return lambda ax: plots.residual_histogram(residuals / chance.sd, 1.0, ax=ax)
-    model_sd = chance.sd if np.ptp(chance.sd) > 0 else None
-    return lambda ax: plots.spread_by_level(diagnosis.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax)
+        plots.residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
+    elif name == "outliers":
+        plots.residual_histogram(residuals / chance.sd, 1.0, ax=ax)
+    else:
+        model_sd = chance.sd if np.ptp(chance.sd) > 0 else None
+        plots.spread_by_level(predicted, residuals, unit=unit, model_sd=model_sd, ax=ax)

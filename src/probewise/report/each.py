@@ -49,11 +49,11 @@ def in_order(rows: Sequence[DeviceRow]) -> list[DeviceRow]:
 def columns_of(rows: Sequence[DeviceRow]) -> dict[str, Sequence[str]]:
     """Return the columns of table.csv, in the order of the page."""
     names = ("device", "verdict", "name", "size_lambda", "probability", "p_value", "says")
-    return {name: [_cell(getattr(row, name)) for row in in_order(rows)] for name in names}
-
-
-def _cell(value: str | float | None) -> str:
-    return value if isinstance(value, str) else "" if value is None else number_text(value)
+    cells = {name: [getattr(row, name) for row in in_order(rows)] for name in names}
+    return {
+        name: [v if isinstance(v, str) else "" if v is None else number_text(v) for v in values]
+        for name, values in cells.items()
+    }
 
 
 def summary(rows: Sequence[DeviceRow]) -> str:
@@ -80,16 +80,10 @@ def page_html(rows: Sequence[DeviceRow], drawn: Mapping[str, bytes], *, seed: in
     """Return the HTML of the page; reports lie in a folder of each device's name."""
 
     def cells(row: DeviceRow) -> tuple[str, ...]:
-        done = row.verdict != "refused"
-        link = element("a", row.device, href=f"{quote(row.device)}/report.html") if done else row.device
-        numbers = (row.size_lambda, row.probability, row.p_value)
-        return (
-            link,
-            row.verdict,
-            row.ails if row.name else "",
-            *("" if v is None else f"{v:.3g}" for v in numbers),
-            row.says,
-        )
+        link = element("a", row.device, href=f"{quote(row.device)}/report.html")
+        numbers = ("" if v is None else f"{v:.3g}" for v in (row.size_lambda, row.probability, row.p_value))
+        device = row.device if row.verdict == "refused" else link
+        return device, row.verdict, row.ails if row.name else "", *numbers, row.says
 
     header = ("device", "verdict", "what it is", "size λ", "probability", "p", "in words")
     return page(

@@ -50,8 +50,8 @@ def draw_robot_view(
     """Draw the robot's view of the field after a step of an experiment, as in the paper; return the axes.
 
     `readings` are x_mm, y_mm and value up to this step, `levels` the readings over black and white; `truth_mm` is the
-    outline of the true shape, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot
-    chose; `lego_scale` adds the paper's coordinates at the top.
+    true outline, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot chose;
+    `lego_scale` adds the paper's coordinates at the top.
     """
     seen = np.asarray(readings, dtype=np.float64).reshape(-1, 3)
     pose, drawn = step.next_pose, drawn or step.map
@@ -95,10 +95,7 @@ def robot_views_by_model_png(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the posteriors of several sensor models from the same readings, one below the other; return a PNG.
-
-    Each of `views` is a title, a step and its experiment; the rest is as in `draw_robot_view`.
-    """
+    """Draw several models' posteriors (title, step, experiment), one below the other; parameters as above."""
     axes = grid_of_axes(len(views), 1, size_in=(8.2, 0.9 + 4.3 * len(views)))
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
         known = f"{title}, {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits"
@@ -147,24 +144,18 @@ def _fault_section(steps: Sequence[Step], trust: float, draw: html.Draw) -> html
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
-    step, truth = run.last, _truth_with_angles_near_estimate(run, truth)
+    step, truth = run.last, dict(truth)
+    likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
+    names = [step.names[k] for k in columns]
+    if all(name in truth for name in names):  # the angle nearest the estimate's by the shape's symmetry
+        near = with_angles_near(likely, np.array([[truth[name] for name in names]]), step.mean[columns])[0]
+        truth |= dict(zip(names, near.tolist(), strict=True))
     return ", ".join(
         f"{words_without_unit(name.removeprefix(f'{step.likely_shape}.'))} "
         f"{value_with_error(float(mean) - truth[name], float(sd), unit_of_name(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
-
-
-def _truth_with_angles_near_estimate(run: Exploration, truth: Mapping[str, float]) -> dict[str, float]:
-    """Return the truth by name, its angle nearest the estimate's by the shape's symmetry; two sides may be swapped."""
-    step = run.last
-    likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
-    names = [step.names[k] for k in columns]
-    if not all(name in truth for name in names):
-        return dict(truth)
-    near = with_angles_near(likely, np.array([[truth[name] for name in names]]), step.mean[columns])[0]
-    return {**truth, **dict(zip(names, near.tolist(), strict=True))}
 
 
 def summary_sentence(run: Exploration) -> str:
@@ -185,9 +176,8 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> h
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
-    header = ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ()))
     return html.table(
-        header,
+        ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ())),
         (
             (
                 words_without_unit(p.name),

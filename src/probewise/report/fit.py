@@ -30,10 +30,7 @@ def summary_sentence(fit: SystemFit) -> str:
 
 
 def figure_drawers(fit: SystemFit) -> dict[str, Callable[[], bytes]]:
-    """List a fit's figures by file name: functions that draw recorded against predicted readings, and residuals.
-
-    Residuals are drawn against time, predicted reading, and up to four input columns that vary.
-    """
+    """List a fit's figures by file name, as functions that draw SVGs: predicted readings, and residuals."""
     residuals = [("fitted", fit.residuals)]
     unit = unit_after_number(fit.fitted.simulator.unit)
     return {
@@ -84,8 +81,7 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
         sections=[
             Section("Posterior", (table(("parameter", "median", "95 % interval", "mode"), rows),)),
             Section(
-                "Residuals",
-                (residuals, "probewise diagnose tests them and names the physics that would explain them."),
+                "Residuals", (residuals, "probewise diagnose tests them and names the physics that would explain them.")
             ),
             Section("This run", (definition_list(facts), *notes_in_words(fit.recording.notes))),
         ],

@@ -31,7 +31,9 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
     """List wordings of a diagnosis's verdict, the most complete first; the last always has at most twenty words."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.too_little:
-        return [_too_few_readings_sentence(diagnosis, n)]
+        if n > 1 and float(np.ptp(diagnosis.recording.readings[diagnosis.recording.usable])) == 0.0:
+            return [f"All {n} readings are equal: there is no signal to diagnose."]
+        return [f"{count_with_noun(n, 'reading').capitalize()} {'is' if n == 1 else 'are'} too few for a diagnosis."]
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
             said = ["These readings look unusual, but nothing that was tried explains them better than the model."]
@@ -74,13 +76,6 @@ def _told_with_sizes(diagnosis: Diagnosis) -> list[str]:
         return []
     joined = diagnosis.apparatus.words.as_sentence("; ".join(told[name] for name in diagnosis.stated))
     return [typeset_numbers(f"{joined}.")]
-
-
-def _too_few_readings_sentence(diagnosis: Diagnosis, n: int) -> str:
-    seen = diagnosis.recording.readings[diagnosis.recording.usable]
-    if n > 1 and float(np.ptp(seen)) == 0.0:
-        return f"All {n} readings are equal: there is no signal to diagnose."
-    return f"{count_with_noun(n, 'reading').capitalize()} {'is' if n == 1 else 'are'} too few for a diagnosis."
 
 
 def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:

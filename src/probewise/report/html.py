@@ -38,20 +38,12 @@ class Section:
     @property
     def elements(self) -> tuple[Markup, ...]:
         """The body as HTML."""
-        return tuple(map(_as_element, self.body))
-
-
-def _as_element(part: str | Mapping[str, str]) -> Markup:
-    if isinstance(part, Markup):
-        return part
-    return paragraph(part) if isinstance(part, str) else definition_list(part.items())
+        texts = (definition_list(p.items()) if isinstance(p, Mapping) else p for p in self.body)
+        return tuple(text if isinstance(text, Markup) else paragraph(text) for text in texts)
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
-    """Build an element; of attribute names, a trailing underscore is dropped (`class_`), others become hyphens.
-
-    Children and attribute values are escaped; a child that is `Markup` is kept.
-    """
+    """Build an element of escaped or `Markup` children; `class_` stands for class, underscores for hyphens."""
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
     )
@@ -113,18 +105,20 @@ def figure(image: bytes, caption: str) -> Markup:
     """Build a figure that embeds a PNG or an SVG; b"" could not be drawn."""
     if not image:
         return element("figure", paragraph("This figure could not be drawn."), element("figcaption", caption))
-    kind = "svg+xml" if image.startswith(b"<svg") else "png"
+    kind, size = "svg+xml", ""
+    if not image.startswith(b"<svg"):
+        with Image.open(io.BytesIO(image)) as picture:
+            dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
+            # Below 0.9 of the width as drawn (CSS px), a PNG's text is too small.
+            kind, size = "png", f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    size = "" if kind == "svg+xml" else _least_width_attribute(image)
     shown = Markup(f'<img src="{source}" alt="{html.escape(caption)}"{size}>')
     return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
 
 
-def _least_width_attribute(png: bytes) -> str:
-    """Return a style attribute: the width (CSS px) below which a PNG's text is too small, 0.9 of the width as drawn."""
-    with Image.open(io.BytesIO(png)) as picture:
-        dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
-        return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
+def figures(drawn: Mapping[str, bytes], captions: Mapping[str, str]) -> dict[str, Markup]:
+    """Build the figures that have a caption, by file name."""
+    return {name: figure(drawn[name], caption) for name, caption in captions.items() if name in drawn}
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
@@ -159,10 +153,12 @@ def page(
         sections = [
             replace(s, body=(*s.body, *_explain_new_terms(" ".join((s.heading, *s.elements)), known))) for s in sections
         ]
+    listed = sum(1 + len(s.parts) for s in sections) >= _FEWEST_LISTED
+    entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
         key_figure,
-        *_table_of_contents(sections),
+        *([element("nav", element("ol", *entries), aria_label="contents")] if listed else []),
         *(_section_element(s, str(k), 2) for k, s in enumerate(sections, start=1)),
     )
     again = () if reload_s is None else (Markup(f'<meta http-equiv="refresh" content="{reload_s}">'),)
@@ -194,13 +190,6 @@ def _section_element(section: Section, number: str, level: int) -> Markup:
     parts = (_section_element(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
     heading = element(f"h{level}", section.heading)
     return element("section", heading, *section.elements, *parts, id=_section_id(number))
-
-
-def _table_of_contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
-    if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
-        return ()
-    entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
-    return (element("nav", element("ol", *entries), aria_label="contents"),)
 
 
 def _contents_entry(section: Section, number: str) -> Markup:

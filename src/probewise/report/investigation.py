@@ -95,10 +95,9 @@ def _round_section(each: Round) -> Section:
     else:
         then = f"Next readings: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
     taken = count_with_noun(len(each.recording), "reading").capitalize()
-    test = f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}."
     said = (
         typeset_numbers(f"{taken} were taken, {why}."),
-        typeset_numbers(test),
+        typeset_numbers(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}."),
         table(("explanation", "probability"), ((name, probability_text(p)) for name, p in likely)),
         typeset_numbers(then),
     )

@@ -23,9 +23,9 @@ class ResidualMeans:
     """Mean residuals per bin; all arrays have shape (n_bins,).
 
     `at` is the covariate's mean in the bin, or 0, 1, 2 ... for a categorical covariate. `before` and `after` are the
-    mean residuals of the calibrated and of the repaired model (`after` None: nothing was repaired). `chance` is half
-    the width of the 95 % band of chance, `size` the number of readings. `by_value`: whether each bin is one value of a
-    covariate that has few.
+    mean residuals of the calibrated and of the repaired model (`after` None: nothing was repaired), `chance` half the
+    width of the 95 % band of chance, `size` the number of readings. `by_value`: each bin is one value of a covariate
+    that has few.
     """
 
     at: FloatArray
@@ -58,8 +58,8 @@ def mean_residuals(
     All have the shape (n_points,): the covariate, the residuals of both models, NaN where there is no reading, the
     noise `sd` of one reading, and `scan` numbers, within which successive noise has the correlation `rho`. `names` are
     those of a categorical covariate's values: each is a bin. No bin straddles the ends of `window`. `absorbed`,
-    (n_samples, n_points), are posterior samples of the predictions: the fit absorbs their variance from the noise,
-    which narrows the band.
+    (n_samples, n_points), are posterior samples of the predictions, whose variance the fit absorbs from the noise: it
+    narrows the band.
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]
@@ -84,10 +84,7 @@ def mean_residuals(
 
 
 def rows_by_value(values: FloatArray) -> list[IntArray] | None:
-    """List the rows of each value, ascending, of a covariate with up to 24 values of four rows or more on average.
-
-    None for any other: its rows are averaged with their neighbours.
-    """
+    """List the rows of each value, ascending, of up to 24 that have four rows or more on average; else None."""
     distinct = distinct_values(values)
     if distinct.size > _STEPS or values.size < _LEAST_ROWS * distinct.size:
         return None

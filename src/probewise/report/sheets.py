@@ -88,14 +88,19 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     the paper is unknown.
     """
     require(paper in PAPERS_MM, "paper", paper, " or ".join(PAPERS_MM))
-    width, height = PAPERS_MM[paper]
-    ways = [(_pages_across_and_up(sheet, page), page) for page in ((width, height), (height, width))]
+    ways = []
+    for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
+        rooms_mm = page[0] - LEFT_MM - RIGHT_MM, page[1] - BOTTOM_MM - TOP_MM
+        counts = [
+            1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
+            for length_mm, room_mm in zip(sheet.size_mm, rooms_mm, strict=True)
+        ]
+        ways.append((counts, page))
     (n_columns, n_rows), page = min(ways, key=lambda way: way[0][0] * way[0][1])
     if n_columns * n_rows > _MOST_PAGES:
         w, h = sheet.size_mm
-        raise ParameterError(
-            sheet.name, f"{w:g} x {h:g} mm, {n_columns * n_rows} pages", f"a sheet of {_MOST_PAGES} pages at most"
-        )
+        found = f"{w:g} x {h:g} mm, {n_columns * n_rows} pages"
+        raise ParameterError(sheet.name, found, f"a sheet of {_MOST_PAGES} pages at most")
     x_mm = np.linspace(sheet.low_mm[0], sheet.high_mm[0], n_columns + 1).tolist()
     y_mm = np.linspace(sheet.low_mm[1], sheet.high_mm[1], n_rows + 1).tolist()
     tiles = []
@@ -119,10 +124,7 @@ def points_of_lines(sheet: Sheet) -> FloatArray:
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
-    """Make one sheet per pattern that the plan uses, which reaches 40 mm or more beyond the plan's readings.
-
-    Without a plan, the sheets show each pattern's own extent.
-    """
+    """Make one sheet per pattern used, 40 mm or more beyond the plan's readings; without a plan, of its own extent."""
     sheets = []
     for name, pattern in patterns.items():
         places, turns = np.concatenate([np.zeros((1, 2)), _points_sheet_must_show(pattern)]), ()
@@ -169,10 +171,7 @@ def arm_home_jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     """Return two sheets that show an arm at its home angles: its links from the side, and its base from above."""
     base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
     turns = (shoulder, shoulder + elbow if geometry.elbow_is_relative else elbow)
-    joints = [np.array(geometry.shoulder_mm)]
-    for length, angle in zip(geometry.links_mm, turns, strict=True):
-        joints.append(joints[-1] + length * np.array([math.cos(angle), math.sin(angle)]))
-    face = joints[-1] + [geometry.sensor_mm[0], -geometry.sensor_mm[1]]
+    *joints, face = geometry.joints_from_side_mm(shoulder, elbow)
     return _links_from_side_sheet(geometry, joints, face, turns), _base_from_above_sheet(geometry, base, float(face[0]))
 
 
@@ -257,15 +256,6 @@ def _sheet_corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tupl
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
     (x_low, y_low), (x_high, y_high) = low.tolist(), high.tolist()
     return (x_low, y_low), (x_high, y_high)
-
-
-def _pages_across_and_up(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
-    rooms_mm = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
-    n_across, n_up = (
-        1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
-        for length_mm, room_mm in zip(sheet.size_mm, rooms_mm, strict=True)
-    )
-    return n_across, n_up
 
 
 def _points_sheet_must_show(pattern: Pattern) -> FloatArray:

@@ -15,7 +15,6 @@ from probewise.diagnosis.search.hypotheses import (
     Evidences,
     Refits,
     _amplitudes_in_residual,
-    is_significantly_better,
     posterior_of,
 )
 from probewise.diagnosis.search.search import search_with_formulas
@@ -56,7 +55,7 @@ def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
     assert weighed.evidence[()].log_z > state.null.evidence[()].log_z + 20
     idle = state.refits.refit_with_effect(state.null, state.effects["input_offset:force"])[0]
     assert idle.evidence.keys() == state.null.evidence.keys()
-    assert not is_significantly_better(idle, state.null)
+    assert not idle.is_significantly_better(state.null)
     assert idle.log_z <= state.null.log_z + 0.02
 
 
@@ -202,6 +201,14 @@ def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):
     assert any(name.startswith("formula:") and "room" in name for name in asked[0])
 
 
+def _refit_favoured(state):
+    def posterior():
+        own = Evidences(state.candidates, state.screened_log_evidences())
+        return posterior_of(own, state.prior, certain=(), n_forms=1)
+
+    searching._refit_favoured_by_screening(state, posterior)
+
+
 def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part_first(prepared_line):
     """About the null the pair promises 500 nats; about the fit with one of the two it promises nothing."""
     searched = searching.search(prepared_line)
@@ -214,12 +221,7 @@ def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part
     pair = ("offset_drift", "sensitivity:room")
     state.about_null[pair, ()] = state.null.log_z + 500.0
 
-    def posterior():
-        return posterior_of(
-            Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
-        )
-
-    searching._refit_favoured_by_screening(state, posterior)
+    _refit_favoured(state)
     assert pair not in state.refitted_combinations | state.undetected
     (part,) = state.candidates_of_combination(("sensitivity:room",))
     assert state.screened_log_evidences()[pair, ()] < part.log_z + 3.0
@@ -232,12 +234,7 @@ def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
     pairs = list(itertools.combinations(sorted(state.effects), 2))[:8]
     state.about_null |= {(tuple(sorted(pair)), ()): promised for pair in pairs}
 
-    def posterior():
-        return posterior_of(
-            Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
-        )
-
-    searching._refit_favoured_by_screening(state, posterior)
+    _refit_favoured(state)
     left = {
         names: value for (names, _), value in state.screened_log_evidences().items() if names not in state.undetected
     }

@@ -7,7 +7,6 @@ import pytest
 
 from probewise.diagnosis import EffectFound, ModelSamples, ParameterFound, Place
 from probewise.proof.challenge import effect_truths_and_intervals, place_overlap, sensor_truths_and_intervals
-from probewise.proof.sensors.cases import HiddenEffect
 from probewise.proof.sensors.effects import CovariateRegion
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
@@ -51,7 +50,7 @@ def found(*parameters):
 
 def test_an_angle_counts_by_its_nearest_turn():
     stated = found(("phase", "rad", -0.1, 0.1), ("amp", "LEGO", 1.0, 2.0))
-    within = effect_truths_and_intervals(HiddenEffect(flicker(1.5, 0.02, 2 * math.pi - 0.05), 8.0).parameters, stated)
+    within = effect_truths_and_intervals(flicker(1.5, 0.02, 2 * math.pi - 0.05).parameters, stated)
     assert within["amp"] == [1.5, 1.0, 2.0]
     assert within["phase"] == pytest.approx([-0.05, -0.1, 0.1])
 

@@ -5,7 +5,7 @@ import lzma
 import challenges_side_by_side as side_by_side
 import pytest
 
-from probewise.proof.campaign import read_campaign, run_campaign
+from probewise.proof.campaign import Campaign, read_campaign
 
 
 def _case(kind, p_value, verdict="clean", combination=(), **more):
@@ -46,7 +46,7 @@ def _square(number):
 
 def test_a_packed_campaign_is_read_as_an_unpacked_one(tmp_path):
     cases = tmp_path / "cases.jsonl"
-    run_campaign(_square, {f"seed / {k}": k for k in range(3)}, path=cases, settings={"seed": 1})
+    Campaign(_square, {f"seed / {k}": k for k in range(3)}, {"seed": 1}).run(path=cases)
     packed = tmp_path / "cases.jsonl.xz"
     packed.write_bytes(lzma.compress(cases.read_bytes()))
     assert read_campaign(packed) == read_campaign(cases)

@@ -80,7 +80,7 @@ def test_what_a_file_holds_is_not_done_again(study):
     one = campaign_of({REFERENCE: 1}, max_readings=3)
     again = one.run(path=study[1], progress=lambda *words: told.append(words))
     assert told == [("runs", 1, 1)]
-    (trial,) = one.tasks
+    (trial,) = one.tasks.values()
     assert again == {trial: study[0][trial]}
     assert summaries(again) == {}
 

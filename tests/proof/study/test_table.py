@@ -11,22 +11,13 @@ from probewise.proof.configurations import SearchConfiguration
 from probewise.proof.estimates import estimated_share
 from probewise.proof.study import summarise
 
+from ..conftest import search
 
-def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, error_mm: float = 1.0) -> dict:
-    return {
-        "reached": reached,
-        "readings": readings,
-        "first_white": first_white,
-        "bits": 20.0,
-        "bits_at_white": 8.0,
-        "error_mm": error_mm,
-        "chance_wrong": 0.001,
-        "held": [True, True, False],
-        "arm_s": 10.0 * readings,
-        "cpu_s": 0.1,
-        "widest_mm": [50.0] * readings,
-        "p_value": 0.5,
-    }
+
+def trial(readings, **others):
+    return search(
+        readings, **{"first_white": 3, "bits": 20.0, "chance_wrong": 1e-3, "held": [True, True, False], **others}
+    )
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 50), (1, 7), (89, 100), (200, 200)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.proof.systems.forms import forms_of
+from probewise.proof.systems.forms import SystemEffect, forms_of
 from probewise.proof.systems.kinds import SystemKind, SystemTable
 from probewise.proof.systems.simulate import simulate_noise_free
 
@@ -45,7 +45,7 @@ def with_form(name, numbers, **options):
     kind, rows, parameters = small(**options)
     bare = simulate_noise_free(kind, rows, parameters)
     form = next(form for form in forms_of(bare) if form.name == name)
-    return simulate_noise_free(kind, rows, parameters, [(form, numbers)]).readings, rows, bare.readings
+    return simulate_noise_free(kind, rows, parameters, [SystemEffect(form, numbers)]).readings, rows, bare.readings
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ def _case(kind, said='noise = {"sd": 0.5}', seed=5):
         "white", 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_table, kind.sd, rng=rng
     )
     labels = tuple(f"r{k}" for k in range(drawn.table.n_runs))
-    return SystemCase(1, 0, Stratum("clean"), drawn, (), noise, said, labels, noise_free, np.round(noise_free, 9))
+    return SystemCase(Stratum("clean"), drawn, (), noise, said, labels, noise_free, np.round(noise_free, 9))
 
 
 @pytest.mark.parametrize(

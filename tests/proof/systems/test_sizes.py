@@ -12,7 +12,6 @@ from probewise.proof.systems.cases import (
     SYSTEMS_WHEEL,
     Stratum,
     SystemCase,
-    SystemEffect,
     draw_effect_of_size,
     draw_system,
     draw_system_case,
@@ -20,7 +19,7 @@ from probewise.proof.systems.cases import (
     system_stratum_of,
     table_text,
 )
-from probewise.proof.systems.forms import forms_of
+from probewise.proof.systems.forms import SystemEffect, forms_of
 from probewise.proof.systems.noise import noise_of_size
 
 BY_NAME = {kind.name: kind for kind in KINDS}
@@ -39,14 +38,14 @@ def _concealed(drawn, name, wanted):
 
 
 def _size(drawn, effect):
-    return np.linalg.norm(SystemRefit()(drawn, drawn.simulate_diagnosed_rows([effect.form_with_parameters])))
+    return np.linalg.norm(SystemRefit()(drawn, drawn.simulate_diagnosed_rows([effect])))
 
 
 def _case(drawn, effects):
     """A case without noise."""
-    free = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
+    free = drawn.simulate_all_rows(effects)
     noise = noise_of_size("white", 12.0, free, drawn.table, drawn.kind.sd, rng=np.random.default_rng(0))
-    return SystemCase(1, 0, Stratum("single"), drawn, tuple(effects), noise, "", (), free, free)
+    return SystemCase(Stratum("single"), drawn, tuple(effects), noise, "", (), free, free)
 
 
 @pytest.mark.parametrize("wanted", [6.0, 20.0])
@@ -55,7 +54,7 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
     """zero + k q^2 is linear in its parameters: a projection tells what is left."""
     drawn = _drawn("orifice flow meter")
     effect = _concealed(drawn, name, wanted)
-    with_effect = drawn.simulate_diagnosed_rows([effect.form_with_parameters])
+    with_effect = drawn.simulate_diagnosed_rows([effect])
     q = drawn.diagnosed_table.columns["flow_lpm"]
     basis = np.stack([np.ones_like(q), q**2], axis=1)
     left = with_effect - basis @ np.linalg.lstsq(basis, with_effect, rcond=None)[0]
@@ -66,7 +65,7 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
 def test_what_a_bent_model_leaves_is_as_large_as_asked():
     drawn = _drawn("photodiode against distance")
     effect = _concealed(drawn, "sensitivity:board_c", 12.0)
-    d, y = drawn.diagnosed_table.columns["dist_mm"], drawn.simulate_diagnosed_rows([effect.form_with_parameters])
+    d, y = drawn.diagnosed_table.columns["dist_mm"], drawn.simulate_diagnosed_rows([effect])
 
     def law(d, dark, power, behind):
         return dark + 1e5 * power / (d + behind) ** 2

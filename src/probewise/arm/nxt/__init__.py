@@ -5,7 +5,7 @@ interface. Each layer can be used and tested without those above it.
 """
 
 from probewise.arm.nxt.brick import Brick, BrickMachine
-from probewise.arm.nxt.light import LightReading, LightSensor, SensorError, normalized_from_counts
+from probewise.arm.nxt.light import LightSensor, SensorError, normalized_from_counts, percent_from_counts
 from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, SerialPort, Timing
 from probewise.arm.nxt.motor import DriveParameters, Guard, Motor, MotorError
 from probewise.arm.nxt.telegram import BrickError, Reply, Request, TelegramError, decode, encode, framed
@@ -17,7 +17,6 @@ __all__ = [
     "ByteStream",
     "DriveParameters",
     "Guard",
-    "LightReading",
     "LightSensor",
     "Link",
     "Motor",
@@ -33,4 +32,5 @@ __all__ = [
     "encode",
     "framed",
     "normalized_from_counts",
+    "percent_from_counts",
 ]

@@ -14,7 +14,7 @@ from probewise._signals import defer_signals
 from probewise.arm.geometry import ROOM_COUNTS, Geometry
 from probewise.arm.instrument import Clock, Side
 from probewise.arm.machine import SoftLimits
-from probewise.arm.nxt.light import LightSensor
+from probewise.arm.nxt.light import LightSensor, percent_from_counts
 from probewise.arm.nxt.link import Link, SerialPort
 from probewise.arm.nxt.motor import DriveParameters, Guard, Motor
 from probewise.arm.nxt.telegram import (
@@ -202,7 +202,7 @@ class BrickMachine:
             self.limits.record_present_count(joint, 0)
 
     def read_percent(self) -> float:
-        return self._light.flash().fine_percent
+        return percent_from_counts(self._light.flash())
 
     def battery_mv(self) -> float:
         return self.brick.battery_mv()

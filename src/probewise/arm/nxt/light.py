@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import time
-from dataclasses import dataclass
 
 from probewise.arm.instrument import Clock
 from probewise.arm.nxt.link import Link
-from probewise.arm.nxt.telegram import GetInputValues, InputValues, SensorMode, SensorType, SetInputMode, TelegramError
+from probewise.arm.nxt.telegram import (
+    LED_OFF,
+    LED_ON,
+    NO_SENSOR,
+    RAW,
+    GetInputValues,
+    InputValues,
+    SetInputMode,
+    TelegramError,
+)
 from probewise.errors import LinkError, require
 
 AD_MAX = 1023
@@ -22,50 +30,36 @@ class SensorError(LinkError):
 
 
 def normalized_from_counts(raw_counts: int) -> int:
-    """Convert A/D counts, which fall with brightness, to 0 (dark) to 1023 (bright).
+    """Convert A/D counts, 0 to 1023 (else ParameterError), which fall with brightness, to 0 (dark) to 1023 (bright).
 
     The firmware's integer arithmetic for types 05 and 06: only 697 of the 1024 values occur.
-
-    Raises ParameterError if the counts are outside the converter's 0 to 1023.
     """
     require(0 <= raw_counts <= AD_MAX, "raw_counts", raw_counts, f"0 to {AD_MAX}")
     dark = max(raw_counts - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT
     return AD_MAX - min(dark, AD_MAX)
 
 
-@dataclass(frozen=True)
-class LightReading:
-    """One reading, in A/D counts, 0 (bright) to 1023 (dark)."""
-
-    raw_counts: int
-
-    @property
-    def normalized(self) -> int:
-        """Brightness from 0 (dark) to 1023 (bright)."""
-        return normalized_from_counts(self.raw_counts)
-
-    @property
-    def fine_percent(self) -> float:
-        """Percent from 0 to 100 at the converter's resolution, about seven steps per percent."""
-        return self.normalized * 100 / AD_MAX
+def percent_from_counts(raw_counts: int) -> float:
+    """Convert A/D counts to percent, 0 (dark) to 100 (bright), about seven steps per percent."""
+    return normalized_from_counts(raw_counts) * 100 / AD_MAX
 
 
 class LightSensor:
-    """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode.
+    """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode: A/D counts.
 
     While the brick marks a reading as invalid, the read is repeated for `valid_s`, three times at least.
     """
 
     def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:
         self._link, self.port, self._clock, self._valid_s = link, port, clock, valid_s
-        self._type: SensorType | None = None
+        self._type: int | None = None
 
     def set_led(self, lit: bool = True) -> None:
         """Switch the LED on (`lit`) or off, and set the input to raw readings."""
-        self._type = SensorType.LIGHT_ACTIVE if lit else SensorType.LIGHT_INACTIVE
-        self._link.ask(SetInputMode(self.port, self._type, SensorMode.RAW))
+        self._type = LED_ON if lit else LED_OFF
+        self._link.ask(SetInputMode(self.port, self._type, RAW))
 
-    def flash(self) -> LightReading:
+    def flash(self) -> int:
         """Light the LED for one reading, as in the paper: it is at the same temperature in all of them.
 
         The reading is the first that the brick marks as valid, 20 ms or more after the LED came on. A lost connection
@@ -79,11 +73,11 @@ class LightSensor:
             with contextlib.suppress(LinkError):
                 self._link.tell(self.off_command)
 
-    def read(self) -> LightReading:
+    def read(self) -> int:
         """Read once, with the LED as last set (by default on).
 
-        Raises SensorError if the brick marks every reading as invalid; TelegramError if the brick's answers remain
-        inconsistent after repeated questions.
+        Raises SensorError if the brick marks every reading as invalid, TelegramError if its answers remain
+        inconsistent.
         """
         if self._type is None:
             self.set_led()
@@ -92,22 +86,22 @@ class LightSensor:
         while True:
             number += 1
             values = self._link.ask(GetInputValues(self.port), check=_require_consistent)
-            as_set = (values.type, values.mode) == (self._type, SensorMode.RAW)
+            as_set = (values.type, values.mode) == (self._type, RAW)
             # An invalid reading still holds the old values.
             if as_set and values.valid:
-                return LightReading(values.raw)
+                return values.raw
             if number >= N_INVALID and self._clock.monotonic() > deadline:
                 raise SensorError(
                     f"input {self.port + 1} gave no valid reading for {self._valid_s:g} s; "
                     "is the light sensor plugged in?"
                 )
             if not as_set:  # a program that starts or stops resets all settings
-                self.set_led(self._type == SensorType.LIGHT_ACTIVE)
+                self.set_led(self._type == LED_ON)
 
     @property
     def off_command(self) -> SetInputMode:
         """The command that switches the LED off and unconfigures the input."""
-        return SetInputMode(self.port, SensorType.NONE, SensorMode.RAW)
+        return SetInputMode(self.port, NO_SENSOR, RAW)
 
 
 def _require_consistent(values: InputValues) -> None:
@@ -120,7 +114,7 @@ def _require_consistent(values: InputValues) -> None:
             f"input {values.port + 1} says valid {values.valid}, calibrated {values.calibrated}, {values.raw} counts; "
             f"allowed: 0 or 1, 0, 0 to {AD_MAX}"
         )
-    is_light = values.type in (SensorType.LIGHT_ACTIVE, SensorType.LIGHT_INACTIVE) and values.mode == SensorMode.RAW
+    is_light = values.type in (LED_ON, LED_OFF) and values.mode == RAW
     if (
         values.valid
         and is_light

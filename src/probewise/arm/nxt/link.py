@@ -48,19 +48,15 @@ class ByteStream(Protocol):
     @property
     def name(self) -> str:
         """Name of the connection, for messages."""
-        ...
 
     def read(self, size: int, timeout_s: float) -> bytes:
         """Return up to `size` bytes, fewer if no more come in `timeout_s`; LinkError if the connection is lost."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Send all bytes; LinkError if the connection is lost."""
-        ...
 
     def close(self) -> None:
         """Close the connection."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -87,10 +83,7 @@ class NoAnswerError(LinkError):
 
 
 class Link:
-    """A connection to a brick over an open stream, one question at a time.
-
-    `n_asked` and `n_told` count the questions, and the commands sent without requesting an answer.
-    """
+    """A connection to a brick over an open stream; `n_asked` counts questions, `n_told` commands without answer."""
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
         self._stream, self._clock, self._timing, self.name = stream, clock, timing, stream.name
@@ -100,14 +93,11 @@ class Link:
         self._awake_until = clock.monotonic()
 
     def ask(self, request: Request[A], *, check: Callable[[A], None] | None = None) -> A:
-        """Send a command and return the answer.
+        """Send a command and return the answer; repeat one that does no harm if that is missing or corrupted.
 
-        A repeatable command is repeated if the answer is missing, corrupted or a refusal; others are sent once.
-
-        `request`: the command; `check`: function that raises TelegramError for an impossible answer; None: any answer
-        is accepted. Raises BrickError if the brick refuses the command; NoAnswerError if the brick did not answer in
-        time, although the connection may still work; TelegramError if the received bytes are not an answer; LinkError
-        if the connection is dead.
+        `check` raises TelegramError for an impossible answer. Raises BrickError if the brick refuses the command, again
+        if it was repeated; NoAnswerError if it did not answer in time, although the connection may still work;
+        TelegramError if the received bytes are not an answer; LinkError if the connection is dead.
         """
         self.keep_awake()
         for n_left in reversed(range(1 + self._timing.n_repeats if request.is_repeatable else 1)):
@@ -136,10 +126,7 @@ class Link:
         self._free_at = self._clock.monotonic() + self._timing.gap_s
 
     def keep_awake(self) -> None:
-        """Reset the brick's sleep timer if the last reset is `keep_awake_s` ago; `ask` does so too.
-
-        Call this now and then if the connection is idle for minutes.
-        """
+        """Reset the brick's sleep timer if that was not done for `keep_awake_s`; `ask` does so too."""
         if self._clock.monotonic() < self._awake_until:
             return
         # Set first: `ask` calls this method.

@@ -17,13 +17,16 @@ from typing import TypeAlias
 from probewise.arm.instrument import Clock, Side
 from probewise.arm.nxt.link import Link, NoAnswerError
 from probewise.arm.nxt.telegram import (
+    BRAKE,
+    BY_SPEED,
+    IDLE,
+    MOTOR_ON,
+    REGULATED,
+    RUNNING,
     BrickError,
     GetOutputState,
-    OutputMode,
     OutputState,
-    Regulation,
     ResetMotorPosition,
-    RunState,
     SetOutputState,
     TelegramError,
 )
@@ -35,8 +38,8 @@ Guard: TypeAlias = Callable[[int, int], None]
 COUNTS_S = 10.0  # counts per second and unit of power
 STUCK, BEYOND = "is stuck at", "runs on beyond its goal, to"
 FAINT_POWER = 1  # a motor needs about 8 to overcome its own friction
-BRAKED = OutputMode.ON | OutputMode.BRAKE
-DRIVEN = BRAKED | OutputMode.REGULATED
+BRAKED = MOTOR_ON | BRAKE
+DRIVEN = BRAKED | REGULATED
 N_ASKED = 6  # largest number of queries until two successive states agree
 N_UNTAKEN = 3  # successive commands ignored by the brick after which a move fails
 
@@ -159,7 +162,7 @@ class Motor:
         """
         start = self._find_firmware_target()
         power = side * self.drive.seek_power
-        gently = SetOutputState(self.port, power, BRAKED, run_state=RunState.RUNNING, limit_counts=farthest)
+        gently = SetOutputState(self.port, power, BRAKED, run_state=RUNNING, limit_counts=farthest)
         while not self._try_to_start_limited_move(start + side * farthest, side, gently):
             start = self._find_firmware_target()
         trouble = self._await_idle_or_trouble(
@@ -204,8 +207,7 @@ class Motor:
         return self._make_limited_move(side * max(side * slow_target, least), side, self.drive.slow_power, here)
 
     def _coast_counts(self, power: int, side: Side) -> int:
-        share = power / self.drive.fast_power
-        return round(self._coast.get((power, side), share * self.drive.coast_counts))
+        return round(self._coast.get((power, side), (power / self.drive.fast_power) * self.drive.coast_counts))
 
     def _make_limited_move(self, target: int, side: Side, power: int, here: int) -> int:
         """Make one limited move to a firmware target; return the count at rest. MotorError if stuck or overrunning."""
@@ -228,15 +230,11 @@ class Motor:
         if ran_on < -self.drive.tolerance_counts:
             self._target = None  # it stopped short of the target, which must be elsewhere
             return here
-        learned = self._coast.get((power, side), ran_on)
-        self._coast[power, side] = (learned + ran_on) / 2
+        self._coast[power, side] = (self._coast.get((power, side), ran_on) + ran_on) / 2
         return here
 
     def _try_to_start_limited_move(self, target: int, side: Side, command: SetOutputState) -> bool:
-        """Command a limited move, exactly once; return whether the brick accepted it.
-
-        Raises LinkError if several successive commands were not accepted.
-        """
+        """Command a limited move, exactly once; return whether the brick accepted it; at the third refusal raise."""
         try:
             self._link.ask(command)
         except (NoAnswerError, TelegramError, BrickError) as error:
@@ -259,10 +257,9 @@ class Motor:
         """
 
         def has_faint_power(state: OutputState) -> bool:
-            return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RunState.RUNNING, 0)
+            return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RUNNING, 0)
 
-        faint = SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RunState.RUNNING)
-        self._link.ask(faint)
+        self._link.ask(SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RUNNING))
         self._clock.sleep(self.drive.settle_s)
         state = self._read_confirmed_state(has_faint_power)
         if not has_faint_power(state):
@@ -278,10 +275,10 @@ class Motor:
 
         def is_plausible(state: OutputState) -> bool:
             # The firmware releases a motor at its target, not before.
-            return state.run_state == RunState.RUNNING or side * (state.rotation_counts - target) >= 0
+            return state.run_state == RUNNING or side * (state.rotation_counts - target) >= 0
 
         here, changed_at = start, self._clock.monotonic()
-        while (state := self._read_confirmed_state(is_plausible)).run_state != RunState.IDLE:
+        while (state := self._read_confirmed_state(is_plausible)).run_state != IDLE:
             now = self._clock.monotonic()
             if state.rotation_counts != here:
                 here, changed_at = state.rotation_counts, now
@@ -317,9 +314,7 @@ class Motor:
         return self._link.ask(GetOutputState(self.port))
 
     def _drive_command(self, power: int, limit: int) -> SetOutputState:
-        return SetOutputState(
-            self.port, power, DRIVEN, Regulation.SPEED, run_state=RunState.RUNNING, limit_counts=limit
-        )
+        return SetOutputState(self.port, power, DRIVEN, BY_SPEED, run_state=RUNNING, limit_counts=limit)
 
 
 def _counter_offsets(state: OutputState) -> tuple[int, int]:

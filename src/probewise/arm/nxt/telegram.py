@@ -12,7 +12,6 @@ import dataclasses
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
 from types import MappingProxyType
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
@@ -82,43 +81,14 @@ LONGEST = 128
 
 
 ALL_OUTPUTS = 0xFF
-
-
-class SensorType(IntEnum):
-    """Type of the sensor at an input."""
-
-    NONE = 0x00
-    LIGHT_ACTIVE = 0x05  # its LED on
-    LIGHT_INACTIVE = 0x06  # its LED off
-
-
-class SensorMode(IntEnum):
-    """Reading mode of an input."""
-
-    RAW = 0x00
-
-
-class OutputMode(IntFlag):
-    """Driving mode of a motor, flags."""
-
-    IDLE = 0x00
-    ON = 0x01
-    BRAKE = 0x02
-    REGULATED = 0x04
-
-
-class Regulation(IntEnum):
-    """Regulated quantity of a motor."""
-
-    IDLE = 0x00
-    SPEED = 0x01
-
-
-class RunState(IntEnum):
-    """Run state of a motor; the brick also reports transient states, which have no name here."""
-
-    IDLE = 0x00
-    RUNNING = 0x20
+NO_SENSOR, LED_ON, LED_OFF = 0x00, 0x05, 0x06
+"""Types of the sensor at an input: none, the light sensor with its LED on, and off."""
+RAW = 0x00  # reading mode of an input
+MOTOR_ON, BRAKE, REGULATED = 0x01, 0x02, 0x04
+"""Driving modes of a motor, flags."""
+BY_SPEED = 0x01  # what is regulated
+IDLE, RUNNING = 0x00, 0x20
+"""Run states of a motor; the brick also reports transient states."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +121,7 @@ class Request(Body, Generic[A_co]):
     def decode_answer(self, reply: Reply) -> A_co:
         """Decode a reply to this command into its answer.
 
-        Raises BrickError if the brick refused the command; the status gives the reason; TelegramError if the reply
-        belongs to another command or port, or its length is wrong.
+        BrickError if the brick refused the command; TelegramError for another command, port or length.
         """
         if reply.opcode != self.OPCODE:
             raise TelegramError(f"a reply to opcode {reply.opcode:02X} came for {self.name}, {self.OPCODE:02X}")
@@ -196,10 +165,10 @@ class SetOutputState(Request[None]):
     )
     port: int
     power: int = 0
-    mode: int = OutputMode.IDLE
-    regulation: int = Regulation.IDLE
+    mode: int = 0
+    regulation: int = 0
     turn_ratio: int = 0
-    run_state: int = RunState.IDLE
+    run_state: int = IDLE
     limit_counts: int = 0
 
     @property

@@ -1,14 +1,16 @@
 """Hypotheses: combinations of effects, refitted jointly under competing noise models, and their probabilities.
 
-A search fits them and returns evidence and posterior probability of each, with the refits.
+`WeighedFit` is one hypothesis on the mean with its evidence under each noise model, `NoiseModels` are these models,
+`Refits` makes such fits, and `Searched` is the result of a search: evidences, and the probabilities that follow.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from functools import cache
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from scipy.special import logsumexp
@@ -24,7 +26,7 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, least_sd_given_rounding, rough_sd
+from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, rough_sd
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
@@ -46,15 +48,14 @@ from probewise.effects.noise import (
     random_walk,
 )
 from probewise.errors import NotConvergedError
+from probewise.inference import sd_floor
 from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
 # Nats that are expected between two hypotheses, below which readings do not tell them apart: the contract's odds of 20
-# to 1. What has no name was believed half again as often as it was true, 371 times for 250, nearly always where one
-# name had made as much of the readings to within these three nats. As far behind the best, a noise model, SSF order or
-# proposal does not say what to refit next; at a cost: what looked worse by three nats before a refit was seen to be
-# better by eight after it.
+# to 1. As far behind the best, a noise model, SSF order or proposal does not say what to refit next; at a cost: a refit
+# can make what looked worse by three nats better by eight.
 ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
@@ -68,6 +69,27 @@ _MANY = 12  # nodes of one effect above which they are thinned before combinatio
 # Nats behind the best to which refined nodes must be able to raise a noise model: further back it does not count.
 _NOISE_NODES_REFINED_WITHIN = 10.0
 
+Hypothesis: TypeAlias = tuple[Names, Names]
+"""Names of the effects on the mean, and on the noise."""
+
+K = TypeVar("K", bound=Hashable)
+
+
+def _sums(terms: Iterable[tuple[K, float]]) -> dict[K, float]:
+    """Add up the values of each key."""
+    out: dict[K, float] = {}
+    for key, value in terms:
+        out[key] = out.get(key, 0.0) + value
+    return out
+
+
+def _log_sums(terms: Iterable[tuple[K, float]]) -> dict[K, float]:
+    """Add up the values of each key, which are given and returned as logs."""
+    out: dict[K, float] = {}
+    for key, value in terms:
+        out[key] = float(np.logaddexp(out.get(key, -np.inf), value))
+    return out
+
 
 def or_impossible(log_z: float) -> float:
     """Return a log evidence, minus infinity for one that is no number: all probabilities would be none."""
@@ -76,43 +98,31 @@ def or_impossible(log_z: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class WeighedFit:
-    """A candidate: effects on the mean refitted with an SSF of some number of Gaussians; evidence by noise effects."""
+    """A candidate: effects on the mean refitted with an SSF of some number of Gaussians; evidence by noise effects.
+
+    `law` is the noise distribution of the fit. In the evidence are the log prior factor of the effects' discrete
+    choices (variants), `log_share`, and the log probability that all have a detectable size, `log_detectable`;
+    `weights` are those of each effect's variants.
+    """
 
     found: Fit
-    law: NoiseLaw  # noise distribution of the fit
+    law: NoiseLaw
     evidence: Mapping[Names, NoiseEvidence]
-    log_share: float  # log prior factor of the effects' discrete choices (variants)
-    log_detectable: float  # log probability that all effects have a detectable size
-    weights: Mapping[str, FloatArray]  # weights of each effect's variants
+    log_share: float
+    log_detectable: float
+    weights: Mapping[str, FloatArray]
 
     @property
     def names(self) -> Names:
         """Names of its effects on the mean, sorted."""
         return tuple(sorted(self.found.model.names))
 
-    @classmethod
-    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_detectable: float) -> WeighedFit:
-        """Build from a fit and its `plain` evidence by noise model: of its parameters alone, without prior factors."""
-        return cls(found, law, {}, 0.0, log_detectable, {}).with_evidence(plain)
-
-    @property
-    def log_prior_factor(self) -> float:
-        """Log prior factor in its evidence: of its effects' discrete choices, and of their detectable sizes."""
-        return self.log_share + self.log_detectable
-
-    def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
-        """Return a copy with new evidence, by noise model: `plain`, of its parameters alone, plus its prior factor."""
-        return replace(self, evidence=plain).with_log_evidence_shifted(self.log_prior_factor)
-
     def with_variant_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
         """Return a copy with other log prior factor and weights of its effects' variants (discrete choices)."""
         return replace(self.with_log_evidence_shifted(log_share - self.log_share), log_share=log_share, weights=weights)
 
     def with_log_evidence_shifted(self, by: float) -> WeighedFit:
-        """Return a copy with its log evidence shifted by these nats under every noise model.
-
-        An evidence that is no number counts as minus infinity: it must not spoil the probabilities of all others.
-        """
+        """Return a copy with its log evidence shifted by these nats under every noise model."""
         shifted = {noise: replace(e, log_z=or_impossible(e.log_z + by)) for noise, e in self.evidence.items()}
         return replace(self, evidence=shifted)
 
@@ -159,6 +169,16 @@ class WeighedFit:
         best, plain = self.log_z, min(self.evidence, key=len)
         return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - ALIASED_NATS)
 
+    def is_significantly_better(self, than: WeighedFit) -> bool:
+        """Return whether its log likelihood exceeds that of another by more than 1.5 nats."""
+        return _improves_fit(self.found, than.found, self.law)
+
+
+def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
+    whitened = law(np.stack([beyond.residuals, found.residuals], axis=1))
+    before, after = law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))
+    return bool(before - after > 1.5)
+
 
 def expected_log_bayes_factor(first: WeighedFit, second: WeighedFit) -> float:
     """Return the log Bayes factor expected between two candidates if the first is true, in nats.
@@ -182,6 +202,9 @@ def effects_out_of_vocabulary(mean: Names) -> Names:
 WITH_MEMORY = frozenset({correlated_noise.name, random_walk.name})
 """Effects on the noise of which a noise distribution can contain only one."""
 
+Nodes: TypeAlias = Mapping[str, tuple[FloatArray, FloatArray]]
+"""Nodes of effects on the noise, by name, (n_nodes, n_params), and their log prior weights."""
+
 
 @dataclass(eq=False)
 class NoiseModels:
@@ -201,23 +224,22 @@ class NoiseModels:
     models: dict[Names, NoiseModel] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.least_sd = least_sd_given_rounding(self.recording)
         self._step = lattice_step(self.recording.readings[self.recording.usable])
+        # On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice.
+        self.least_sd = max(sd_floor(self.recording), HIDDEN * self._step)
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
-        seen = ROUNDING_SEEN_ABOVE * sd < self._step
-        rounded = {quantisation.name: np.array([self._step])} if quantisation.name in self.effects and seen else {}
-        shown = {name: effect.known for name, effect in self.effects.items() if effect.known is not None}
-        self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
-        self.certain = tuple(sorted(self._known))
+        known = {name: effect.known for name, effect in self.effects.items() if effect.known is not None}
+        if quantisation.name in self.effects and ROUNDING_SEEN_ABOVE * sd < self._step:
+            known.setdefault(quantisation.name, np.array([self._step]))
+        self._known = {name: (values[None, :], np.zeros(1)) for name, values in known.items()}
         self._hidden = sd < HIDDEN * self._step
-        others = [name for name in self.effects if name not in (quantisation.name, *self.certain)]
-        single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in sorted(others)))]
+        self.certain = tuple(sorted(known))
+        others = sorted(name for name in self.effects if name not in (quantisation.name, *self.certain))
+        single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in others))]
         self.models = {names: self._build_model(names) for names in single}
 
-    def _build_model(
-        self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None
-    ) -> NoiseModel:
+    def _build_model(self, names: Names, likely: Nodes | None = None) -> NoiseModel:
         # Certain effects are not re-estimated about each fit, whose own residual may be larger.
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
@@ -244,16 +266,14 @@ class NoiseModels:
             for names, own in evidence.items()
         }
 
-    def best_evidence(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
-        """Return the evidence, of those given by noise model, whose noise model is most probable, priors included."""
-        return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
+    def likeliest_law(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseLaw:
+        """Return the distribution of the noise model that is most probable by its evidence, priors included."""
+        return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))].likeliest_law
 
     def add_significant_pairs(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
         """Add pairs of noise effects to the models if a single one is significant about a fit; triples if a pair is.
 
-        Only those within three nats of the best are added.
-
-        Returns whether any pair was tried.
+        Only those within three nats of the best are added. Returns whether any pair was tried.
         """
         known, singles = dict(evidence), list(evidence)
         for size in range(1, _MOST_FAULTS):
@@ -263,8 +283,7 @@ class NoiseModels:
             if not parts or known[first].log_z < max(known[n].log_z for n in parts) + ALIASED_NATS:
                 return size > 1
             # Beside another effect the likeliest values may be others: nodes about them alone would lie too close.
-            of_first = laplace_evidence(found, self.models[first])
-            likely = {name: of_first.likeliest_nodes_of_effect(name) for name in self._uncertain_names(first)}
+            likely = self._likeliest_nodes(laplace_evidence(found, self.models[first]))
             best = max(e.log_z + self.log_prior(names) for names, e in known.items())
             for other in singles:
                 both = tuple(sorted({*first, *other}))
@@ -278,32 +297,26 @@ class NoiseModels:
                 nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
                 least = best - ALIASED_NATS - self.log_prior(both)
                 own = refined(found, nearby, least=least)
-                if own.log_z > least:
-                    # Of all nodes of each effect, the likeliest beside the likeliest of the others.
-                    best_of = {name: nearby.likeliest_nodes_of_effect(name) for name in self._uncertain_names(both)}
-                    recentred = {}
-                    for name in self._uncertain_names(first):
-                        beside = {k: nodes for k, nodes in best_of.items() if k != name}
-                        again = laplace_evidence(found, self._build_model(both, beside))
-                        recentred[name] = again.likeliest_nodes_of_effect(name)
-                    self.models[both], known[both] = self._build_model(both, recentred | coarse), own
+                if own.log_z <= least:
+                    continue
+                # Of all nodes of each effect, the likeliest beside the likeliest of the others.
+                best_of, recentred = self._likeliest_nodes(nearby), {}
+                for name in self._uncertain_names(first):
+                    beside = {k: nodes for k, nodes in best_of.items() if k != name}
+                    again = laplace_evidence(found, self._build_model(both, beside))
+                    recentred[name] = again.likeliest_nodes_of_effect(name)
+                self.models[both], known[both] = self._build_model(both, recentred | coarse), own
         return True
+
+    def _likeliest_nodes(self, evidence: NoiseEvidence) -> dict[str, tuple[FloatArray, FloatArray]]:
+        names = self._uncertain_names(tuple(effect.name for effect in evidence.noise.effects))
+        return {name: evidence.likeliest_nodes_of_effect(name) for name in names}
 
     def _uncertain_names(self, names: Names) -> Names:
         return tuple(n for n in names if n not in self.certain)
 
 
 _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
-
-
-def checked_finite_fit(found: Fit) -> Fit:
-    """Return a fit after checking that its predictions are finite.
-
-    Raises NotConvergedError if they are not, with the fit as its `partial`.
-    """
-    if not np.isfinite(found.objective):
-        raise NotConvergedError("the model predicts readings that are not finite; check the model and its prior", found)
-    return found
 
 
 def require_converged_fit(found: Fit, problem: Linearised) -> None:
@@ -332,16 +345,16 @@ _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicate
 class Refits:
     """The refits of one recording, each made once; a second search of the recording reuses them.
 
-    `sensor` is the given null, if any; `templates` caches the templates of effects about fits.
+    `sensor` is the given null, if any; `templates` caches the templates of effects about fits; `known` are refits with
+    one more effect, by the candidate, the effect, and the nats against it; `scored` log Bayes factors of the templates
+    of a bank, by label.
     """
 
     sensor: Null | None
     noises: NoiseModels
     templates: TemplateCache
     known: dict[tuple[WeighedFit, Effect, float], Extended] = field(default_factory=dict, repr=False)
-    """Refits with one more effect, by the candidate, the effect, and the nats against it."""
     scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
-    """Log Bayes factors of the templates of a bank, by label."""
 
     def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: TemplateBank) -> dict[str, FloatArray]:
         """Return the log Bayes factors of a bank's templates about a fit under noise `law`, by label; cached."""
@@ -352,7 +365,7 @@ class Refits:
 
     def likeliest_law(self, candidate: WeighedFit) -> NoiseLaw:
         """Return the noise distribution of a candidate's most probable noise model."""
-        return self.noises.best_evidence(candidate.evidence).likeliest_law
+        return self.noises.likeliest_law(candidate.evidence)
 
     def fit_and_weigh(
         self,
@@ -371,19 +384,36 @@ class Refits:
         """
         found = self._fit_from_best_start(model, starts, law, max_steps)
         if beyond is not None and not law.has_memory and not _improves_fit(found, beyond.found, law):
-            plain = beyond.with_log_evidence_shifted(-beyond.log_prior_factor).evidence
-            return WeighedFit.of(found, law, plain, beyond.log_detectable)
-        for _ in range(2):
-            evidence = self.noises.evidence_by_noise(found)
-            best = self.noises.best_evidence(evidence).likeliest_law
-            if best.is_practically_equal(law):
-                break
-            law = best
-            found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
+            plain = beyond.with_log_evidence_shifted(-(beyond.log_share + beyond.log_detectable)).evidence
+            detectable = beyond.log_detectable
         else:
-            evidence = self.noises.evidence_by_noise(found)
-        detectable = log_probability_effects_detectable(found, law, self.templates.usable)
-        return WeighedFit.of(found, law, evidence, detectable)
+            for _ in range(2):
+                plain = self.noises.evidence_by_noise(found)
+                best = self.noises.likeliest_law(plain)
+                if best.is_practically_equal(law):
+                    break
+                law = best
+                found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
+            else:
+                plain = self.noises.evidence_by_noise(found)
+            detectable = log_probability_effects_detectable(found, law, self.templates.usable)
+        return WeighedFit(found, law, plain, 0.0, detectable, {}).with_log_evidence_shifted(detectable)
+
+    def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
+        """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
+        recording, hopeless = self.noises.recording, math.inf
+        found, start = None, starts[0]
+        if len(starts) > 1:
+            found = min(fit_each_start(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
+            start = found.z
+        if found is None or not found.settled:
+            if model.sensor.predicts_dearly and self.known:
+                hopeless = min(candidate.found.objective for candidate, _ in self.known.values()) + _HOPELESS
+            found = fit(model, recording, start, law, max_steps=max_steps, hopeless_above=hopeless)
+        if not np.isfinite(found.objective):
+            text = "the model predicts readings that are not finite; check the model and its prior"
+            raise NotConvergedError(text, found)
+        return found
 
     def refit_with_effect(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
@@ -400,27 +430,25 @@ class Refits:
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: Effect, against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)
-        own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
+        bank, odds = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns)), templates.variant_odds
 
-        def log_bayes_factors_about(problem: Linearised) -> FloatArray:
-            return log_bayes_factors_by_label(problem, own)[effect.name]
+        @cache
+        def screened(law: NoiseLaw) -> tuple[Linearised, FloatArray]:
+            problem = Linearised.of(parent.found, law)
+            return problem, log_bayes_factors_by_label(problem, bank)[effect.name]
 
-        by_noise = {
-            noise: log_mean_exp(log_bayes_factors_about(Linearised.of(parent.found, evidence.likeliest_law)))
-            for noise, evidence in parent.leading_noises()
-        }
-        problem = Linearised.of(parent.found, self.likeliest_law(parent))
-        scores = log_bayes_factors_about(problem)
-        weights = templates.variant_probabilities(scores)
+        by_noise = {noise: log_mean_exp(screened(e.likeliest_law)[1]) for noise, e in parent.leading_noises()}
+        own_law = self.likeliest_law(parent)
+        seen = [screened(own_law)]
         # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
         # too.
         law = parent.evidence[self.noises.certain].likeliest_law
-        plain = [] if law.is_practically_equal(problem.law) else [Linearised.of(parent.found, law)]
-        seen = [(problem, scores), *((about, log_bayes_factors_about(about)) for about in plain)]
-        likeliest = (int(np.argmax(templates.variant_probabilities(own_scores))) for _, own_scores in seen[1:])
+        if not law.is_practically_equal(seen[0][0].law):
+            seen.append(screened(law))
+        weights = templates.variant_probabilities(seen[0][1])
+        likeliest = (int(np.argmax(templates.variant_probabilities(scores))) for _, scores in seen[1:])
         tried = list(dict.fromkeys([*_variants_to_refit(templates, weights), *likeliest]))
         refitted = [self._refit_variant(parent, effect, templates, k, seen) for k in tried]
-        odds = templates.variant_odds
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = _variant_to_show(log_z, [templates.variants[k] for k in tried])
@@ -434,32 +462,12 @@ class Refits:
         # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
         # a change point is far better known. To first order: only where that leads to the variant of the best refit.
         law = self.likeliest_law(refitted[best])
-        if len(weights) > 1 and not law.is_practically_equal(problem.law):
-            later = next((own_scores for about, own_scores in seen if law.is_practically_equal(about.law)), None)
-            later = templates.variant_probabilities(
-                log_bayes_factors_about(Linearised.of(parent.found, law)) if later is None else later
-            )
-            weights = later if int(np.argmax(later)) == tried[best] else weights
-        return refitted[best].with_variant_factor_and_weights(
-            log_share, {**parent.weights, effect.name: weights}
-        ), by_noise
-
-    def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
-        """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
-        recording = self.noises.recording
-        if len(starts) > 1:
-            best = min(fit_each_start(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
-            if best.settled:
-                return checked_finite_fit(best)
-            starts = best.z[None, :]
-        return checked_finite_fit(
-            fit(model, recording, starts[0], law, max_steps=max_steps, hopeless_above=self._hopeless_above(model))
-        )
-
-    def _hopeless_above(self, model: Model) -> float:
-        if not model.sensor.predicts_dearly:
-            return math.inf
-        return min((candidate.found.objective for candidate, _ in self.known.values()), default=math.inf) + _HOPELESS
+        if len(weights) > 1 and not law.is_practically_equal(seen[0][0].law):
+            later = next((scores for about, scores in seen if law.is_practically_equal(about.law)), None)
+            probabilities = templates.variant_probabilities(screened(law)[1] if later is None else later)
+            weights = probabilities if int(np.argmax(probabilities)) == tried[best] else weights
+        extended = refitted[best].with_variant_factor_and_weights(log_share, {**parent.weights, effect.name: weights})
+        return extended, by_noise
 
     def _refit_variant(
         self,
@@ -472,20 +480,20 @@ class Refits:
         """Refit with one variant of one more effect, from its best templates by each linearisation in `seen`."""
         own = np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
-        ranked = [(about, scores, own[np.argsort(-scores[own])]) for about, scores in seen]
-        chosen = [(about, at) for about, scores, best in ranked for at in best[: 2 if scores[best[0]] > 5 else 1]]
         starts: list[FloatArray] = []
-        for about, at in chosen:
-            columns = templates.columns[at]
-            amount = _amplitudes_in_residual(about.project(columns), about.residual)
-            setting = effect.start(templates.settings[at], amount)
-            # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
-            # one.
-            for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
-                z = parent.found.z + about.absorbing_shift(parent.found, columns @ taken)
-                start = np.concatenate([z, model.z_of_last_effect(setting[None, :])[0]])
-                if all(np.abs(start - other).max() > _SAME_START for other in starts):
-                    starts.append(start)
+        for about, scores in seen:
+            ranked = own[np.argsort(-scores[own])]
+            for at in ranked[: 2 if scores[ranked[0]] > 5 else 1]:
+                columns = templates.columns[at]
+                amount = _amplitudes_in_residual(about.project(columns), about.residual)
+                setting = effect.start(templates.settings[at], amount)
+                # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
+                # one.
+                for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
+                    z = parent.found.z + about.absorbing_shift(parent.found, columns @ taken)
+                    start = np.concatenate([z, model.z_of_last_effect(setting[None, :])[0]])
+                    if all(np.abs(start - other).max() > _SAME_START for other in starts):
+                        starts.append(start)
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
@@ -506,21 +514,10 @@ def _amplitudes_in_residual(projected: FloatArray, residual: FloatArray) -> Floa
     least squares alone all runs would start far off, the parameter as far on the other side, and the fit stay there.
     """
     n = projected.shape[1]
-    if n == 1:
-        return np.asarray(np.linalg.lstsq(projected, residual)[0], dtype=np.float64)
-    prior = np.eye(n) / SCALES[-1]
-    return np.asarray(np.linalg.lstsq(np.concatenate([projected, prior]), np.append(residual, np.zeros(n)))[0])
-
-
-def is_significantly_better(candidate: WeighedFit, parent: WeighedFit) -> bool:
-    """Return whether a candidate's log likelihood exceeds that of `parent` by more than 1.5 nats."""
-    return _improves_fit(candidate.found, parent.found, candidate.law)
-
-
-def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
-    whitened = law(np.stack([beyond.residuals, found.residuals], axis=1))
-    before, after = law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))
-    return bool(before - after > 1.5)
+    if n > 1:
+        projected = np.concatenate([projected, np.eye(n) / SCALES[-1]])
+        residual = np.append(residual, np.zeros(n))
+    return np.asarray(np.linalg.lstsq(projected, residual)[0], dtype=np.float64)
 
 
 def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:
@@ -530,10 +527,8 @@ def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:
     differ. If values of one size explain about as much, these stand for both: their intervals leave it open too.
     """
     best = int(np.argmax(log_z))
-    for k, variant in enumerate(variants):
-        if isinstance(variant.prior, SharedScalePrior) and log_z[k] > log_z[best] - ALIASED_NATS:
-            return k
-    return best
+    shared = (k for k, variant in enumerate(variants) if isinstance(variant.prior, SharedScalePrior))
+    return next((k for k in shared if log_z[k] > log_z[best] - ALIASED_NATS), best)
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
@@ -541,12 +536,13 @@ def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[
 
     All of one or two; of more, the best, and the next too if bound to scans and of a twentieth of the best's weight.
     """
+    ranked: list[int] = np.argsort(-weights).tolist()
     if len(weights) <= _FEW_VARIANTS:
-        return [int(k) for k in np.argsort(-weights)]
+        return ranked
     # Two scans of opposite direction are aliased to first order; a refit shows which one was turned.
-    first, *others = np.argsort(-weights)[:2].tolist()
+    first, second = ranked[:2]
     bound = templates.variants[first].scans or templates.variants[first].patterns
-    return [first, *(k for k in others if bound and weights[k] > _VARIANTS_TRIED * weights[first])]
+    return [first, second] if bound and weights[second] > _VARIANTS_TRIED * weights[first] else [first]
 
 
 _BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
@@ -555,18 +551,16 @@ _TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gai
 
 @dataclass(frozen=True, eq=False)
 class Evidences:
-    """Log evidences of hypotheses.
+    """Log evidences of hypotheses: pairs of the effects on the mean, and on the noise.
 
-    A hypothesis is a pair (mean, noise): the names of its effects on the mean, and on the noise. The mean ("unknown",)
-    stands for an unknown effect, alone or with others. The SSF order is the number of Gaussians.
-
+    The mean ("unknown",) stands for an unknown effect, alone or with others; the SSF order is the number of Gaussians.
     `fits`: refits by (SSF order, mean), with their evidence by noise; `screened`: combinations not refitted, by
     templates: (mean, noise) -> log evidence; `unknown`: unknown effects added to fits: (SSF order, mean, noise) -> log
     evidence; `unknown_shares`: share of each family of bases, such as "time", in the evidence of an unknown effect.
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
-    screened: Mapping[tuple[Names, Names], float] = field(default_factory=dict)
+    screened: Mapping[Hypothesis, float] = field(default_factory=dict)
     unknown: Mapping[tuple[int, Names, Names], float] = field(default_factory=dict)
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
@@ -579,8 +573,8 @@ class Evidences:
         named = tuple(name for name in names if not is_out_of_vocabulary(name)) or names
         if not names or not {(order, ()), (order, named)} <= self.fits.keys():
             return False
-        gained = self.fits[order, named].evidence[noise].log_z - self.fits[order, ()].evidence[noise].log_z
-        return gained > self.unknown[order, names, noise] - self.fits[order, named].evidence[noise].log_z
+        nothing, own = (self.fits[order, key].evidence[noise].log_z for key in ((), named))
+        return own - nothing > self.unknown[order, names, noise] - own
 
     def reported_as(self, mean: Names) -> Names:
         """Return the names by which a combination is reported: ("unknown",) if any of its effects has no name.
@@ -590,9 +584,11 @@ class Evidences:
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
             return mean
-        nothing = self._largest_log_z(())
-        explains_more = self._largest_log_z(named) - nothing > 0.5 * (self._largest_log_z(mean) - nothing)
-        return named if named and explains_more else ("unknown",)
+        nothing, own, whole = (
+            max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
+            for names in ((), named, mean)
+        )
+        return named if named and own - nothing > 0.5 * (whole - nothing) else ("unknown",)
 
     def best_formula_beside(self, fit: WeighedFit, noise: Names) -> WeighedFit | None:
         """Return the refit of largest evidence that adds formulas alone to the effects of another fit, if any."""
@@ -631,9 +627,6 @@ class Evidences:
             for change in apart
         )
 
-    def _largest_log_z(self, names: Names) -> float:
-        return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
-
     def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
         """Return a copy with the log evidence of fits, with and without an unknown effect, shifted by `gaps` in nats.
 
@@ -648,34 +641,32 @@ class Evidences:
 class Posterior:
     """Probabilities of hypotheses by (names on the mean, names on the noise)."""
 
-    probabilities: Mapping[tuple[Names, Names], float]
+    probabilities: Mapping[Hypothesis, float]
 
     @property
     def marginal_over_noise(self) -> dict[Names, float]:
         """Probability of each hypothesis on the mean, marginalised over noise models."""
-        out: dict[Names, float] = {}
-        for (mean, _), p in self.probabilities.items():
-            out[mean] = out.get(mean, 0.0) + p
-        return out
+        return _sums((mean, p) for (mean, _), p in self.probabilities.items())
 
     def likeliest_noise(self, stated: Names | None = None) -> Names:
         """Return the names of the most probable noise model, of all or of those with just the `stated` effects."""
-        marginal: dict[Names, float] = {}
-        for (_, noise), p in self.probabilities.items():
-            if stated is None or noise_effects_in_vocabulary(noise) == stated:
-                marginal[noise] = marginal.get(noise, 0.0) + p
+        marginal = _sums(
+            (noise, p)
+            for (_, noise), p in self.probabilities.items()
+            if stated is None or noise_effects_in_vocabulary(noise) == stated
+        )
         return max(marginal, key=lambda noise: marginal[noise])
 
 
 def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
     """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
     outlying = evidences.only_outlying_readings_differ(prior, certain)
-    log_z: dict[tuple[Names, Names], float] = {}
-    for (_, names), candidate in evidences.fits.items():
-        if names and outlying:
-            continue
-        for noise, evidence in candidate.evidence.items():
-            log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), or_impossible(evidence.log_z)))
+    log_z = _log_sums(
+        ((names, noise), or_impossible(evidence.log_z))
+        for (_, names), candidate in evidences.fits.items()
+        if not (names and outlying)
+        for noise, evidence in candidate.evidence.items()
+    )
     log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
         if names and outlying:
@@ -738,6 +729,10 @@ class Searched:
         """Names of the noise effects beyond doubt, which are part of every noise model."""
         return self.refits.noises.certain
 
+    def log_posterior(self, fit: WeighedFit) -> float:
+        """Return a fit's unnormalised log posterior: its log evidence plus the log prior of its effects."""
+        return fit.log_z + self.prior.log_prior_on_mean(fit.names)
+
     def with_evidences(self, evidences: Evidences) -> Searched:
         """Return the result with other evidences, and the probabilities that follow from them."""
         posterior = posterior_of(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
@@ -745,13 +740,14 @@ class Searched:
 
     def with_prior_probabilities(self) -> Searched:
         """Return the result with prior instead of posterior probabilities, for readings without information."""
-        effects = self.prepared.effects
-        named = (
-            name for name in effects if not effects_out_of_vocabulary((name,)) and name_of_first_copy(name) is None
-        )
-        on_mean = [name for name in named if name not in self.prepared.noise_effect_names]
-        probabilities = self.prior.single_effect_priors(on_mean, self.certain)
-        return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
+        on_mean = [
+            name
+            for name in self.prepared.effects
+            if name not in self.prepared.noise_effect_names
+            and not is_out_of_vocabulary(name)
+            and name_of_first_copy(name) is None
+        ]
+        return replace(self, posterior=Posterior(self.prior.single_effect_priors(on_mean, self.certain)))
 
     def best_refit_of(self, names: Names, noise: Names) -> WeighedFit | None:
         """Return the refit of these effects with the number of Gaussians of largest evidence under a noise, if any."""
@@ -791,23 +787,18 @@ class Searched:
         }
         top = max(scores.values(), default=0.0)
         weights = {key: math.exp(score - top) for key, score in scores.items()}
-        out: dict[str, float] = {}
-        for (_, names, _), weight in weights.items():
-            for name in names:
-                out[name] = out.get(name, 0.0) + weight / sum(weights.values())
-        return out
+        total = sum(weights.values())
+        return _sums((name, weight / total) for (_, names, _), weight in weights.items() for name in names)
 
     def noise_probabilities_given_unknown(self) -> dict[str, float]:
         """Return, by effect on the noise, the probability that it acts, given that what acts on the mean is unknown."""
-        unknown: dict[Names, float] = {}
-        for (mean, noise), p in self.posterior.probabilities.items():
-            if self.evidences.reported_as(mean) == ("unknown",):
-                unknown[noise] = unknown.get(noise, 0.0) + p
-        total, out = sum(unknown.values()) or 1.0, dict[str, float]()
-        for noise, p in unknown.items():
-            for name in noise:
-                out[name] = out.get(name, 0.0) + p / total
-        return out
+        unknown = _sums(
+            (noise, p)
+            for (mean, noise), p in self.posterior.probabilities.items()
+            if self.evidences.reported_as(mean) == ("unknown",)
+        )
+        total = sum(unknown.values()) or 1.0
+        return _sums((name, p / total) for noise, p in unknown.items() for name in noise)
 
     def template_banks_for_global_test(self, found: Fit) -> list[TemplateBank]:
         """Return the two banks by which a fit is tested: of the effects that it lacks, and of unknown effects.
@@ -820,22 +811,16 @@ class Searched:
             for name, effect in self.prepared.effects.items()
             if effect.stage is not Stage.NOISE and not name.startswith(PROPOSAL) and name not in found.model.names
         ]
-        return [
-            self.misfit_templates.templates.coarse_bank(self.misfit_templates.about, missing),
-            self.misfit_templates.unknown_bases,
-        ]
+        own = self.misfit_templates
+        return [own.templates.coarse_bank(own.about, missing), own.unknown_bases]
 
     @property
     def likeliest_order(self) -> int:
         """The most probable number of Gaussians (SSF order), over all refits, with and without an unknown effect."""
-        by_order: dict[int, float] = {}
-        terms = [
-            (n, fit.log_z + self.prior.log_prior_on_mean(names)) for (n, names), fit in self.evidences.fits.items()
-        ]
+        terms = [(n, self.log_posterior(fit)) for (n, _), fit in self.evidences.fits.items()]
         for (n, names, _), value in self.evidences.unknown.items():
             terms.append((n, value + self.prior.log_prior_with_unknown(names)))
-        for n, value in terms:
-            by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
+        by_order = _log_sums(terms)
         return max(by_order, key=lambda n: by_order[n])
 
     @property
@@ -857,11 +842,11 @@ class Searched:
         `besides`: effects out of vocabulary that do not count as unknown.
         """
         by_mean = self.posterior.marginal_over_noise
-        unknown = by_mean.get(("unknown",), 0.0)
-        shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}
-        for names, p in by_mean.items():
-            unnamed = effects_out_of_vocabulary(names)
-            for name in unnamed if unnamed != besides else ():
-                shares[name] = shares.get(name, 0.0) + p
+        unknown, unnamed = (
+            by_mean.get(("unknown",), 0.0),
+            [(effects_out_of_vocabulary(n), p) for n, p in by_mean.items()],
+        )
+        terms = [(family, unknown * p) for family, p in self.evidences.unknown_shares.items()]
+        shares = _sums([*terms, *((name, p) for names, p in unnamed if names != besides for name in names)])
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}

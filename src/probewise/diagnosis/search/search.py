@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -31,6 +31,7 @@ from probewise.diagnosis.search.hypotheses import (
     SAME_MODE,
     WITH_MEMORY,
     Evidences,
+    Hypothesis,
     MisfitTemplates,
     NoiseModels,
     Posterior,
@@ -39,7 +40,6 @@ from probewise.diagnosis.search.hypotheses import (
     WeighedFit,
     effects_out_of_vocabulary,
     expected_log_bayes_factor,
-    is_significantly_better,
     posterior_of,
 )
 from probewise.diagnosis.sensors import (
@@ -89,13 +89,11 @@ _REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 _PAIRED = 60
 _MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
 # Share of a template that a null leaves, below which a large effect may show in another way than to first order. The
-# width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off, and screening missed it
-# (495 concealed recordings of seed 9203); the threshold was not varied.
+# width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off.
 _FAINT = 0.35
 _ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no refit shows more
-# Leading combinations, of which each effect is left out in turn. A missing tooth of lambda 20 stood at a wrong place,
-# beside an effect that it made superfluous, and was never tried alone; of 31 pairs named wrong eight had never had a
-# fair fit, built from the part beside which the other looked worse, say, or fifth in a beam of three (now eight).
+# Leading combinations, of which each effect is left out in turn: one that was found first may stand at a wrong place
+# beside another that it makes superfluous, and the right pair may be built from the part that looked worse.
 _ELIMINATED = 3
 _SWAPPED = 2  # combinations that lead beside what is left, with what was left out or another
 _MOST_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
@@ -108,7 +106,11 @@ class SearchState:
 
     `effects`: effects on the mean, by name; `tried_always`: effects that are always refitted alone, whatever their
     score by screening; `progress`: called at every refit; `share_is_spent`: function of a share: whether that share of
-    this search's budget of refits is spent; `share`: share of the budget that may be spent by now.
+    this search's budget of refits is spent; `share`: share of the budget that may be spent by now. `sensors`: nulls by
+    SSF order; `about_null`, `about_parts`: log evidence by screening about a null, and about a fit with all but one of
+    the effects; `undetected`: combinations in which a refit has shown one effect to be insignificant; `pruned`:
+    combinations out of vocabulary that are aliased with named ones; `optimism`: nats by which screening promises too
+    much at least.
     """
 
     effects: Mapping[str, Effect]
@@ -120,32 +122,21 @@ class SearchState:
     share: float = 1.0
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)
-    """By SSF order."""
-    about_null: dict[tuple[Names, Names], float] = field(default_factory=dict)
-    """Log evidence of (mean, noise), by screening about a null."""
-    about_parts: dict[tuple[Names, Names], float] = field(default_factory=dict)
-    """The same, about a fit with all but one of the effects."""
+    about_null: dict[Hypothesis, float] = field(default_factory=dict)
+    about_parts: dict[Hypothesis, float] = field(default_factory=dict)
     undetected: set[Names] = field(default_factory=set)
-    """Combinations in which a refit has shown one effect to be insignificant."""
     pruned: set[Names] = field(default_factory=set)
-    """Combinations out of vocabulary that are aliased with named ones."""
     optimism: float = 0.0
-    """Nats by which screening promises too much at least."""
 
     @property
     def nulls(self) -> list[WeighedFit]:
         """The candidates without effects, one per number of Gaussians."""
-        return [c for (_, names), c in self.candidates.items() if not names]
+        return self.candidates_of_combination(())
 
     @property
     def null(self) -> WeighedFit:
         """The candidate without effects whose number of Gaussians has the largest evidence."""
         return max(self.nulls, key=lambda c: c.log_z)
-
-    @property
-    def null_is_given(self) -> bool:
-        """Whether the null is a given one, whose fits are comparable, and not one of several forms of the SSF."""
-        return self.refits.sensor is not None
 
     @property
     def effects_in_vocabulary(self) -> list[Effect]:
@@ -160,6 +151,10 @@ class SearchState:
     def candidates_of_combination(self, names: Names) -> list[WeighedFit]:
         """List the candidates of one combination, one per number of Gaussians."""
         return [c for (_, key), c in self.candidates.items() if key == names]
+
+    def best_candidate(self, names: Names) -> WeighedFit | None:
+        """Return the candidate of one combination with the largest evidence, if any."""
+        return max(self.candidates_of_combination(names), key=lambda c: c.log_z, default=None)
 
     def log_posterior(self, candidate: WeighedFit) -> float:
         """Return a candidate's unnormalised log posterior: its log evidence plus the log prior of its effects."""
@@ -212,24 +207,23 @@ class SearchState:
         """
         against, names = self.penalty_of_extending(parent), tuple(sorted((*parent.names, added)))
         if self.share_is_spent(self.share):
-            return max(self.candidates_of_combination(names), key=lambda c: c.log_z, default=None)
+            return self.best_candidate(names)
         try:
             candidate, scores = self.refits.refit_with_effect(parent, self.effects[added], against)
         except NotConvergedError:  # its model diverges from every start
             self.about_parts |= {(names, noise): e.log_z - against for noise, e in parent.evidence.items()}
             self.undetected.add(names)
             return None
-        known = self.candidates.get((candidate.n_gaussians, candidate.names), candidate)
-        if is_significantly_better(candidate, parent):
-            return self.store_candidate(max(known, candidate, key=lambda c: c.log_z))
-        if known is not candidate:
-            return known
-        # Laplace fails where an effect is too small to be significant and the closed form does not; but the
-        # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
-        for noise, value in scores.items():
-            self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
-        self.undetected.add(names)
-        return None
+        known = self.candidates.get((candidate.n_gaussians, candidate.names))
+        if candidate.is_significantly_better(parent):
+            return self.store_candidate(candidate if known is None or candidate.log_z > known.log_z else known)
+        if known is None:
+            # Laplace fails where an effect is too small to be significant and the closed form does not; but the
+            # closed form takes amplitudes of a sign that the effect cannot have, and the refit has shown that.
+            for noise, value in scores.items():
+                self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
+            self.undetected.add(names)
+        return known
 
     def largest_refitted_part(self, names: Names) -> WeighedFit:
         """Return the candidate with most of some effects and no others, the most probable one."""
@@ -267,9 +261,9 @@ class SearchState:
         except NotConvergedError:
             return None
         self.undetected.discard(both.names)
-        return self.store_candidate(both) if is_significantly_better(both, between) else None
+        return self.store_candidate(both) if both.is_significantly_better(between) else None
 
-    def screened_log_evidences(self) -> dict[tuple[Names, Names], float]:
+    def screened_log_evidences(self) -> dict[Hypothesis, float]:
         """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.
 
         Screening about a fit with part of the effects is more accurate than about the null, which is corrected for
@@ -278,11 +272,11 @@ class SearchState:
         refitted = self.refitted_combinations
         out = {}
         for (names, noise), value in self.about_null.items():
-            parts = [p for p in itertools.combinations(names, len(names) - 1) if p in refitted]
             gains = [
                 max(c.evidence[noise].log_z for c in self.candidates_of_combination(part))
                 - self.about_null.get((part, noise), np.inf)
-                for part in parts
+                for part in itertools.combinations(names, len(names) - 1)
+                if part in refitted
             ]
             out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
         out |= self.about_parts
@@ -297,8 +291,10 @@ class SearchState:
 
         It is that of refits or, if there are none, that by screening; minus infinity if there is neither.
         """
+        if (refitted := self.best_candidate(names)) is not None:
+            return refitted.log_z
         screened = (value for (own, _), value in self.screened_log_evidences().items() if own == names)
-        return max([c.log_z for c in self.candidates_of_combination(names)] or screened, default=-np.inf)
+        return max(screened, default=-np.inf)
 
 
 def competing_candidates(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
@@ -318,15 +314,14 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     """
     refits, null, noises = state.refits, prepared.null, state.refits.noises
     recording = prepared.recording
-    plan, law = recording.plan, white_noise_of_recording(recording, least=noises.least_sd)
-
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 
     def fit_and_keep(sensor: Null, starts: FloatArray, law: NoiseLaw) -> WeighedFit:
         state.progress("fitting the sensor alone", len(state.sensors), n_forms)
         state.sensors[sensor.n_gaussians] = sensor
-        return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), plan), starts, law))
+        return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), recording.plan), starts, law))
 
+    law = white_noise_of_recording(recording, least=noises.least_sd)
     if null is not None:
         fit_and_keep(null, null.starts, law)
     else:
@@ -348,7 +343,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     if noises.add_significant_pairs(state.null.found, state.null.evidence):
         state.progress("weighing pairs of noises")
         for candidate in state.nulls:
-            state.store_candidate(candidate.with_evidence(noises.evidence_by_noise(candidate.found)))
+            state.store_candidate(replace(candidate, evidence=noises.evidence_by_noise(candidate.found)))
 
 
 def noise_sd_about_given_null(prepared: Prepared) -> float:
@@ -363,12 +358,10 @@ def noise_sd_about_given_null(prepared: Prepared) -> float:
     step = lattice_step(readings)
     if null is None or not step:
         return math.inf
-    model, starts = Model(null, (), recording.plan), null.starts
-    if len(starts) > 1:
-        law = white_noise_of_recording(recording)
-        z = min(fit_each_start(model, recording, list(starts), law), key=lambda found: found.objective).z
-    else:
-        z = starts[0]
+    model, z = Model(null, (), recording.plan), null.starts[0]
+    if len(null.starts) > 1:
+        fits = fit_each_start(model, recording, list(null.starts), white_noise_of_recording(recording))
+        z = min(fits, key=lambda found: found.objective).z
     with np.errstate(all="ignore"):  # of a start from which the model runs away
         residuals = np.abs(readings - model.predict(z[None, :])[0, rows])
     relative_sd = recording.relative_sd[rows]
@@ -378,8 +371,7 @@ def noise_sd_about_given_null(prepared: Prepared) -> float:
     return max(median, step / math.sqrt(12)) * math.sqrt(len(rows) / free) if math.isfinite(median) else math.inf
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
+class Proposal(NamedTuple):
     """A possible refit: candidate `parent` with the effect `added`; `score` is its log evidence by templates."""
 
     score: float
@@ -439,31 +431,30 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
         singles = state.log_bayes_factors_by_effect(null, evidence.likeliest_law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:_PAIRED]
-        singles = {name: singles[name] for name in ranked}
         templates = {name: state.refits.templates.templates_of(null.found, state.effects[name]) for name in ranked}
         about = Linearised.of(null.found, evidence.likeliest_law)
-        for pair, value in log_bayes_factors_of_pairs(about, templates, singles).items():
-            state.about_null[pair, noise] = evidence.log_z + value
+        pairs = log_bayes_factors_of_pairs(about, templates, {name: singles[name] for name in ranked})
+        state.about_null |= {(pair, noise): evidence.log_z + value for pair, value in pairs.items()}
 
 
 def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
     """Screen every effect that a candidate lacks, by its templates about the null with the same number of Gaussians.
 
-    Where the candidate is far from a given null, the templates are those about the candidate: a null that slides on
-    behind an end stop says nothing of a drag before it. The log evidence of each resulting combination, by noise model,
-    is stored in the state.
+    Where the candidate is far from a given null, whose fits are comparable, the templates are those about the
+    candidate: a null that slides on behind an end stop says nothing of a drag before it. The log evidence of each
+    resulting combination, by noise model, is stored in the state.
 
     Returns `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
-    about = parent if state.null_is_given and parent.log_z > null.log_z + _FAR_FROM_NULL else null
+    is_far = state.refits.sensor is not None and parent.log_z > null.log_z + _FAR_FROM_NULL
     against = state.penalty_of_extending(parent)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
     for noise, evidence in parent.leading_noises():
-        for name, own in state.log_bayes_factors_by_effect(parent, evidence.likeliest_law, about).items():
-            first = name_of_first_copy(name)
-            if name in parent.names or (first is not None and first not in parent.names):
+        scores = state.log_bayes_factors_by_effect(parent, evidence.likeliest_law, parent if is_far else null)
+        for name, own in scores.items():
+            if name in parent.names or name_of_first_copy(name) not in (None, *parent.names):
                 continue
             names = tuple(sorted((*parent.names, name)))
             score = evidence.log_z + log_mean_exp(own) - against
@@ -518,14 +509,12 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
     While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
     """
     plain = state.refits.noises.certain
-    pairs = [(first, name) for name in state.effects if (first := name_of_first_copy(name)) is not None]
+    least = null.evidence[plain].log_z + _REPEATED_FROM
     return [
-        (first, again)
-        for first, again in pairs
-        if any(
-            c.evidence[plain].log_z > null.evidence[plain].log_z + _REPEATED_FROM
-            for c in state.candidates_of_combination((first,))
-        )
+        (first, name)
+        for name in state.effects
+        if (first := name_of_first_copy(name)) is not None
+        and any(c.evidence[plain].log_z > least for c in state.candidates_of_combination((first,)))
     ]
 
 
@@ -535,11 +524,8 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     Of a difference of two columns, neither column alone need explain anything.
     """
     settled = state.refitted_combinations | state.undetected
-    scores: dict[Names, float] = {
-        names: value
-        for names, value in _largest_scores_about_null(state).items()
-        if len(names) == 2 and names not in settled
-    }
+    best = _largest_scores_about_null(state).items()
+    scores: dict[Names, float] = {names: value for names, value in best if len(names) == 2 and names not in settled}
     # All against what was best before: equal pairs are refitted, or none.
     for names in promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS):
         state.refit_stepwise(names)
@@ -560,8 +546,7 @@ def eliminate_backward(state: SearchState) -> None:
     suits neither. Candidates are stored in the state.
     """
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.log_posterior(c))
-    named = [c for c in several if not effects_out_of_vocabulary(c.names)]
-    rest = [c for c in several if effects_out_of_vocabulary(c.names)]
+    named, rest = ([c for c in several if bool(effects_out_of_vocabulary(c.names)) == rare] for rare in (False, True))
     # Of an effect that is there twice either may go; what stays is the first of its name.
     dropped = [(c.names, n) for c in [*named[:_ELIMINATED], *rest[:1]] for n in c.names if n + AGAIN not in c.names]
     for k, (names, left_out) in enumerate(dropped):
@@ -569,7 +554,7 @@ def eliminate_backward(state: SearchState) -> None:
         others = tuple(name for name in names if name != left_out)
         if others not in state.refitted_combinations | state.undetected:
             state.refit_stepwise(others)
-        held = max(state.candidates_of_combination(others), key=lambda c: c.log_z, default=None)
+        held = state.best_candidate(others)
         if held is None:
             continue
         proposals = proposals_for(state, held, {})
@@ -590,10 +575,9 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
     for k, names in enumerate(leaders[:_MOST_AT_OTHER_ORDERS]):
         state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _MOST_AT_OTHER_ORDERS))
-        held = state.candidates_of_combination(names)
-        if not held or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
+        source = state.best_candidate(names)
+        if source is None or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
             continue
-        source = max(held, key=lambda c: c.log_z)
         own = state.candidates[source.n_gaussians, ()].log_z
         for n, sensor in state.sensors.items():
             # A freer SSF that the evidence rejects by itself is also rejected with an effect.
@@ -606,17 +590,14 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
 
 def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
     """Refit a candidate's effects with `n` Gaussians; store the fit if it is significantly better than that null."""
-    null, sensor = state.candidates[n, ()], state.sensors[n]
-    own = source.found.z[source.found.model.sensor.n_params :]
+    null, sensor, found = state.candidates[n, ()], state.sensors[n], source.found
+    start = np.concatenate([null.found.z, found.z[found.model.sensor.n_params :]])
     candidate = state.refits.fit_and_weigh(
-        Model(sensor, source.found.model.effects, source.found.model.plan),
-        np.concatenate([null.found.z, own])[None, :],
-        state.refits.likeliest_law(source),
-        max_steps=15,
+        replace(found.model, sensor=sensor), start[None, :], state.refits.likeliest_law(source), max_steps=15
     )
     before, after = map(state.complexity_penalty, (source.ssf_degrees_of_freedom, sensor.effective_n_gaussians))
     candidate = candidate.with_variant_factor_and_weights(source.log_share + before - after, source.weights)
-    if is_significantly_better(candidate, null):
+    if candidate.is_significantly_better(null):
         state.store_candidate(candidate)
 
 
@@ -629,12 +610,10 @@ _REFITTED_LATE = 0.02  # probability by screening alone, from which on a combina
 _MOST_REFITTED_LATE = 6  # such combinations
 _WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
 
-Key = tuple[int, Names]
-
 
 def prune_out_of_vocabulary(
-    candidates: Mapping[Key, WeighedFit], noises: NoiseModels
-) -> tuple[dict[Key, WeighedFit], set[Names]]:
+    candidates: Mapping[tuple[int, Names], WeighedFit], noises: NoiseModels
+) -> tuple[dict[tuple[int, Names], WeighedFit], set[Names]]:
     """Drop or penalise combinations out of vocabulary that compete with named ones of no more effects.
 
     A combination is dropped if it predicts so much the same as a named one that its expected lead is below three nats.
@@ -681,12 +660,11 @@ class UnknownEffects:
         best = -np.inf
         for candidate in candidates:
             for noise, evidence in candidate.leading_noises():
-                scores = self.state.refits.log_bayes_factors_by_label(
-                    candidate.found, evidence.likeliest_law, self.bases
-                )
+                law = evidence.likeliest_law
+                scores = self.state.refits.log_bayes_factors_by_label(candidate.found, law, self.bases)
                 by_family = {family: log_mean_exp(own) for family, own in scores.items()}
-                if evidence.likeliest_law.share > 0:
-                    far_out = outlier_probabilities(candidate.found.residuals, evidence.likeliest_law)
+                if law.share > 0:
+                    far_out = outlier_probabilities(candidate.found.residuals, law)
                     by_family |= clustering_log_bayes_factors(far_out, self.covariates)
                 if not by_family:
                     continue
@@ -718,32 +696,26 @@ class UnknownEffects:
 
         The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
         """
-        most = max((self._log_evidence_with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
-        n_named = len(self.state.effects_in_vocabulary)
+        average, n_named = self.state.refits.noises.average_log_evidence, len(self.state.effects_in_vocabulary)
+
+        def with_unknown(candidate: WeighedFit) -> float:
+            own = candidate.n_gaussians, candidate.names
+            return average({key[2]: value for key, value in self.log_z.items() if key[:2] == own})
 
         def believed(rival: WeighedFit) -> float:
-            alone = self._log_evidence_without_unknown(rival)
             n = len(rival.names)  # two names are chosen from many more combinations
-            return alone - (math.log(math.comb(n_named, n) / n_named) if n - len(known) > 1 else 0.0)
+            several = math.log(math.comb(n_named, n) / n_named) if n - len(known) > 1 else 0.0
+            return average(rival.log_z_by_noise) - several
 
+        most = max((with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
         for candidate in sorted(rivals, key=believed, reverse=True):
             if believed(candidate) < most - ALIASED_NATS:
                 return False
-            if self._log_evidence_with_unknown(candidate) == -np.inf:
+            if with_unknown(candidate) == -np.inf:
                 self.weigh_beside([candidate])
-            more = self._log_evidence_with_unknown(candidate) - self._log_evidence_without_unknown(candidate)
-            if more < ALIASED_NATS:
+            if with_unknown(candidate) - average(candidate.log_z_by_noise) < ALIASED_NATS:
                 return True
         return False
-
-    def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
-        return self.state.refits.noises.average_log_evidence(candidate.log_z_by_noise)
-
-    def _log_evidence_with_unknown(self, candidate: WeighedFit) -> float:
-        own = candidate.n_gaussians, candidate.names
-        return self.state.refits.noises.average_log_evidence(
-            {key[2]: value for key, value in self.log_z.items() if key[:2] == own}
-        )
 
 
 def search(
@@ -762,10 +734,10 @@ def search(
     readings. `after`: an earlier search of the same recording with a given null, with fewer effects: its fits are not
     made again. Returns `Searched`: evidences and probabilities of all hypotheses, and the refits.
     """
-    recording, effects = prepared.recording, prepared.effects
+    recording, effects, apparatus = prepared.recording, prepared.effects, prepared.apparatus
     if max_order is None:
         max_order = 1 if len(prepared.usable_rows) < _FEW_READINGS else MAX_ORDER
-    prior = prior or prepared.apparatus.prior_odds(effects)
+    prior = prior or apparatus.prior_odds(effects)
     on_mean = {name: effect for name, effect in effects.items() if name not in prepared.noise_effect_names}
     on_noise = {name: cast(NoiseEffect, effect) for name, effect in effects.items() if name not in on_mean}
     if after is None:
@@ -773,15 +745,15 @@ def search(
         refits = Refits(prepared.null, models, TemplateCache(prepared.usable_rows))
     else:
         refits = after.refits
-    noises, own = refits.noises, prepared.apparatus.user_effect_names(on_mean)
+    always = apparatus.user_effect_names(on_mean)
     if prepared.null is not None and prepared.null.may_be_far_off:
-        own = frozenset(on_mean)
-    spent = prepared.apparatus.refit_budget_share_spent()
+        always = frozenset(on_mean)
+    spent = apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
-        return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
+        return apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
-    state = SearchState(on_mean, prior, refits, own, progress, share_is_spent)
+    state = SearchState(on_mean, prior, refits, always, progress, share_is_spent)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
         misfit_templates = _build_misfit_templates(state, prepared)
@@ -793,7 +765,7 @@ def search(
 
     def found() -> Searched:
         own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
-        posterior = posterior_of(own, prior, certain=noises.certain, n_forms=len(state.sensors))
+        posterior = posterior_of(own, prior, certain=refits.noises.certain, n_forms=len(state.sensors))
         return Searched(prepared, prior, state.sensors, misfit_templates, refits, own, posterior)
 
     select_forward(state, depth=depth)
@@ -805,7 +777,7 @@ def search(
     _refit_favoured_by_screening(state, lambda: found().posterior)
     if prepared.null is None:
         refit_at_other_orders(state, found().posterior.marginal_over_noise)
-    state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
+    state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, refits.noises)
     progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
@@ -831,7 +803,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
         if by_mean.get(names, 0.0) <= _REFITTED_LATE or not names:
             return
         part = state.largest_refitted_part(names)
-        if state.null_is_given and part.names and part not in screened:
+        if state.refits.sensor is not None and part.names and part not in screened:
             screened.add(part)
             proposals_for(state, part, {})
             continue
@@ -898,28 +870,26 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     Named effects can partly explain what one formula explains, and then predict other runs badly: a square law an
     exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
     """
-    prepared = searched.prepared
-    if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.is_refit_budget_spent():
+    prepared, apparatus = searched.prepared, searched.prepared.apparatus
+    if not needs_more_than_memoryless_noise(searched) or apparatus.is_refit_budget_spent():
         return searched
-    proposals = prepared.apparatus.proposed_formulas()
+    proposals = apparatus.proposed_formulas()
     if not proposals:
         return searched
     progress("weighing formulas")
-    every = {**prepared.effects, **proposals}
-    prior = prepared.apparatus.prior_odds(every)
-    promises = _promise_by_formula(searched, proposals)
-    own = {name: prior.log_prior_on_mean((name,)) - prior.log_prior_on_mean(()) for name in promises}
-    odds = {name: value + own[name] for name, value in promises.items()}
-    best = max(
-        fit.log_z + searched.prior.log_prior_on_mean(names) for (_, names), fit in searched.evidences.fits.items()
-    )
+    prior = apparatus.prior_odds({**prepared.effects, **proposals})
+    odds = {
+        name: value + (prior.log_prior_on_mean((name,)) - prior.log_prior_on_mean(()))
+        for name, value in _promise_by_formula(searched, proposals).items()
+    }
+    best = max(map(searched.log_posterior, searched.evidences.fits.values()))
     ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
     kept = {name: proposals[name] for name in ranked if odds[name] > best}
     if not kept:
         return searched
     more = replace(prepared, effects={**prepared.effects, **kept})
     again = search(more, prior=prior, after=searched, progress=progress)
-    return searched if prepared.apparatus.is_refit_budget_spent() else again
+    return searched if apparatus.is_refit_budget_spent() else again
 
 
 def needs_more_than_memoryless_noise(searched: Searched) -> bool:
@@ -934,15 +904,13 @@ def _promise_by_formula(searched: Searched, proposals: Mapping[str, Effect]) -> 
     The leader is the most probable combination. The log prior of what the formula stands beside is included, that of
     the formula is not. The nats by which a formula may trail there are added.
     """
-    usable, null = searched.prepared.usable_rows, searched.null
-    singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
-    fits = sorted(singles, key=lambda f: -f.log_z)[:1]
-    leader = max(searched.evidences.fits.values(), key=lambda f: f.log_z + searched.prior.log_prior_on_mean(f.names))
-    if len(leader.names) > 1:
-        fits.append(leader)
-    parents = [(null, _WITHIN_ALONE), *((fit, _WITHIN_BESIDE) for fit in fits)]
-    memory, out = TemplateCache(usable), dict[str, float]()
-    bank: TemplateBank = memory.coarse_bank(null.found, list(proposals.values()))
+    null, fits = searched.null, list(searched.evidences.fits.values())
+    single = max((fit for fit in fits if len(fit.names) == 1), key=lambda f: f.log_z, default=None)
+    leader = max(fits, key=searched.log_posterior)
+    parents = [(null, _WITHIN_ALONE), *([(single, _WITHIN_BESIDE)] if single is not None else [])]
+    parents += [(leader, _WITHIN_BESIDE)] if len(leader.names) > 1 else []
+    bank = TemplateCache(searched.prepared.usable_rows).coarse_bank(null.found, list(proposals.values()))
+    out: dict[str, float] = {}
     for parent, within in parents:
         for _, evidence in parent.leading_noises():
             scores = log_bayes_factors_by_label(Linearised.of(parent.found, evidence.likeliest_law), bank)

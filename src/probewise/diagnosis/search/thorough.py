@@ -65,8 +65,8 @@ def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
     """Extend a verdict's reason by whether nested sampling agrees, by how many nats not, and its first warning."""
     if not weighings:
         return reason
-    signed = {w.label: f"{w.gap:+.1f}".replace("-", "−") for w in weighings if not w.agree}
-    apart = ", ".join(f"{label} by {gap} nats" for label, gap in signed.items())
+    signed = {w.label: f"{w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree}
+    apart = ", ".join(f"{label} by {gap}" for label, gap in signed.items())
     doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
     if not apart:
         said = "nested sampling agrees to within a nat plus its standard error"
@@ -127,12 +127,11 @@ def weigh_thoroughly(
             candidate, noise, searched, rng=own, n_live=n_live, show=show
         )
     told = tuple(weighings.values())
-    if all(w.agree for w in told) or any(w.doubts for w in told):
-        return searched, told
-    common = next((w.gap for (_, names), w in weighings.items() if not names), 0.0)
-    return searched.with_evidences(
-        searched.evidences.with_log_evidence_shifted({key: w.gap - common for key, w in weighings.items()})
-    ), told
+    if not all(w.agree for w in told) and not any(w.doubts for w in told):
+        common = next((w.gap for (_, names), w in weighings.items() if not names), 0.0)
+        gaps = {key: w.gap - common for key, w in weighings.items()}
+        searched = searched.with_evidences(searched.evidences.with_log_evidence_shifted(gaps))
+    return searched, told
 
 
 def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
@@ -140,24 +139,20 @@ def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
 
     Each has the number of Gaussians of largest evidence; the null, if it is not among them, that of the first.
     """
-    merged = searched.posterior.marginal_over_noise
+    merged, noise_of = searched.posterior.marginal_over_noise, dict[Names, Names]()
+    for mean, noise in searched.posterior.probabilities:  # the most probable first
+        noise_of.setdefault(mean, noise)
     out: list[tuple[WeighedFit, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
         if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
             break
-        noise = _likeliest_noise_of(searched, mean)
-        candidate = searched.best_refit_of(mean, noise)
+        candidate = searched.best_refit_of(mean, noise_of[mean])
         if candidate is not None:
-            out.append((candidate, noise))
-    null = searched.evidences.fits[out[0][0].n_gaussians if out else searched.likeliest_order, ()]
+            out.append((candidate, noise_of[mean]))
     if all(candidate.names for candidate, _ in out):
-        out.append((null, _likeliest_noise_of(searched, ())))
+        order = out[0][0].n_gaussians if out else searched.likeliest_order
+        out.append((searched.evidences.fits[order, ()], noise_of[()]))
     return out
-
-
-def _likeliest_noise_of(searched: Searched, mean: Names) -> Names:
-    own = {noise: p for (names, noise), p in searched.posterior.probabilities.items() if names == mean}
-    return max(own, key=lambda noise: own[noise])
 
 
 def _weigh_by_nested_sampling(
@@ -174,7 +169,9 @@ def _weigh_by_nested_sampling(
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     once = HypothesisProblem(candidate.found.model, searched.prepared.recording, evidence, candidate.found.z)
     # Laplace's method integrates over one peak, to be counted `n_peaks` times. The whole prior holds them all.
-    log_factor = candidate.log_prior_factor - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
+    log_factor = (
+        candidate.log_share + candidate.log_detectable - sum(math.log(e.n_peaks) for e in candidate.found.model.effects)
+    )
     n_live = max(n_live, nested.LIVE_PER_PARAM * once.model.n_params)
     run = partial(
         nested.run,

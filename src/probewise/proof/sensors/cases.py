@@ -18,10 +18,8 @@ from probewise.proof.sensors.effects import (
     SINGLES,
     CleanSetup,
     CovariateRegion,
-    EffectSizer,
     NormAfterRefit,
     amplitude_of_size,
-    region_of_effect,
 )
 from probewise.proof.sensors.sensors import (
     NOISE_LEVELS,
@@ -91,35 +89,18 @@ def stratum_in_wheel(
 
 @dataclass(frozen=True)
 class HiddenEffect:
-    """One concealed effect.
+    """One concealed effect, with its parameters.
 
-    `effect`: the effect with its parameters; `size_lambda`: norm of its change after a refit of the null model, in
-    noise sds; `region`: region where it acts; None: not a local effect.
+    `size_lambda`: norm of its change after a refit of the null model, in noise sds; `covariates`: those along which its
+    residual is visible; `region`: where it acts; None: not a local effect.
     """
 
+    name: str
     effect: Concealed
     size_lambda: float
-    region: CovariateRegion | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the effect."""
-        return self.effect.name
-
-    @property
-    def in_vocabulary(self) -> bool:
-        """Whether the effect is in the vocabulary of a diagnosis."""
-        return self.name in INSIDE
-
-    @property
-    def residual_covariates(self) -> tuple[str, ...]:
-        """Names of the covariates along which the effect's residual is visible."""
-        return SAMPLERS[self.name].residual_covariates
-
-    @property
-    def parameters(self) -> Mapping[str, object]:
-        """Parameters of the effect, name to value."""
-        return self.effect.parameters
+    in_vocabulary: bool
+    covariates: tuple[str, ...]
+    region: CovariateRegion | None
 
 
 ALIASES: tuple[tuple[str, str], ...] = (
@@ -138,14 +119,12 @@ _ATTEMPTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One case of a challenge.
+    """One case of a challenge: a recording to diagnose, and the simulated sensor with its concealed effects.
 
-    `recording`: the recording to diagnose; `world`: the simulated sensor with its concealed effects; `test_plans`:
-    plans of the held-out readings, by name: "angle", "pattern", "direction" (`held_out_plans`); `test_seed`: seed
-    sequence of their noise; `ssf`, `noise_level`, `noise_model`, `plan`: names in SSFS, NOISE_LEVELS, OTHER_NOISE or
-    "white", and PLANS; `hidden`: concealed effects, in the order of the vocabulary; `alias`: in the stratum of aliases,
-    the name of an effect, not in the recording, that is aliased with the concealed one; `cosine` of the two, or of a
-    pair, after the refit; None: neither.
+    `test_plans`: plans of the held-out readings by name (`held_out_plans`), `test_seed`: of their noise; `ssf`,
+    `noise_level`, `noise_model`, `plan`: names in SSFS, NOISE_LEVELS, OTHER_NOISE or "white", and PLANS; `hidden`:
+    concealed effects, in the order of the vocabulary; `alias`: in the stratum of aliases, the name of an effect that is
+    aliased with the concealed one; `cosine` of the two, or of a pair, after the refit; None: neither.
     """
 
     recording: Recording
@@ -176,13 +155,10 @@ class Case:
 
 
 def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Case:
-    """Draw case `number` of a challenge; it depends on the seed and the number alone.
+    """Draw case `number` of a challenge; it depends on the secret seed and the number, from 0, alone.
 
-    `seed`: the secret seed of the challenge; `number`: number of the case, from 0: determines its stratum
-    (`stratum_of`) and, with the seed, everything else; `norm_after_refit`: function of two noise-free recordings,
-    without and with an effect: norm of the effect after a full refit of the null model, in reading units. Raises
-    NotConvergedError if none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an alias's
-    loss < 3.
+    Raises NotConvergedError if none of six draws in each plan has the stratum's size, a pair's abs(cosine) < 0.5, an
+    alias's loss < 3.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
@@ -191,24 +167,22 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
     plans = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    failure = NotConvergedError("no plan to try")
     for attempt in range(_ATTEMPTS * len(plans)):
         if attempt % _ATTEMPTS == 0:
             plan_name = plans[attempt // _ATTEMPTS]
-            setup = CleanSetup(draw_plan_with_displaced_patterns(plan_name, rng=plan_rng), sensor)
-            sizer = EffectSizer(setup, norm_after_refit)
+            plan = draw_plan_with_displaced_patterns(plan_name, rng=plan_rng)
+            setup = CleanSetup(plan, sensor, norm_after_refit)
         try:
-            hidden, cosine, alias = _draw_effects(stratum, n_earlier, sizer, rng)
+            hidden, cosine, alias = _draw_effects(stratum, n_earlier, setup, rng)
             break
-        except NotConvergedError as error:
-            failure = error
-    else:
-        raise failure
+        except NotConvergedError:
+            if attempt == _ATTEMPTS * len(plans) - 1:
+                raise
     if any(each.effect.disturbs for each in hidden):
         model = "white"  # only one noise fault at a time
     step = 1.0 if model == "quantised" else None
-    told = replace(setup.plan.instrumentation, step=step, description="Simulated readings of a challenge")
-    plan = replace(setup.plan, instrumentation=told)
+    told = replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")
+    plan = replace(plan, instrumentation=told)
     concealing = replace(sensor, concealed=tuple(each.effect for each in hidden))
     world = with_noise_model(concealing, model, duration_s=setup.duration_s)
     return Case(
@@ -237,7 +211,7 @@ def held_out_recordings(case: Case) -> dict[str, Recording]:
 
 
 def _draw_effects(
-    stratum: Stratum, n_earlier: int, sizer: EffectSizer, rng: np.random.Generator
+    stratum: Stratum, n_earlier: int, setup: CleanSetup, rng: np.random.Generator
 ) -> tuple[tuple[HiddenEffect, ...], float | None, str | None]:
     """Draw the effects of a stratum once; return them, the cosine of a pair or with an alias, and that alias's name.
 
@@ -245,7 +219,7 @@ def _draw_effects(
     """
 
     def draw_effect(name: str) -> HiddenEffect:
-        return draw_effect_of_size(name, stratum.size, sizer, rng)
+        return draw_effect_of_size(name, stratum.size, setup, rng)
 
     match stratum.kind:
         case "clean":
@@ -256,13 +230,13 @@ def _draw_effects(
             return (draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),), None, None
         case "pair":
             first, second = (draw_effect(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
-            cosine = sizer.cosine(first.effect, second.effect)
+            cosine = setup.cosine(first.effect, second.effect)
             if abs(cosine) >= _MOST_COSINE:
                 raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
             return (first, second), cosine, None
         case "alias":
             hidden, other = (draw_effect(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
-            cosine = sizer.cosine(hidden.effect, other.effect)
+            cosine = setup.cosine(hidden.effect, other.effect)
             if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
             return (hidden,), cosine, other.name
@@ -270,14 +244,14 @@ def _draw_effects(
             return (draw_effect(stratum.kind),), None, None
 
 
-def draw_effect_of_size(name: str, wanted: float, sizer: EffectSizer, rng: np.random.Generator) -> HiddenEffect:
+def draw_effect_of_size(name: str, wanted: float, setup: CleanSetup, rng: np.random.Generator) -> HiddenEffect:
     """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
     sampler = SAMPLERS[name]
-    of_amplitude = sampler.draw(sizer.setup, rng)
-    amplitude = sampler.first
+    of_amplitude = sampler.draw(setup, rng)
+    amplitude, limit = sampler.first, sampler.limit
     if sampler.scalable:
-        amplitude = amplitude_of_size(
-            lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
-        )
+        amplitude = amplitude_of_size(lambda a: setup.size(of_amplitude(a)), wanted, first=amplitude, limit=limit)
     effect = of_amplitude(amplitude)
-    return HiddenEffect(effect, sizer.size(effect), region_of_effect(effect, sizer))
+    return HiddenEffect(
+        name, effect, setup.size(effect), name in INSIDE, sampler.covariates, region=setup.region(effect)
+    )

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.recordings.patterns import Uniform
 from probewise.recordings.plan import Plan, Recording
@@ -21,13 +21,21 @@ from probewise.world import unlisted as strange
 from probewise.world.stages import AFTER_VIEW, Concealed
 from probewise.world.world import View, World
 
+NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]
+"""Norm of an effect after a refit of the null model: noise-free readings (without, with effect) to reading units.
+
+It is the 2-norm of `with - null`, where the null model is refitted in full to `with`. The misfit to the readings
+without effect (the model cannot have the true SSF's shape) must not be counted.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class CleanSetup:
-    """A plan and a simulated sensor without effects, in which an effect will be concealed."""
+    """A plan and a simulated sensor without effects, in which effects are concealed; their sizes lambda by a refit."""
 
     plan: Plan
     world: World
+    norm_after_refit: NormAfterRefit
 
     @property
     def duration_s(self) -> float:
@@ -35,19 +43,104 @@ class CleanSetup:
         return float(self.plan.time_s[-1] - self.plan.time_s[0])
 
     @cached_property
-    def edge_scan_names(self) -> tuple[str, ...]:
-        """Names of the scans of 20 readings or more whose first reading is over a pattern that is not uniform."""
-        plan, by_scan = self.plan, zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)
-        below = {k: plan.patterns[name] for k, name in enumerate(plan.pattern_names)}
-        return tuple(
-            n for n, rows in by_scan if rows.size >= 20 and not isinstance(below[plan.pattern[rows[0]]], Uniform)
-        )
+    def _view(self) -> View:
+        return self.world.view(self.plan)
 
-    def scans_at_orientation_of(self, scan: str) -> tuple[str, ...]:
-        """Return the names of all scans, `scan` included, that start at the orientation of `scan`, in plan order."""
-        first = {name: rows[0] for name, rows in zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)}
-        turn = self.plan.orientation_rad
-        return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])
+    @cached_property
+    def clean_recording(self) -> Recording:
+        """Recording of the plan: noise-free readings without any effect."""
+        return self.world.simulate(self.plan, rng=None, view=self._view).without_declared_range()
+
+    def recording_with_effects(self, *concealed: Concealed) -> Recording:
+        """Return a recording of the plan: noise-free readings with these effects."""
+        same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
+        world, view = replace(self.world, concealed=concealed), self._view if same_view else None
+        return world.simulate(self.plan, rng=None, view=view).without_declared_range()
+
+    def size(self, *concealed: Concealed) -> float:
+        """Return the joint lambda of effects: norm after the refit / noise sd; for noise `_size_on_noise`."""
+        if len(concealed) == 1 and concealed[0].disturbs:
+            return self._size_on_noise(concealed[0])
+        changed = self.recording_with_effects(*concealed)
+        return self.norm_after_refit(self.clean_recording, changed) / self.world.noise_sd
+
+    def _size_on_noise(self, effect: Concealed) -> float:
+        """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
+
+        lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
+        variance (Kullback-Leibler divergence summed over readings). Lost readings count as an effect on the mean:
+        lambda is the norm of their expected deviations in noise sds.
+        """
+        view, own = self._view, effect.parameters
+        n_points = len(view.seen)
+        match effect.name:
+            case "correlated_noise":
+                n_correlated = n_points - int(view.rows.scan_start_mask().sum())
+                return math.sqrt(-n_correlated * math.log(1 - own["rho"] ** 2))
+            case "signal_dependent_noise":
+                variance = 1 + own["ratio"] * view.seen
+                return math.sqrt(n_points * (math.log(variance.mean()) - float(np.log(variance).mean())))
+            case "outliers":
+                return math.sqrt(2 * n_points * _outlier_divergence(**own))
+            case "dropouts":
+                # As for the mean: a lost reading deviates by its distance from the right value.
+                squared = float(((own["value"] - self.clean_recording.readings) ** 2).sum())
+                return math.sqrt(own["share"] * squared) / self.world.noise_sd
+            case _:
+                raise ParameterError("effect", effect.name, "a noise effect of the vocabulary")
+
+    def cosine(self, one: Concealed, other: Concealed) -> float:
+        """Return the cosine between two effects' residuals after the refit, from the sizes of each and of both."""
+        a, b, both = self.size(one), self.size(other), self.size(one, other)
+        return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
+
+    def region(self, effect: Concealed) -> CovariateRegion | None:
+        """Return the region of a local effect, or None for any other.
+
+        Effects on named scans: those scans. Ambient step: from the step to the last reading. Saturation: its level to
+        the largest reading. Edge shadow: distances at which it is at least half its maximum. Stain, glint, step in X:
+        the range of X in which it changes readings of scans along X by at least half its maximum.
+        """
+        plan, clean, own = self.plan, self.clean_recording.readings, effect.parameters
+        match effect.name:
+            case "scan_misplacement":
+                return CovariateRegion("scan", scans=(own["scan"],))
+            case "scan_angle_error" | "height_offset":
+                return CovariateRegion("scan", scans=own["scans"])
+            case "ambient_step":
+                return CovariateRegion("time", own["at_s"], float(plan.time_s[-1]))
+            case "saturation":
+                return CovariateRegion("level", own["level"], float(clean.max()))
+            case "edge_shadow":
+                return CovariateRegion("edge_distance", 0.0, own["w"] * math.sqrt(2 * math.log(2)))
+            case "albedo_patch" | "glint" | "place_step":
+                along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
+                strength = np.where(along_x, np.abs(self.recording_with_effects(effect).readings - clean), 0.0)
+                there = plan.x_mm[strength >= strength.max() / 2]
+                return CovariateRegion("place", float(there.min()), float(there.max()))
+            case _:
+                return None
+
+
+@dataclass(frozen=True)
+class CovariateRegion:
+    """The interval `low` to `high` of `covariate`, in its unit; for the covariate "scan", the names `scans` instead."""
+
+    covariate: str
+    low: float | None = None
+    high: float | None = None
+    scans: tuple[str, ...] = ()
+
+
+def _outlier_divergence(share: float, size: float) -> float:
+    """Return KL in nats of (1 - share) N(0, 1) + share N(0, 1 + size^2) from the Gaussian of equal variance."""
+    wide, even = math.sqrt(1 + size**2), math.sqrt(1 + share * size**2)
+
+    def integrand(z: float) -> float:
+        density = (1 - share) * norm.pdf(z) + share * norm.pdf(z, scale=wide)
+        return float(density * (math.log(density) - norm.logpdf(z, scale=even)))
+
+    return 2 * float(quad(integrand, 0, 12 * wide, points=[2.0, 4.0], limit=200)[0])
 
 
 Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], Any]
@@ -58,13 +151,12 @@ Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], Any]
 class EffectSampler:
     """A distribution over one kind of effect, up to its amplitude.
 
-    `residual_covariates`: names of the covariates along which its residual is visible; `make`: function of the
-    amplitude and the values that `draws` drew; returns the effect; `first`: first amplitude of the search for a size;
-    `limit`: largest plausible amplitude, or `first` if the search does not choose it; `draws`: draw the parameters, one
-    each, in this order.
+    `covariates`: those along which its residual is visible; `make`: function of the amplitude and the values that
+    `draws` drew, in this order; returns the effect; `first`: first amplitude of the search for a size; `limit`: largest
+    plausible amplitude, or `first` if the search does not choose it.
     """
 
-    residual_covariates: tuple[str, ...]
+    covariates: tuple[str, ...]
     make: Callable[..., Concealed]
     first: float
     limit: float
@@ -103,13 +195,21 @@ def _moment(low: float, high: float) -> Draw:
 
 
 def _edge_scan(setup: CleanSetup, rng: np.random.Generator) -> str:
-    return str(rng.choice(setup.edge_scan_names))
+    """Draw a scan of 20 readings or more whose first reading is over a pattern that is not uniform."""
+    plan = setup.plan
+    patterns = [plan.patterns[name] for name in plan.pattern_names]
+    by_scan = zip(plan.scan_names, plan.rows_by_scan(), strict=True)
+    names = [n for n, rows in by_scan if rows.size >= 20 and not isinstance(patterns[plan.pattern[rows[0]]], Uniform)]
+    return str(rng.choice(names))
 
 
 def _edge_scans(setup: CleanSetup, rng: np.random.Generator) -> tuple[str, ...]:
-    """Draw a scan, or all scans at its orientation."""
-    scan = _edge_scan(setup, rng)
-    return setup.scans_at_orientation_of(scan) if rng.random() < 0.5 else (scan,)
+    """Draw a scan, or all scans that start at its orientation."""
+    scan, plan = _edge_scan(setup, rng), setup.plan
+    if rng.random() >= 0.5:
+        return (scan,)
+    turn = {n: plan.orientation_rad[rows[0]] for n, rows in zip(plan.scan_names, plan.rows_by_scan(), strict=True)}
+    return tuple(name for name in turn if turn[name] == turn[scan])
 
 
 def _duration_s(setup: CleanSetup, *_: np.random.Generator) -> float:
@@ -245,14 +345,6 @@ OUTSIDE: Mapping[str, EffectSampler] = {
 SAMPLERS = {**INSIDE, **OUTSIDE}
 
 
-NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]
-"""Norm of an effect after a refit of the null model: noise-free readings (without, with effect) to reading units.
-
-It is the 2-norm of `with - null`, where the null model is refitted in full to `with`. The misfit to the readings
-without effect (the model cannot have the true SSF's shape) must not be counted.
-"""
-
-
 def amplitude_of_size(
     size: Callable[[float], float],
     wanted: float,
@@ -266,12 +358,10 @@ def amplitude_of_size(
     """Return an amplitude greater than 0 at which `size` has the requested value.
 
     Size grows roughly as a power of the amplitude: steps follow a straight line in log-log coordinates, first by
-    extrapolation, then by interpolation, with bisection where interpolation gains too little.
-
-    `size`: function from amplitude to size; `wanted`: requested size, greater than 0; `first`: first amplitude tried;
-    `tolerance`: relative error of the size at which the search ends; `acceptable`: relative error accepted when the
-    search ends otherwise; `max_calls`: largest number of calls of `size`. Raises NotConvergedError if even the limit is
-    too small, or no amplitude has an acceptable size; `partial` holds (amplitude, size) of the nearest.
+    extrapolation, then by interpolation, with bisection where interpolation gains too little. `first`: first amplitude
+    tried; `tolerance`: relative error of the size at which the search ends; `acceptable`: accepted when it ends
+    otherwise. Raises NotConvergedError if even the limit is too small, or no amplitude has an acceptable size;
+    `partial` holds (amplitude, size) of the nearest.
     """
     low: tuple[float, float] | None = None  # log amplitude and log(size / wanted), size too small
     high: tuple[float, float] | None = None  # the same, size too large
@@ -301,125 +391,3 @@ def amplitude_of_size(
     raise NotConvergedError(
         f"the size nearest to {wanted:g} is {nearest[1]:.3g}, at amplitude {nearest[0]:.3g} (limit {limit:g})", nearest
     )
-
-
-@dataclass(frozen=True, eq=False)
-class EffectSizer:
-    """Computes sizes lambda of effects in one plan and with one sensor, and the cosine of two.
-
-    `setup`: a plan and a world without effects; `norm_after_refit`: function of two recordings, without and with an
-    effect: its norm after a full refit of the null model.
-    """
-
-    setup: CleanSetup
-    norm_after_refit: NormAfterRefit
-
-    @cached_property
-    def _clean_view(self) -> View:
-        return self.setup.world.view(self.setup.plan)
-
-    @cached_property
-    def clean_recording(self) -> Recording:
-        """Recording of the plan: noise-free readings without any effect."""
-        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._clean_view).without_declared_range()
-
-    def recording_with_effects(self, *concealed: Concealed) -> Recording:
-        """Return a recording of the plan: noise-free readings with these effects."""
-        same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
-        world = replace(self.setup.world, concealed=concealed)
-        return world.simulate(
-            self.setup.plan, rng=None, view=self._clean_view if same_view else None
-        ).without_declared_range()
-
-    def size(self, *concealed: Concealed) -> float:
-        """Return the joint lambda of effects: norm after the refit / noise sd; of one on noise, `noise_effect_size`."""
-        if len(concealed) == 1 and concealed[0].disturbs:
-            return noise_effect_size(
-                concealed[0], self._clean_view, self.clean_recording.readings, self.setup.world.noise_sd
-            )
-        return (
-            self.norm_after_refit(self.clean_recording, self.recording_with_effects(*concealed))
-            / self.setup.world.noise_sd
-        )
-
-    def cosine(self, one: Concealed, other: Concealed) -> float:
-        """Return the cosine between two effects' residuals after the refit, from the sizes of each and of both."""
-        a, b, both = self.size(one), self.size(other), self.size(one, other)
-        return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
-
-
-def noise_effect_size(effect: Concealed, view: View, readings: FloatArray, noise_sd: float) -> float:
-    """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
-
-    lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
-    variance (Kullback-Leibler divergence summed over readings). Lost readings count as an effect on the mean: lambda is
-    the norm of their expected deviations in noise sds.
-
-    `effect`: correlated or signal-dependent noise, outliers, or dropouts; `view`, `readings`: view of the sensor
-    (`World.view`), and the noise-free readings, shape (n_points,); `noise_sd`: sd of the noise's Gaussian core, reading
-    units. Raises ParameterError if the effect is any other.
-    """
-    n_points, own = len(view.seen), effect.parameters
-    match effect.name:
-        case "correlated_noise":
-            n_correlated = n_points - int(view.rows.scan_start_mask().sum())
-            return math.sqrt(-n_correlated * math.log(1 - own["rho"] ** 2))
-        case "signal_dependent_noise":
-            variance = 1 + own["ratio"] * view.seen
-            return math.sqrt(n_points * (math.log(variance.mean()) - float(np.log(variance).mean())))
-        case "outliers":
-            return math.sqrt(2 * n_points * _outlier_divergence(**own))
-        case "dropouts":
-            # As for the mean: a lost reading deviates by its distance from the right value.
-            return math.sqrt(own["share"] * float(((own["value"] - readings) ** 2).sum())) / noise_sd
-        case _:
-            raise ParameterError("effect", effect.name, "a noise effect of the vocabulary")
-
-
-def _outlier_divergence(share: float, size: float) -> float:
-    """Return KL in nats of (1 - share) N(0, 1) + share N(0, 1 + size^2) from the Gaussian of equal variance."""
-    wide, even = math.sqrt(1 + size**2), math.sqrt(1 + share * size**2)
-
-    def integrand(z: float) -> float:
-        density = (1 - share) * norm.pdf(z) + share * norm.pdf(z, scale=wide)
-        return float(density * (math.log(density) - norm.logpdf(z, scale=even)))
-
-    return 2 * float(quad(integrand, 0, 12 * wide, points=[2.0, 4.0], limit=200)[0])
-
-
-@dataclass(frozen=True)
-class CovariateRegion:
-    """The interval `low` to `high` of `covariate`, in its unit; for the covariate "scan", the names `scans` instead."""
-
-    covariate: str
-    low: float | None = None
-    high: float | None = None
-    scans: tuple[str, ...] = ()
-
-
-def region_of_effect(effect: Concealed, sizer: EffectSizer) -> CovariateRegion | None:
-    """Return the region of a local effect, or None for any other.
-
-    Effects on named scans: those scans. Ambient step: from the step to the last reading. Saturation: its level to the
-    largest reading. Edge shadow: distances at which it is at least half its maximum. Stain, glint, step in X: the range
-    of X in which it changes readings of scans along X by at least half its maximum.
-    """
-    plan, clean, own = sizer.clean_recording.plan, sizer.clean_recording.readings, effect.parameters
-    match effect.name:
-        case "scan_misplacement":
-            return CovariateRegion("scan", scans=(own["scan"],))
-        case "scan_angle_error" | "height_offset":
-            return CovariateRegion("scan", scans=own["scans"])
-        case "ambient_step":
-            return CovariateRegion("time", own["at_s"], float(plan.time_s[-1]))
-        case "saturation":
-            return CovariateRegion("level", own["level"], float(clean.max()))
-        case "edge_shadow":
-            return CovariateRegion("edge_distance", 0.0, own["w"] * math.sqrt(2 * math.log(2)))
-        case "albedo_patch" | "glint" | "place_step":
-            along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
-            strength = np.where(along_x, np.abs(sizer.recording_with_effects(effect).readings - clean), 0.0)
-            there = plan.x_mm[strength >= strength.max() / 2]
-            return CovariateRegion("place", float(there.min()), float(there.max()))
-        case _:
-            return None

@@ -12,14 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant
 from probewise.recordings.plan import Plan
 from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_times
-from probewise.world.concealed import (
-    correlated_noise,
-    drifting_noise,
-    dropouts,
-    heavy_tails,
-    outliers,
-    signal_dependent_noise,
-)
+from probewise.world import concealed as known
 from probewise.world.spots import Blob, Spot, gaussian_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.stages import Concealed
 from probewise.world.world import World
@@ -29,15 +22,19 @@ _PIXEL_MM = 0.5  # resolution of the raster: an SSF may be constant over half a 
 NOISE_LEVELS: Mapping[str, float] = {"low": 0.4, "middle": 0.6, "high": 1.0}
 """Sd of a reading's noise, in reading units."""
 
-OTHER_NOISE = ("ar1", "drifting", "t4", "outliers", "quantised", "signal_dependent", "dropouts")
-
-NOISE_NAMES: Mapping[str, str] = {
-    "ar1": "correlated_noise",
-    "t4": "outliers",
-    "outliers": "outliers",
-    "signal_dependent": "signal_dependent_noise",
-    "dropouts": "dropouts",
+_NOISE: Mapping[str, tuple[str, Callable[[float], Concealed] | None]] = {
+    "ar1": ("correlated_noise", lambda duration_s: known.correlated_noise(0.3)),
+    "drifting": ("", lambda duration_s: known.drifting_noise(2.0, duration_s)),
+    "t4": ("outliers", lambda duration_s: known.heavy_tails(4.0)),
+    "outliers": ("outliers", lambda duration_s: known.outliers(0.02, 8.0)),
+    "quantised": ("", None),
+    "signal_dependent": ("signal_dependent_noise", lambda duration_s: known.signal_dependent_noise(2.0)),
+    "dropouts": ("dropouts", lambda duration_s: known.dropouts(0.01, 0.0)),
 }
+OTHER_NOISE = tuple(_NOISE)
+"""Names of the noise models besides "white"."""
+
+NOISE_NAMES: Mapping[str, str] = {model: name for model, (name, _) in _NOISE.items() if name}
 """Names of noise models in the vocabulary; the other models are declared in the plan or out of vocabulary."""
 
 
@@ -107,17 +104,10 @@ def with_noise_model(world: World, model: str, *, duration_s: float) -> World:
     This sd is that at the start for "drifting", on black for "signal_dependent", of the core for "outliers".
     "quantised" readings are rounded to whole units, which the plan should declare.
     """
-    more: Mapping[str, Concealed] = {
-        "ar1": correlated_noise(0.3),
-        "drifting": drifting_noise(2.0, duration_s),
-        "t4": heavy_tails(4.0),
-        "outliers": outliers(0.02, 8.0),
-        "signal_dependent": signal_dependent_noise(2.0),
-        "dropouts": dropouts(0.01, 0.0),
-    }
-    if model in more:
-        return replace(world, concealed=(*world.concealed, more[model]))
-    return replace(world, step=1.0) if model == "quantised" else world
+    if model == "white":
+        return world
+    make = _NOISE[model][1]
+    return replace(world, step=1.0) if make is None else replace(world, concealed=(*world.concealed, make(duration_s)))
 
 
 PLANS: Mapping[str, Callable[[], Plan]] = {"paper": paper_plan, "two_way": two_way_plan}

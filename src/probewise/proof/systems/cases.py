@@ -21,9 +21,8 @@ from probewise.proof.systems.forms import (
     FAMILIES,
     OUT_OF_VOCABULARY,
     Form,
-    FormWithParameters,
-    Numbers,
     SimulatedSystem,
+    SystemEffect,
     family_of,
     forms_of,
     forms_out_of_vocabulary,
@@ -101,11 +100,11 @@ class DrawnSystem:
         per_run = {name: values[table.run] for name, values in self.by_run.items()}
         return {name: per_run[name] if name in per_run else self.shared[name] for name in self.kind.parameters}
 
-    def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
+    def simulate_all_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
         return self._simulate(self.table, effects)
 
-    def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
+    def simulate_diagnosed_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at the rows that are not held out, (n_points,).
 
         Raises NotConvergedError if a reading is not finite.
@@ -115,53 +114,24 @@ class DrawnSystem:
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
 
-    def _simulate(self, table: SystemTable, effects: Sequence[FormWithParameters]) -> FloatArray:
+    def _simulate(self, table: SystemTable, effects: Sequence[SystemEffect]) -> FloatArray:
         with np.errstate(all="ignore"):
             return simulate_noise_free(self.kind, table, self._parameters(table), effects).readings
 
 
 AfterRefit: TypeAlias = Callable[[DrawnSystem, FloatArray], FloatArray]
-"""Residuals, in noise sds, (n_points,), of noise-free readings of the rows that are not held out after a refit of the
-model without effects. Its own error, the residuals without effects, must not be counted. NotConvergedError: no fit."""
-
-
-@dataclass(frozen=True, eq=False)
-class SystemEffect:
-    """A concealed effect: form, parameters, size lambda, and the covariates along which it shows."""
-
-    form: Form
-    values: Numbers
-    size_lambda: float
-    covariates: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """The effect's name, with its target."""
-        return self.form.vocabulary_name
-
-    @property
-    def in_vocabulary(self) -> bool:
-        """Whether the effect is one that a diagnosis can name."""
-        return not self.form.outside
-
-    @property
-    def form_with_parameters(self) -> FormWithParameters:
-        """The pair of the form and its parameters by name."""
-        return self.form, self.values
+"""Residuals of noise-free readings, (n_points,), in sds, after a refit, whose own error must not be counted."""
 
 
 @dataclass(frozen=True, eq=False)
 class SystemCase:
     """One case of a challenge on systems.
 
-    `seed`, `number`, `stratum`: identification of the case; `effects`: its concealed effects; `noise_text`: the line on
-    noise in the simulator file; may be empty; `labels`: names of the runs, as in the table; `noise_free`, `readings`:
-    readings with the effects, without and with noise, at all rows, (n_points,); `cosine`: cosine of a pair after the
-    refit; None: no pair.
+    `effects`: the concealed ones; `noise_text`: the line on noise in the simulator file; may be empty; `labels`: names
+    of the runs, as in the table; `noise_free`, `readings`: readings with the effects, without and with noise, at all
+    rows, (n_points,); `cosine`: of a pair after the refit; None: no pair.
     """
 
-    seed: int
-    number: int
     stratum: Stratum
     drawn: DrawnSystem
     effects: tuple[SystemEffect, ...]
@@ -171,10 +141,6 @@ class SystemCase:
     noise_free: FloatArray
     readings: FloatArray
     cosine: float | None = None
-
-    def forms_with_parameters(self) -> list[FormWithParameters]:
-        """Return every concealed effect's form with its parameters."""
-        return [effect.form_with_parameters for effect in self.effects]
 
 
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
@@ -193,21 +159,18 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
     stratum, n_earlier = system_stratum_of(number)
     drawing, noising = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
     shuffled = [*np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES), *ADDED_FAMILIES]
-    failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
         family = str(shuffled[(n_earlier + (attempt // 8)) % len(shuffled)])
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
         try:
             effects, cosine = _draw_effects(stratum, n_earlier, family, drawn, after_refit, drawing)
-            everywhere = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
+            everywhere = drawn.simulate_all_rows(effects)
             if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.true_system.readings).max():
                 raise NotConvergedError("the held-out runs diverge")
-        except NotConvergedError as error:
-            failure = error
-            continue
-        break
-    else:
-        raise failure
+            break
+        except NotConvergedError:
+            if attempt == _ATTEMPTS - 1:
+                raise
     kind = drawn.kind
     name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
@@ -225,8 +188,6 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
     stated = ", ".join(f'"{key}": {value:g}' for key, value in said.items())
     plain = bool(noising.random() < 0.5)
     return SystemCase(
-        seed,
-        number,
         stratum=stratum,
         drawn=drawn,
         effects=effects,
@@ -255,9 +216,13 @@ def _draw_effects(
         if stratum.kind == "pair":
             families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
         own = [[f for f in forms if family_of(f) == name] for name in families]
-    chosen = [_draw_form(of, name, rng) for of, name in zip(own, families, strict=True)]
+    chosen = []
+    for of, name in zip(own, families, strict=True):
+        if not of:
+            raise NotConvergedError(f"this system has no target for {name}")
+        chosen.append(of[int(rng.integers(len(of)))])
     effects = tuple(draw_effect_of_size(form, stratum.size, drawn, after_refit, rng) for form in chosen)
-    left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e.form_with_parameters])) for e in effects]
+    left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e])) for e in effects]
     cosine = None
     if len(effects) == 2:
         cosine = float(left[0] @ left[1] / np.sqrt((left[0] @ left[0]) * (left[1] @ left[1])))
@@ -267,13 +232,6 @@ def _draw_effects(
         replace(effect, covariates=_residual_covariates(effect.form, residuals, drawn.true_system))
         for effect, residuals in zip(effects, left, strict=True)
     ), cosine
-
-
-def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
-    """Draw one of these forms; if there is none, raise NotConvergedError with the effect's `name` in the message."""
-    if not forms:
-        raise NotConvergedError(f"this system has no target for {name}")
-    return forms[int(rng.integers(len(forms)))]
 
 
 def draw_effect_of_size(
@@ -288,7 +246,7 @@ def draw_effect_of_size(
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
     def readings_at(amplitude: float) -> FloatArray:
-        return drawn.simulate_diagnosed_rows([(form, form.of_amplitude(sign * amplitude, more))])
+        return drawn.simulate_diagnosed_rows([SystemEffect(form, form.of_amplitude(sign * amplitude, more))])
 
     def size_at(amplitude: float) -> float:
         return float(np.linalg.norm(after_refit(drawn, readings_at(amplitude))))

@@ -20,9 +20,6 @@ Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
 Numbers: TypeAlias = Mapping[str, float]
 """A form's parameters by name."""
 
-OfAmplitude: TypeAlias = Callable[[float, dict[str, float]], dict[str, float]]
-Draw: TypeAlias = Callable[[np.random.Generator], dict[str, float]]
-
 
 @dataclass(frozen=True, eq=False)
 class Instants:
@@ -65,8 +62,8 @@ class Form:
     first: float
     limit: float
     covariates: tuple[str, ...]
-    of_amplitude: OfAmplitude = lambda a, drawn: {"a": a, **drawn}
-    draw: Draw = lambda rng: {}
+    of_amplitude: Callable[[float, dict[str, float]], dict[str, float]] = lambda a, drawn: {"a": a, **drawn}
+    draw: Callable[[np.random.Generator], dict[str, float]] = lambda rng: {}
     signed: bool = True
     target: str = ""
     order: int = 0
@@ -83,8 +80,24 @@ class Form:
         return self.name.removesuffix(" (floor)")
 
 
-FormWithParameters: TypeAlias = tuple[Form, Numbers]
-"""A form with its parameters."""
+@dataclass(frozen=True, eq=False)
+class SystemEffect:
+    """An effect of a system: form, parameters, size lambda, and the covariates along which it shows."""
+
+    form: Form
+    values: Numbers
+    size_lambda: float = 0.0
+    covariates: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The effect's name, with its target."""
+        return self.form.vocabulary_name
+
+    @property
+    def in_vocabulary(self) -> bool:
+        """Whether the effect is one that a diagnosis can name."""
+        return not self.form.outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +119,8 @@ class SimulatedSystem:
         """Names of the columns that vary, except time."""
         return tuple(name for name, v in self.table.columns.items() if name != self.table.time and np.ptp(v) > 0)
 
-    @property
-    def names_runs(self) -> bool:
-        """Whether the table names its runs, of which there are several."""
-        return self.kind.run is not None and len(self.table.rows_by_run) > 1
-
     def deviation(self, column: str) -> tuple[float, float]:
-        """Return mean and sd of a column over the rows that are not held out."""
+        """Return mean and sd of a column."""
         values = self.table.columns[column]
         return float(values.mean()), float(values.std())
 
@@ -124,11 +132,6 @@ class SimulatedSystem:
             found.append(np.diff(self.states[state][own])[gaps > 0] / gaps[gaps > 0])
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
-    def random_time(self, rng: np.random.Generator) -> float:
-        """Draw a time (or a row plus 0.5, if there is no time) from the middle 60 % of the rows."""
-        at = float(np.quantile(self.table.t, rng.uniform(0.2, 0.8)))
-        return math.floor(at) + 0.5 if self.table.time is None else at
-
 
 def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw a number between `low` and `high` whose logarithm is uniform; NotConvergedError if the range is empty."""
@@ -137,79 +140,72 @@ def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-def modulation(value_at: Callable[[Instants, Numbers], Any], *covariates: str, reach: float = 1.0, **more: Any) -> Form:
-    """Return a variation in proportion to an amplitude, of which forms are made by `modulated`.
-
-    `value_at` is a function of instants and parameters, `reach` its typical magnitude at amplitude 1; `more` as of
-    `Form`.
-    """
+def _modulation(
+    value_at: Callable[[Instants, Numbers], Any], *covariates: str, reach: float = 1.0, **more: Any
+) -> Form:
+    """Return a variation in proportion to an amplitude; `reach`: its typical magnitude at amplitude 1."""
     return Form("", "parameter", value_at, 1 / reach, math.inf, covariates, **more)
 
 
-def modulated(how: Form, name: str, side: Side, size: float, *, limit: float, **more: Any) -> Form:
+def _modulated(how: Form, name: str, side: Side, size: float, *, limit: float, **more: Any) -> Form:
     """Return the form that varies so, by default a term added; `size` of its first amplitude, `limit` in that."""
     first = size * how.first
     return replace(how, name=name, side=side, first=first, limit=limit * first, **more)
 
 
-def linear_drift(true: SimulatedSystem) -> Form:
-    """Return the modulation a t, t the recorded time."""
-    names = dict.fromkeys(("time", true.table.time or "time"))
-    return modulation(lambda now, v: v["a"] * now.t, *names, reach=float(np.abs(true.table.t).max()))
+def _modulations(true: SimulatedSystem) -> dict[str, Form]:
+    """Return by name the variations that a system can have.
 
+    "step" at a change point, after a time "at_s" or, without time, a row "at_row"; "drift" with the recorded time;
+    "per_run", a normal random value for each run, held-out ones included; "wave", with a period of four rows to two
+    thirds of the recording; "settling" from the start of each run.
+    """
+    rows, timed = true.table, true.table.time is not None
+    at, time = ("at_s", ("time", str(rows.time))) if timed else ("at_row", ("row",))
+    names = [f"values[{k}]" for k in range(rows.n_runs)]
+    longest = float(rows.time_since_start.max())
 
-def proportional_to_column(true: SimulatedSystem, column: str) -> Form:
-    """Return the modulation a (column - its mean over the recording)."""
-    middle, sd = true.deviation(column)
-    return modulation(lambda now, v: v["a"] * (now.u[column] - middle), column, reach=sd, uses=(column,))
+    def change_point(rng: np.random.Generator) -> dict[str, float]:
+        """Draw a time, or a row plus 0.5, from the middle 60 % of the rows."""
+        found = float(np.quantile(rows.t, rng.uniform(0.2, 0.8)))
+        return {at: found if timed else math.floor(found) + 0.5}
 
+    def wave(rng: np.random.Generator) -> dict[str, float]:
+        hz = draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap)
+        return {"hz": hz, "phase": float(rng.uniform(0, 2 * np.pi))}
 
-def step_at_change_point(true: SimulatedSystem) -> Form:
-    """Return the modulation 0, then a after a time "at_s", or after a row "at_row" if the table has no time."""
-    timed = true.table.time is not None
-    at = "at_s" if timed else "at_row"
-    return modulation(
+    step = _modulation(
         lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at]),
-        *(("time", str(true.table.time)) if timed else ("row",)),
-        draw=lambda rng: {at: true.random_time(rng)},
+        *time,
+        draw=change_point,
         breaks=(lambda v: v[at]) if timed else None,
     )
+    out = {"step": step}
+    if timed:
+        out["drift"] = _modulation(lambda now, v: v["a"] * now.t, *time, reach=float(np.abs(rows.t).max()))
+    if true.kind.run is not None and len(rows.rows_by_run) > 1:
+        out["per_run"] = _modulation(
+            lambda now, v: np.array([v[name] for name in names])[now.run],
+            "run",
+            of_amplitude=lambda a, drawn: {name: a * drawn[name] for name in names},
+            draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
+        )
+    if timed:
+        sine = lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"])  # noqa: E731
+        out["wave"] = _modulation(sine, *time, draw=wave, signed=False)
+    if timed and true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
+        out["settling"] = _modulation(
+            lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"]),
+            *("time", "run", str(rows.time)),
+            draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * rows.median_gap, 0.4 * longest)},
+        )
+    return out
 
 
-def value_per_run(true: SimulatedSystem) -> Form:
-    """Return a modulation with one normal random value per run, held-out runs included, times the amplitude."""
-    names = [f"values[{k}]" for k in range(true.table.n_runs)]
-    return modulation(
-        lambda now, v: np.array([v[name] for name in names])[now.run],
-        "run",
-        of_amplitude=lambda a, drawn: {name: a * drawn[name] for name in names},
-        draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
-    )
-
-
-def sinusoid_in_time(true: SimulatedSystem) -> Form:
-    """Return a sinusoid in time, its period from four rows to two thirds of the recording."""
-    rows = true.table
-    return modulation(
-        lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
-        "time",
-        str(rows.time),
-        draw=lambda rng: {
-            "hz": draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap),
-            "phase": float(rng.uniform(0, 2 * np.pi)),
-        },
-        signed=False,
-    )
-
-
-def settling(true: SimulatedSystem) -> Form:
-    """Return the modulation a exp(-t / tau_s), t the time since the start of the run."""
-    longest = float(true.table.time_since_start.max())
-    return modulation(
-        lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"]),
-        *("time", "run", str(true.table.time)),
-        draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
-    )
+def _proportional_to_column(true: SimulatedSystem, column: str) -> Form:
+    """Return the modulation a (column - its mean over the recording)."""
+    middle, sd = true.deviation(column)
+    return _modulation(lambda now, v: v["a"] * (now.u[column] - middle), column, reach=sd, uses=(column,))
 
 
 GAIN, OFFSET, _HYSTERESIS, _BEND, _LAG, _CEILING = range(6)
@@ -236,17 +232,17 @@ def family_of(form: Form) -> str:
 
 def forms_of(true: SimulatedSystem) -> list[Form]:
     """Return every form of the vocabulary, once for each of its possible targets in this system."""
-    out = [*_modulated_forms(true), *_forms_of_levels(true), *_lag_and_delay_forms(true)]
+    modulations = _modulations(true)
+    out = [*_forms_of_readings(true, modulations), *_forms_of_levels(true)]
     for column in true.kind.drives:
         out += _forms_of_input(true, column)
     time = true.table.time
     # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (true.kind.law is not None or true.kind.restarts_time):
         out.append(_input_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, "time", time))
-    out += _varying_parameter_forms(true)
-    if true.kind.defines_states:
-        for state in true.states:
-            out += _forms_of_rate(true, state)
+    out += _forms_of_parameters(true, modulations)
+    for state in true.states if true.kind.defines_states else ():
+        out += _forms_of_rate(true, state, modulations["wave"])
     return out
 
 
@@ -260,48 +256,40 @@ def _bounded_by(end: float, inwards: float) -> dict[str, Any]:
     return {"of_amplitude": lambda a, drawn: {"level": end + inwards * a}, "signed": False}
 
 
-def _modulated_reading_form(true: SimulatedSystem, name: str, how: Form, *, gain: bool = False) -> Form:
-    """Return the form that adds a modulation to the reading or, with `gain`, multiplies by 1 + modulation."""
-
-    def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        change = how.act(Instants.at_rows(rows), v)
-        return np.asarray(y * (1 + change) if gain else y + change)
-
-    typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
-    order = GAIN if gain else OFFSET
-    return modulated(how, name, "reading", true.kind.sd / typical, limit=_MANY, act=act, order=order)
-
-
 def _added_form(
     true: SimulatedSystem, name: str, addition: Callable[..., Any], *covariates: str, order: int = OFFSET, **more: Any
 ) -> Form:
     """Return the form that adds `a` times `addition` (readings, rows, parameters) to the reading."""
     sd = true.kind.sd
-    act = partial(_with_addition, addition)
+
+    def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        return np.asarray(y + v["a"] * addition(y, rows, v))
+
     return Form(name, "reading", act, sd, _MANY * sd, covariates, order=order, **more)
 
 
-def _with_addition(addition: Callable[..., Any], y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-    return np.asarray(y + v["a"] * addition(y, rows, v))
+def _forms_of_readings(true: SimulatedSystem, modulations: Mapping[str, Form]) -> Iterator[Form]:
+    """Yield what is added to the reading, or multiplies it, over rows, runs and columns."""
+    sd, typical = true.kind.sd, float(np.sqrt(np.mean(true.readings**2)))
 
+    def added(name: str, how: Form) -> Form:
+        act = lambda y, rows, v: np.asarray(y + how.act(Instants.at_rows(rows), v))  # noqa: E731
+        return _modulated(how, name, "reading", sd, limit=_MANY, act=act, order=OFFSET)
 
-def _modulated_forms(true: SimulatedSystem) -> Iterator[Form]:
-    timed = true.table.time is not None
-    both = {"step": step_at_change_point(true)}
-    if timed:
-        both["drift"] = linear_drift(true)
-    if true.names_runs:
-        both["per_run"] = value_per_run(true)
-    for kind, how in both.items():
-        yield _modulated_reading_form(true, f"offset_{kind}", how)
-        yield _modulated_reading_form(true, f"gain_{kind}", how, gain=True)
+    def multiplied(name: str, how: Form) -> Form:
+        act = lambda y, rows, v: np.asarray(y * (1 + how.act(Instants.at_rows(rows), v)))  # noqa: E731
+        return _modulated(how, name, "reading", sd / typical, limit=_MANY, act=act, order=GAIN)
+
+    for kind in ("step", "drift", "per_run"):
+        if kind in modulations:
+            yield added(f"offset_{kind}", modulations[kind])
+            yield multiplied(f"gain_{kind}", modulations[kind])
     for column in true.varying_columns:
-        yield _modulated_reading_form(true, f"sensitivity:{column}", proportional_to_column(true, column))
+        yield added(f"sensitivity:{column}", _proportional_to_column(true, column))
         yield from _curve_and_friction_forms(true, column)
-    if timed:
-        yield _modulated_reading_form(true, "interference", sinusoid_in_time(true))
-        if true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
-            yield _modulated_reading_form(true, "settling", settling(true))
+    for name, kind in (("interference", "wave"), ("settling", "settling")):
+        if kind in modulations:
+            yield added(name, modulations[kind])
 
 
 def _curve_and_friction_forms(true: SimulatedSystem, column: str) -> Iterator[Form]:
@@ -350,29 +338,6 @@ def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
     return out
 
 
-def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
-    """Yield what depends on the reading itself: hysteresis, a bend, a ceiling and a floor."""
-    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.kind.sd
-    span, level = high - low, ("level",)
-    turns = partial(_added_form, true, "hysteresis", lambda y, rows, v: direction_of_change(y, rows))
-    yield turns("previous", order=_HYSTERESIS)
-    if not span > 0:
-        return
-
-    def bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        z = (y - low) / span
-        return np.asarray(y + v["a"] * span * (np.sign(z) * np.abs(z) ** v["power"] - z))
-
-    def power(rng: np.random.Generator) -> dict[str, float]:
-        return {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}
-
-    yield Form("nonlinearity", "reading", bend, sd / span, 0.5, level, draw=power, order=_BEND)
-    bounds = (("saturation", np.minimum, high, -1.0), ("saturation (floor)", np.maximum, low, 1.0))
-    for name, bound, *end in bounds:
-        act = partial(lambda bound, y, rows, v: bound(y, v["level"]), bound)
-        yield Form(name, "reading", act, 2 * sd, 0.5 * span, level, **_bounded_by(*end), order=_CEILING)
-
-
 def delayed_values(values: FloatArray, rows: SystemTable, tau: float) -> FloatArray:
     """Delay values (n_points,) by `tau` within runs: interpolated, constant before the first row."""
     out = np.empty(values.shape)
@@ -395,11 +360,35 @@ def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
     return out
 
 
-def _lag_and_delay_forms(true: SimulatedSystem) -> Iterator[Form]:
+def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
+    """Yield what depends on the reading itself: hysteresis, a bend, a ceiling and a floor, a lag and a delay."""
+    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.kind.sd
+    span, level = high - low, ("level",)
+
+    def bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        z = (y - low) / span
+        return np.asarray(y + v["a"] * span * (np.sign(z) * np.abs(z) ** v["power"] - z))
+
+    def power(rng: np.random.Generator) -> dict[str, float]:
+        return {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}
+
+    def ceiling(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        return np.minimum(y, v["level"])
+
+    def floor(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        return np.maximum(y, v["level"])
+
+    yield _added_form(
+        true, "hysteresis", lambda y, rows, v: direction_of_change(y, rows), "previous", order=_HYSTERESIS
+    )
+    if span > 0:
+        yield Form("nonlinearity", "reading", bend, sd / span, 0.5, level, draw=power, order=_BEND)
+        for name, act, *end in (("saturation", ceiling, high, -1.0), ("saturation (floor)", floor, low, 1.0)):
+            yield Form(name, "reading", act, 2 * sd, 0.5 * span, level, **_bounded_by(*end), order=_CEILING)
     if true.table.time is not None:
         gap = true.table.median_gap
-        for name, act in (("lag", _lagged), ("delay", _late)):
-            yield Form(name, "reading", act, 0.5 * gap, 15 * gap, ("previous",), **_is("tau_s"), order=_LAG)
+        for name, late in (("lag", _lagged), ("delay", _late)):
+            yield Form(name, "reading", late, 0.5 * gap, 15 * gap, ("previous",), **_is("tau_s"), order=_LAG)
 
 
 def _input_form(
@@ -413,24 +402,23 @@ def _input_form(
     return Form(name, "input", act, first, limit, covariates, **more)
 
 
-def _narrowed(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-    return np.asarray(np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0))
-
-
-def _with_runout(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-    return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
-
-
 def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
     """Yield the forms on a column that the law or formula uses."""
     values, (_, spread) = true.table.columns[column], true.deviation(column)
     low, high = float(values.min()), float(values.max())
-    span, own, n_values = high - low, (column, "level"), len(np.unique(values))
+    span, n_values = high - low, len(np.unique(values))
     if not span > 0:
         return
 
     def form(name: str, change: Callable[..., Any], first: float, limit: float, *seen: str, **more: Any) -> Form:
-        return _input_form(f"{name}:{column}", column, change, first, limit, *(seen or own), **more)
+        seen = seen or (column, "level")
+        return _input_form(f"{name}:{column}", column, change, first, limit, *seen, **more)
+
+    def narrowed(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        return np.asarray(np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0))
+
+    def with_runout(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
     def wave(rng: np.random.Generator) -> dict[str, float]:
         period = span / draw_log_uniform(rng, 1.5, min(n_values / 6, 25))
@@ -441,12 +429,12 @@ def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
     ceiling = _bounded_by(high, -1.0)
     yield form("input_saturation", lambda c, rows, v: np.minimum(c, v["level"]), 0.05 * span, 0.6 * span, **ceiling)
     if low <= 0.1 * span:
-        yield form("dead_zone", _narrowed, 0.01 * span, 0.3 * span, **_is("width"))
+        yield form("dead_zone", narrowed, 0.01 * span, 0.3 * span, **_is("width"))
     moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield form("backlash", behind_gear_play, 0.01 * span, 0.3 * span, "previous", column, **_is("width"))
     if n_values > 20:
-        yield form("periodic_error", _with_runout, 0.01 * spread, 0.2 * span, draw=wave, signed=False)
+        yield form("periodic_error", with_runout, 0.01 * spread, 0.2 * span, draw=wave, signed=False)
     if true.table.time is not None:
         gap = true.table.median_gap
         yield form("input_delay", _late, 0.5 * gap, 6 * gap, "previous", column, **_is("tau_s"), late=column)
@@ -467,21 +455,17 @@ def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray
     return out
 
 
-def _varying_parameter_forms(true: SimulatedSystem) -> Iterator[Form]:
+def _forms_of_parameters(true: SimulatedSystem, modulations: Mapping[str, Form]) -> Iterator[Form]:
     """Yield the forms by which each parameter may vary: in a step, a drift, from run to run, with a column."""
-    common = {"steps": step_at_change_point(true)}
-    if true.table.time is not None:
-        common["drifts"] = linear_drift(true)
     for name, values in true.parameters.items():
         of_run = name in true.kind.per_run
         if of_run and true.kind.law is not None:
             continue  # initial values do not vary within a run
-        own = {f"{kind}:{name}": how for kind, how in common.items()}
-        if not of_run and true.names_runs:
-            own[f"differs:{name}"] = value_per_run(true)
-        own |= {f"depends:{name}:{column}": proportional_to_column(true, column) for column in true.varying_columns}
+        words = {"steps": "step", "drifts": "drift"} | ({} if of_run else {"differs": "per_run"})
+        own = {f"{word}:{name}": modulations[kind] for word, kind in words.items() if kind in modulations}
+        own |= {f"depends:{name}:{column}": _proportional_to_column(true, column) for column in true.varying_columns}
         size = 0.003 * float(np.abs(values).mean())
-        yield from (modulated(how, called, "parameter", size, limit=200, target=name) for called, how in own.items())
+        yield from (_modulated(how, called, "parameter", size, limit=200, target=name) for called, how in own.items())
 
 
 def _rate_form(
@@ -495,9 +479,9 @@ def _rate_form(
     )
 
 
-def _forms_of_rate(true: SimulatedSystem, state: str) -> Iterator[Form]:
+def _forms_of_rate(true: SimulatedSystem, state: str, wave: Form) -> Iterator[Form]:
     """Yield the terms that may be missing from the rate of a state, dry friction and an upper bound included."""
-    speed, values, waves = true.rms_rate(state), true.states[state], sinusoid_in_time(true)
+    speed, values = true.rms_rate(state), true.states[state]
 
     def term(name: str, of: str, change: Callable[[Any], Any], size: float, *seen: str, **more: Any) -> Form:
         """Return a term that is a function `change` of the state `of`."""
@@ -513,8 +497,8 @@ def _forms_of_rate(true: SimulatedSystem, state: str) -> Iterator[Form]:
         yield term(f"quadratic:{state}:{other}", other, lambda r: -(r**2), most**2, *seen)
         if other != state:
             yield term(f"coupling:{state}:{other}", other, lambda r: -r, most, *seen)
-    act = partial(lambda waves, s, now, v: waves.act(now, v), waves)
-    yield modulated(waves, f"periodic_forcing:{state}", "rate", 0.02 * speed, limit=100, act=act, target=state)
+    act = lambda s, now, v: wave.act(now, v)  # noqa: E731
+    yield _modulated(wave, f"periodic_forcing:{state}", "rate", 0.02 * speed, limit=100, act=act, target=state)
     held = partial(Form, side="rate", act=lambda s, now, v: 0.0, covariates=(f"state:{state}", "level"), target=state)
     yield held(f"friction:{state}", first=0.02 * speed, limit=2 * speed, sticks=True, signed=False)
     high, span = float(values.max()), float(np.ptp(values))
@@ -581,7 +565,7 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
         most, sprung = float(np.abs(values).max()), float(np.quantile(values, 0.6))
 
         def pushes(name: str, push: Callable[..., Any], size: float, *seen: str, **more: Any) -> Form:
-            return _rate_form(true, f"strange_{name}:{state}", state, push, size, *seen, outside=True, **more)
+            return _rate_form(true, f"strange_{name}", state, push, size, *seen, outside=True, **more)
 
         def spring(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
             return -np.maximum(s[state] - sprung, 0.0)
@@ -592,8 +576,7 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
         def pull(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
             return np.asarray(-(now.u[one] - middle) / spread * s[state] ** 2 / most**2)
 
-        yield pushes("one_sided_spring", spring, float(np.ptp(values)), *own)
-        yield pushes("leak", leak, 20.0, *own)
+        yield pushes(f"one_sided_spring:{state}", spring, float(np.ptp(values)), *own)
+        yield pushes(f"leak:{state}", leak, 20.0, *own)
         seen = (one, f"state:{state}", "time", "run", "level")
-        column = pushes("column_times_state", pull, 1.0, *seen, uses=(one,))
-        yield replace(column, name=f"{column.name}:{one}")
+        yield pushes(f"column_times_state:{state}:{one}", pull, 1.0, *seen, uses=(one,))

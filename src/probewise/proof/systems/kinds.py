@@ -68,17 +68,13 @@ Values: TypeAlias = Mapping[str, Any]
 
 Columns: TypeAlias = dict[str, FloatArray]
 
-Formula: TypeAlias = Callable[[Values, Values], Any]
-"""Function of parameters and columns; returns the reading, row by row."""
-
 
 @dataclass(frozen=True)
 class Law:
-    """A law in continuous time.
+    """A law in continuous time: `rates` of the states and what is `read`, functions of states, parameters and columns.
 
-    `start`: initial value of each state: the name of a parameter, or a number; `rates`: function of states, parameters
-    and columns; returns the rate of each state; `read`: function of states, parameters and columns; returns the
-    reading; `linear`: whether inputs are interpolated linearly between rows; otherwise they are held.
+    `start`: initial value of each state: the name of a parameter, or a number; `linear`: whether inputs are
+    interpolated linearly between rows; otherwise they are held.
     """
 
     start: Mapping[str, str | float]
@@ -133,7 +129,7 @@ class SystemKind:
     parameters: tuple[str, ...] = field(init=False)
     defines_states: bool = field(init=False)
     law: Law | None = field(init=False)
-    formula: Formula = field(init=False)  # None beside states
+    formula: Callable[[Values, Values], Any] = field(init=False)  # of parameters and columns; None beside states
 
     def __post_init__(self) -> None:
         file: dict[str, Any] = {}

@@ -7,8 +7,6 @@ each run is integrated by itself, and its events are located.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, cast
 
@@ -17,8 +15,8 @@ from scipy.integrate import solve_ivp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.proof.systems.forms import Form, FormWithParameters, Instants, SimulatedSystem
-from probewise.proof.systems.kinds import Law, SystemKind, SystemTable
+from probewise.proof.systems.forms import Form, Instants, SimulatedSystem, SystemEffect
+from probewise.proof.systems.kinds import Law, SystemKind, SystemTable, Values
 
 _RTOL, _ATOL = 1e-8, 1e-10
 _REST = 1e-9  # share of a state's scale below which it is at rest
@@ -29,100 +27,83 @@ _HAIR = 1e-8  # share of a gap by which an interval keeps away from discontinuit
 
 
 def simulate_noise_free(
-    kind: SystemKind, rows: SystemTable, parameters: Mapping[str, Any], effects: Sequence[FormWithParameters] = ()
+    kind: SystemKind, rows: SystemTable, parameters: Mapping[str, Any], effects: Sequence[SystemEffect] = ()
 ) -> SimulatedSystem:
     """Simulate a system without noise.
 
-    `rows`: the table of the rows to simulate; `parameters`: by name, a number or (n_points,) each; `effects`: forms,
-    each with its parameters by name.
+    `rows`: the table of the rows to simulate; `parameters`: by name, a number or (n_points,) each.
     """
     law, columns, inner = kind.law, dict(rows.columns), []
-    for form, numbers in effects:
-        if form.side == "input" and not (form.late and law is not None):
-            columns = form.act(columns, rows, numbers)
-        elif form.side != "reading":
-            inner.append((form, numbers))
+    for effect in effects:
+        if effect.form.side == "input" and not (effect.form.late and law is not None):
+            columns = effect.form.act(columns, rows, effect.values)
+        elif effect.form.side != "reading":
+            inner.append(effect)
     states: Mapping[str, FloatArray] = {}
     if law is not None:
-        states = _Integration(law, kind, rows, parameters, columns, inner).solve()
+        states = _Integration(kind, rows, parameters, columns, inner).solve()
         readings = law.read(states, parameters, columns)
     else:
         p, now = dict(parameters), Instants.at_rows(rows)
-        for form, numbers in inner:
-            p[form.target] = p[form.target] + form.act(now, numbers)
+        for effect in inner:
+            p[effect.form.target] = p[effect.form.target] + effect.form.act(now, effect.values)
         readings = kind.formula(p, columns)
     readings = np.array(np.broadcast_to(readings, len(rows)), dtype=np.float64)
-    for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
-        readings = form.act(readings, rows, numbers)
+    for effect in sorted((e for e in effects if e.form.side == "reading"), key=lambda e: e.form.order):
+        readings = effect.form.act(readings, rows, effect.values)
     return SimulatedSystem(kind, rows, parameters, readings, states)
 
 
-@dataclass(frozen=True, eq=False)
 class _Integration:
     """The solution of a law for all runs; `columns` are the inputs after their effects, including time.
 
-    `effects`: forms on parameters and rates, and those that delay a column.
+    `effects`: on parameters and rates, and those that delay a column.
     """
 
-    law: Law
-    kind: SystemKind
-    table: SystemTable
-    parameters: Mapping[str, Any]
-    columns: Mapping[str, FloatArray]
-    effects: Sequence[FormWithParameters]
-
-    @cached_property
-    def time(self) -> FloatArray:
-        """The time by which the law is integrated, (n_points,): with the errors of the clock."""
-        return self.columns[cast(str, self.table.time)]
-
-    @cached_property
-    def rows_by_position_and_run(self) -> IntArray:
-        """Index of the row at each position in each run, (n_positions, n_runs); short runs repeat their last row."""
-        longest = max(len(own) for own in self.table.rows_by_run)
-        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.table.rows_by_run]
-        return np.stack(filled, axis=1)
-
-    @cached_property
-    def delays(self) -> dict[str, float]:
-        """Delay of each column that is delayed, by name."""
-        return {form.late: numbers["tau_s"] for form, numbers in self.effects if form.late}
-
-    @cached_property
-    def hard(self) -> list[tuple[Form, float]]:
-        """Forms of dry friction and bounds, each with its strength or level."""
-        return [(f, float(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
+    def __init__(
+        self, kind: SystemKind, table: SystemTable, p: Values, columns: Values, effects: Sequence[SystemEffect]
+    ) -> None:
+        self.law, self.kind, self.table, self.parameters = cast(Law, kind.law), kind, table, p
+        self.columns, self.effects, self.names = columns, effects, list(self.law.start)
+        # The time by which the law is integrated, (n_points,): with the errors of the clock.
+        self.time: FloatArray = columns[cast(str, table.time)]
+        # The row at each position in each run, (n_positions, n_runs); short runs repeat their last row.
+        longest = max(len(own) for own in table.rows_by_run)
+        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in table.rows_by_run]
+        self.rows: IntArray = np.stack(filled, axis=1)
+        self.delays = {e.form.late: e.values["tau_s"] for e in effects if e.form.late}
+        # Dry friction and bounds, each with its strength or level.
+        hard = (e for e in effects if e.form.sticks or e.form.stops)
+        self.hard = [(e.form, float(e.values["a" if e.form.sticks else "level"])) for e in hard]
 
     def solve(self) -> dict[str, FloatArray]:
         """Return every state by name at every row, (n_points,)."""
-        names, first = list(self.law.start), self.rows_by_position_and_run[0]
+        first = self.rows[0]
         starts = [self.parameters[each] if isinstance(each, str) else each for each in self.law.start.values()]
-        s = np.array(
-            [np.broadcast_to(np.asarray(each)[first] if np.ndim(each) else each, len(first)) for each in starts]
-        )
+        each_run = (np.asarray(each)[first] if np.ndim(each) else each for each in starts)
+        s = np.array([np.broadcast_to(each, len(first)) for each in each_run])
         for form, level in self.hard:
             if form.stops:
-                k = names.index(form.target)
+                k = self.names.index(form.target)
                 s[k] = np.minimum(s[k], level)
         kept = [s]
-        for position in range(len(self.rows_by_position_and_run) - 1):
+        for k in range(len(self.rows) - 1):
             if self.hard:
-                runs = [self._through_events(s[:, j], position, j, names) for j in range(len(first))]
-                s = np.stack(runs, axis=1)
+                s = np.stack([self._through_events(s[:, j], k, j) for j in range(len(first))], axis=1)
             else:
-                s = self._through_gap(s, position, names)
+                s = self._through_gap(s, k)
             kept.append(s)
-        out = {name: np.empty(len(self.table)) for name in names}
-        for name, values in zip(names, np.stack(kept, axis=2), strict=True):
+        out = {name: np.empty(len(self.table)) for name in self.names}
+        for name, values in zip(self.names, np.stack(kept, axis=2), strict=True):
             for own, of_run in zip(self.table.rows_by_run, values, strict=True):
                 out[name][own] = of_run[: len(own)]
         return out
 
     def _inputs_in_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
         """Return a function from a share of the gap after position k to the parameters by name and `Instants` there."""
-        first, here, there = (self.rows_by_position_and_run[at, runs] for at in (0, k, k + 1))
+        first, here, there = (self.rows[at, runs] for at in (0, k, k + 1))
         printed, run = self.table.t, self.table.run[here]
-        uses = (column for form, _ in self.effects for column in form.uses)
+        uses = (column for e in self.effects for column in e.form.uses)
         ends = {}
         for name in dict.fromkeys((*self.kind.drives, *uses)):
             if name not in self.delays:
@@ -130,7 +111,7 @@ class _Integration:
                 holds = name in self.kind.drives and not self.law.linear
                 ends[name] = (values[here], 0.0 if holds else values[there] - values[here])
         base = {name: v[here] if np.ndim(v) else v for name, v in self.parameters.items()}
-        varying = [(form, numbers) for form, numbers in self.effects if form.side == "parameter"]
+        varying = [(e.form, e.values) for e in self.effects if e.form.side == "parameter"]
 
         def at(share: float) -> tuple[dict[str, Any], Instants]:
             u: dict[str, Any] = {name: low + share * rise for name, (low, rise) in ends.items()}
@@ -157,19 +138,19 @@ class _Integration:
                 out[j] = column[own[max(int(np.searchsorted(self.table.t[own], t[j] + 1e-12, side="right")) - 1, 0)]]
         return out
 
-    def _rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
+    def _rates(self, s: FloatArray, p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
         """Return the rate of each state by name, with the effects on rates except dry friction and bounds."""
-        out = self.law.rates(s, p, now.u)
-        for form, numbers in self.effects:
-            if form.side == "rate" and not (form.sticks or form.stops):
-                out[form.target] = out[form.target] + form.act(s, now, numbers)
+        by_name = dict(zip(self.names, s, strict=True))
+        out = self.law.rates(by_name, p, now.u)
+        for e in self.effects:
+            if e.form.side == "rate" and not (e.form.sticks or e.form.stops):
+                out[e.form.target] = out[e.form.target] + e.form.act(by_name, now, e.values)
         return out
 
     def _intervals(self, k: int) -> Iterator[tuple[float, float]]:
         """Yield the intervals, as shares of the gap after position k, between the discontinuities of any run."""
-        here, there = self.rows_by_position_and_run[k], self.rows_by_position_and_run[k + 1]
-        begin, gap = self.table.t[here], self.table.t[there] - self.table.t[here]
-        moments = [np.ravel(form.breaks(numbers)) for form, numbers in self.effects if form.breaks is not None]
+        begin, gap = self.table.t[self.rows[k]], self.table.t[self.rows[k + 1]] - self.table.t[self.rows[k]]
+        moments = [np.ravel(e.form.breaks(e.values)) for e in self.effects if e.form.breaks is not None]
         moments += [self.table.t + tau for tau in self.delays.values()]
         inside: FloatArray = np.zeros(0)
         if moments:
@@ -188,21 +169,20 @@ class _Integration:
                 raise NotConvergedError(f"the law of the {self.kind.name} runs away, or is too stiff, between two rows")
             return slope(share, y)
 
-        solved = solve_ivp(
-            counted, (begin, end), s, method="DOP853", rtol=_RTOL, atol=_ATOL, first_step=end - begin, events=events
-        )
+        settings: Any = {"method": "DOP853", "rtol": _RTOL, "atol": _ATOL, "first_step": end - begin}
+        solved = solve_ivp(counted, (begin, end), s, events=events, **settings)
         if not solved.success:
             raise NotConvergedError(f"the law of the {self.kind.name} cannot be solved: {solved.message}")
         return solved
 
-    def _through_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
+    def _through_gap(self, s: FloatArray, k: int) -> FloatArray:
         """Integrate states, (n_states, n_runs), from position k of all runs to the next position."""
-        here, there = self.rows_by_position_and_run[k], self.rows_by_position_and_run[k + 1]
-        gap, at, intervals = self.time[there] - self.time[here], self._inputs_in_gap(k), list(self._intervals(k))
+        gap, at = self.time[self.rows[k + 1]] - self.time[self.rows[k]], self._inputs_in_gap(k)
+        intervals = list(self._intervals(k))
 
         def slope(share: float, flat: FloatArray) -> FloatArray:
-            found = self._rates(dict(zip(names, flat.reshape(s.shape), strict=True)), *at(share))
-            return np.stack([np.broadcast_to(found[name] * gap, len(gap)) for name in names]).ravel()
+            found = self._rates(flat.reshape(s.shape), *at(share))
+            return np.stack([np.broadcast_to(found[name] * gap, len(gap)) for name in self.names]).ravel()
 
         # Slightly inside: a discontinuity at an end belongs to the other side.
         hair, flat = _HAIR if len(intervals) > 1 else 0.0, s.ravel()
@@ -210,33 +190,48 @@ class _Integration:
             flat = self._solved(slope, low + hair, high - hair, flat).y[:, -1]
         return np.asarray(flat.reshape(s.shape))
 
-    def _through_events(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
+    def _through_events(self, s: FloatArray, k: int, j: int) -> FloatArray:
         """Integrate the states of run j, (n_states,), from position k to the next, locating events."""
-        here, there = self.rows_by_position_and_run[k : k + 2, j]
+        here, there = self.rows[k : k + 2, j]
         gap, at = self.time[there] - self.time[here], self._inputs_in_gap(k, slice(j, j + 1))
+        place = [self.names.index(form.target) for form, _ in self.hard]
 
         def free_rates(share: float, y: FloatArray) -> dict[str, float]:
-            found = self._rates(dict(zip(names, y, strict=True)), *at(share))
-            return {name: float(np.ravel(v)[0]) for name, v in found.items()}
+            return {name: float(np.ravel(v)[0]) for name, v in self._rates(y, *at(share)).items()}
+
+        def end_of_mode(form: Form, size: float, mode: int, i: int) -> Any:
+            """Return SciPy's event: coming to rest, breaking loose, reaching or leaving a bound."""
+
+            def rate(x: float, y: FloatArray) -> float:
+                return free_rates(x, y)[form.target]
+
+            found: Any
+            if mode == 0:
+                found, direction = (lambda x, y: abs(rate(x, y)) - size, 1.0) if form.sticks else (rate, -1.0)
+            elif form.sticks:
+                found, direction = (lambda x, y: y[i] + mode * _REST), -float(mode)  # it may start from 0
+            else:
+                found, direction = (lambda x, y: y[i] - size), 1.0
+            found.terminal, found.direction = True, direction
+            return found
 
         for low, high in self._intervals(k) if gap > 0 else ():
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):
                 rates = free_rates(share, s)
                 modes = [
-                    forced.get(m, _mode(form, size, s[names.index(form.target)], rates[form.target]))
-                    for m, (form, size) in enumerate(self.hard)
+                    forced.get(m, _mode(form, size, s[i], rates[form.target]))
+                    for m, ((form, size), i) in enumerate(zip(self.hard, place, strict=True))
                 ]
 
                 def slope(x: float, y: FloatArray, modes: list[int] = modes) -> FloatArray:
                     found = free_rates(x, y)
                     for (form, size), mode in zip(self.hard, modes, strict=True):
-                        found[form.target] = (
-                            0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
-                        )
-                    return np.asarray(gap * np.array([found[name] for name in names]))
+                        against = size * mode if form.sticks else 0.0
+                        found[form.target] = 0.0 if mode == 0 else found[form.target] - against
+                    return np.asarray(gap * np.array([found[name] for name in self.names]))
 
-                ends = [_end_of_mode(*f, mode, names, free_rates) for f, mode in zip(self.hard, modes, strict=True)]
+                ends = [end_of_mode(*f, mode, i) for f, mode, i in zip(self.hard, modes, place, strict=True)]
                 solved = self._solved(slope, share, high, s, ends)
                 s, share = solved.y[:, -1].copy(), float(solved.t[-1])
                 if solved.status != 1 or share >= high:
@@ -244,7 +239,7 @@ class _Integration:
                 forced = {}
                 for m, ((form, size), found, mode) in enumerate(zip(self.hard, solved.t_events, modes, strict=True)):
                     if found.size and mode != 0:  # at rest, or at the bound
-                        s[names.index(form.target)] = 0.0 if form.sticks else size
+                        s[place[m]] = 0.0 if form.sticks else size
                     elif found.size:  # breaks loose
                         forced[m] = int(np.sign(free_rates(share, s)[form.target])) if form.sticks else 1
             else:
@@ -257,19 +252,3 @@ def _mode(form: Form, size: float, value: float, rate: float) -> int:
     if form.stops:
         return 0 if value >= size and rate > 0 else 1
     return int(np.sign(value)) if value != 0 else int(np.sign(rate)) * (abs(rate) > size)
-
-
-def _end_of_mode(form: Form, size: float, mode: int, names: list[str], free_rates: Any) -> Any:
-    """Return SciPy's event function of a mode's end: coming to rest, breaking loose, reaching or leaving a bound."""
-    i = names.index(form.target)
-    if form.sticks:
-        if mode == 0:
-            found, direction = (lambda x, y: abs(free_rates(x, y)[form.target]) - size), 1.0
-        else:
-            found, direction = (lambda x, y: y[i] + mode * _REST), -float(mode)  # it may start from 0
-    elif mode == 0:
-        found, direction = (lambda x, y: free_rates(x, y)[form.target]), -1.0
-    else:
-        found, direction = (lambda x, y: y[i] - size), 1.0
-    found.terminal, found.direction = True, direction  # type: ignore[attr-defined]
-    return found

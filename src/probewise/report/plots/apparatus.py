@@ -40,7 +40,7 @@ def arm_and_sensor(
     draw_sensor_face(face, size=1.0)
     face.set_axis_off()
     face.set(xlim=(-0.95, 0.95), ylim=(-0.95, 0.95), aspect="equal")
-    face.set_title("sensor, from below", fontsize="medium", loc="left")
+    face.set_title("sensor, from below", **canvas.TITLE)
     face.annotate(
         "photodiode", (0.0, 0.24), xytext=(0.0, 0.72), ha="center", fontsize=canvas.SMALL_PT, arrowprops=_ARROW
     )
@@ -49,10 +49,7 @@ def arm_and_sensor(
 
 
 def draw_arm_lengths(geometry: Geometry) -> Axes:
-    """Draw the arm from the side with its lengths, motors and gear ratios, for building or measuring; return the axes.
-
-    The sensor reads in the middle of its reach.
-    """
+    """Draw the arm, in the middle of its reach, from the side with its lengths, motors and gear ratios."""
     away = sum(geometry.radii_in_reach_mm()) / 2
     middle = (geometry.base.low_rad + geometry.base.high_rad) / 2
     place = np.array([geometry.axis_mm]) + away * np.array([[np.cos(middle), np.sin(middle)]])
@@ -60,7 +57,7 @@ def draw_arm_lengths(geometry: Geometry) -> Axes:
     ax = canvas.axes_or_new(None, size_in=(8.2, 5.4))
     _draw_arm_from_side(ax, geometry, shoulder, elbow, named=False)
     _draw_lengths(ax, geometry, shoulder, elbow)
-    joint, knee, *_ = _joints_from_side(geometry, shoulder, elbow)
+    joint, knee, *_ = geometry.joints_from_side_mm(shoulder, elbow)
     motors = (
         ("base", geometry.base, np.array([0.0, joint[1] + 110.0]), (-12, 16), "right"),
         ("shoulder", geometry.shoulder, joint, (40, -22), "left"),
@@ -75,7 +72,7 @@ def draw_arm_lengths(geometry: Geometry) -> Axes:
 
 def _draw_lengths(ax: Axes, geometry: Geometry, shoulder: float, elbow: float) -> None:
     """Draw a dimension line for each length of the arm, named as in a geometry file."""
-    joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
+    joint, knee, wrist, eye = geometry.joints_from_side_mm(shoulder, elbow)
     (forward, height), (upper_mm, lower_mm), (out_mm, drop_mm) = (
         geometry.shoulder_mm,
         geometry.links_mm,
@@ -120,7 +117,7 @@ def draw_sensor_face(
 ) -> None:
     """Draw the sensor seen from below: package, photodiode (white), LED (red) and the ridge between them.
 
-    `size` is the width of the package in the axes' units; it is turned anticlockwise, at 0 the photodiode is at the
+    `size` is the width of the package in the axes' units, `turned_rad` its anticlockwise turn from the photodiode on
     top.
     """
     turn = Affine2D().scale(size).rotate(turned_rad).translate(*center) + ax.transData
@@ -137,17 +134,8 @@ def draw_sensor_face(
         ax.add_patch(part)
 
 
-def _joints_from_side(geometry: Geometry, shoulder: float, elbow: float) -> list[FloatArray]:
-    """Return shoulder, elbow, wrist and sensor's face as distance from the base's axis and height, (2,) each, in mm."""
-    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
-    joint = np.array(geometry.shoulder_mm)
-    knee = joint + geometry.links_mm[0] * np.array([np.cos(shoulder), np.sin(shoulder)])
-    wrist = knee + geometry.links_mm[1] * np.array([np.cos(lower), np.sin(lower)])
-    return [joint, knee, wrist, wrist + np.array([geometry.sensor_mm[0], -geometry.sensor_mm[1]])]
-
-
 def _draw_arm_from_side(ax: Axes, geometry: Geometry, shoulder: float, elbow: float, *, named: bool = True) -> None:
-    joint, knee, wrist, eye = _joints_from_side(geometry, shoulder, elbow)
+    joint, knee, wrist, eye = geometry.joints_from_side_mm(shoulder, elbow)
     ax.axhline(0.0, color=canvas.BLACK, linewidth=1.2)
     ax.add_patch(Rectangle((-45, 0), 90, joint[1] - 12, fc="#e3e3e3", ec=canvas.GREY, zorder=1))
     ax.plot([0, 0], [-25, knee[1] + 70], color=canvas.BLACK, linewidth=1.0, linestyle=(0, (6, 3)), zorder=2)
@@ -209,9 +197,15 @@ def reach_map(
     the place of the arm's axis.
     """
     ax = canvas.axes_or_new(ax, size_in=(8.2, 5.0))
-    degrees = _unwrapped_about_mean_deg(np.degrees(orientation_rad))
+    degrees = np.degrees(orientation_rad)
+    known = degrees[np.isfinite(degrees)]
+    # Within 180 of their mean, so that 179 and -179 have similar colours.
+    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(known)).sum()))) if known.size else 0.0
+    degrees = middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0
     image = canvas.draw_map(ax, degrees, x_mm, y_mm, cmap="cividis")
-    levels = _contour_levels_deg(degrees)
+    levels = known = degrees[np.isfinite(degrees)]
+    if known.size:  # multiples of 15 degrees within the range of the angles
+        levels = np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
     if levels.size:
         style: dict[str, Any] = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
         lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
@@ -231,21 +225,6 @@ def reach_map(
     share = 100 * float(np.isfinite(degrees).mean())
     title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
     return canvas.label_axes(ax, x="x (mm)", y="y (mm)", title=title)
-
-
-def _unwrapped_about_mean_deg(degrees: FloatArray) -> FloatArray:
-    """Shift angles (degrees) by full turns to within 180 of their mean, so that 179 and -179 have similar colours."""
-    known = np.radians(degrees[np.isfinite(degrees)])
-    middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
-    return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
-
-
-def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
-    """Return the multiples of 15 degrees within the range of the angles, (n_lines,); none if no angle is finite."""
-    known = degrees[np.isfinite(degrees)]
-    if not known.size:
-        return known
-    return np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
 
 
 def _angle_text(degrees: float) -> str:

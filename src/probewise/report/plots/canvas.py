@@ -36,6 +36,14 @@ BLUE, VERMILLION, PURPLE, GREY = "#0072b2", "#d55e00", "#cc79a7", "#8c8c8c"
 CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 """Okabe and Ito's palette, distinct for the colour-blind."""
 
+THIN: dict[str, Any] = {"color": BLACK, "linewidth": 0.7}
+"""Style of the line at zero."""
+BAND: dict[str, Any] = {"color": GREY, "alpha": 0.3, "linewidth": 0}
+"""Style of a band of chance, or of errors."""
+FILLED: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
+"""Style of the area below a curve."""
+TITLE: dict[str, Any] = {"fontsize": "medium", "loc": "left"}
+
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
@@ -65,10 +73,7 @@ COPPER: Colormap = LinearSegmentedColormap.from_list(
 
 
 def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -> Axes:
-    """Return the axes given, or those of a new figure.
-
-    Raises ParameterError if something other than axes is given; a figure is the usual mistake.
-    """
+    """Return the axes given, or those of a new figure; ParameterError for anything else, such as a figure."""
     if ax is not None:
         require_kind("ax", ax, Axes, _AXES)
     return ax if ax is not None else grid_of_axes(1, 1, size_in=size_in)[0, 0]
@@ -83,10 +88,7 @@ def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], *
 
 
 def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
-    """Open a figure with one pair of axes within fixed margins: left, bottom, right, top.
-
-    To find the margins takes longer than to draw a frame of many.
-    """
+    """Open a figure with one pair of axes within fixed margins, left, bottom, right, top: faster than to find them."""
     (width, height), (left, bottom, right, top) = size_in, margins_in
     within = (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
     return new_figure(size_in).add_axes(within)
@@ -169,7 +171,16 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         return 0
     room = LETTERS_PER_IN * ax.get_position().width * figure_of(ax).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
-    n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width_letters(labels, n) < room), 1)
+
+    def lines_by_column(n: int) -> list[list[str]]:
+        """Return the lines of text in each of `n` columns; a legend is filled column by column."""
+        columns = np.array_split(np.array(labels, dtype=np.object_), n)
+        return ["\n".join(column).split("\n") for column in columns]
+
+    def width(n: int) -> int:
+        return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in lines_by_column(n))
+
+    n_columns = next((n for n in range(len(labels), 1, -1) if width(n) < room), 1)
     ax.legend(
         handles,
         labels,
@@ -184,17 +195,7 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         borderaxespad=0.1,
         columnspacing=1.2,
     )
-    return max(map(len, _legend_lines_by_column(labels, n_columns)))
-
-
-def _legend_width_letters(labels: Sequence[str], n_columns: int) -> int:
-    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _legend_lines_by_column(labels, n_columns))
-
-
-def _legend_lines_by_column(labels: Sequence[str], n_columns: int) -> list[list[str]]:
-    """Return the lines of text in each column of a legend, which is filled column by column."""
-    columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
-    return ["\n".join(column).split("\n") for column in columns]
+    return max(map(len, lines_by_column(n_columns)))
 
 
 def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
@@ -213,10 +214,7 @@ def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
-    """Draw one legend for all axes of a figure with constrained layout, below them, where it covers nothing.
-
-    It has at most `n_columns` entries in a row, text of the colour `ink`, and `ground` behind it.
-    """
+    """Draw one legend for all axes of a figure with constrained layout, below them, with text of the colour `ink`."""
     every: list[Axes] = list(axes.flat) if isinstance(axes, np.ndarray) else [axes]
     handles = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     if handles:
@@ -235,14 +233,11 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
 
 
 def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
-    """Label both axes, set the title, and hide the upper and right spines; return the axes.
-
-    Brackets without a unit, "reading ()", are left out.
-    """
+    """Label both axes (without empty brackets), set the title, and hide the upper and right spines; return the axes."""
     ax.set_xlabel(_EMPTY_BRACKETS.sub("", x))
     ax.set_ylabel(_EMPTY_BRACKETS.sub("", y))
     if title:
-        ax.set_title(title, fontsize="medium", loc="left")
+        ax.set_title(title, **TITLE)
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 
@@ -262,14 +257,10 @@ def hide_unused(axes: AxesGrid, n: int) -> None:
 
 
 def draw_map(ax: Axes, values: FloatArray, x: FloatArray, y: FloatArray, **style: Any) -> AxesImage:
-    """Draw values, (n_y, n_x), lower row first, as pixels about the places `x`, (n_x,), and `y`, (n_y,); NaN is blank.
-
-    Places must be even, and `style` goes to `Axes.imshow`.
-    """
+    """Draw values, (n_y, n_x), lower row first, as pixels about even places, (n_x,) and (n_y,); NaN is blank."""
     dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     extent = (float(x[0] - dx), float(x[-1] + dx), float(y[0] - dy), float(y[-1] + dy))
-    shown = np.ma.masked_invalid(values)
-    return ax.imshow(shown, origin="lower", extent=extent, interpolation="nearest", **style)
+    return ax.imshow(np.ma.masked_invalid(values), origin="lower", extent=extent, interpolation="nearest", **style)
 
 
 def paint_out_of_reach(ax: Axes) -> None:

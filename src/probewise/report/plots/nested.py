@@ -10,13 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.stats import binom
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray
 from probewise._kinds import require_kind, require_like
 from probewise._words import unit_of_name
 from probewise.errors import require
@@ -50,35 +49,32 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
     """
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
-    height = 1.5 if n <= _FEW else 1.15
-    shares: dict[str, Any] = {"width_ratios": (4.0, 1.0), "height_ratios": (1.2 if n <= _FEW else 1.6, *[1.0] * n)}
+    height, first = (1.5, 1.2) if n <= _FEW else (1.15, 1.6)
+    shares: dict[str, Any] = {"width_ratios": (4.0, 1.0), "height_ratios": (first, *[1.0] * n)}
     axes = canvas.grid_of_axes(n + 1, 2, size_in=(8.6, 1.9 + height * n), **shares)
-    depth, mass = -result.log_volume, _mass_per_nat(result)
+    depth, mass = _depth_and_mass_per_nat(result)
     shown = np.unique(np.linspace(0, result.n_dead - 1, min(result.n_dead, _MOST_POINTS)).astype(np.int64))
     shown = shown[np.argsort(mass[shown], kind="stable")]
     top, key = axes[0]
     _draw_mass(top, depth, mass, linewidth=1.2)
     canvas.label_axes(top, x="", y="posterior\nper nat", title=_evidence_text(result))
     key.axis("off")
-    scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
     place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
+    scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
     bar = key.figure.colorbar(scale, cax=place, orientation="horizontal", ticks=[0, 1])
     bar.set_label("posterior per nat,\nshare of its peak", fontsize=canvas.SMALL_PT)
     bar.ax.tick_params(labelsize=canvas.SMALL_PT)
-    for row, i in enumerate(columns, start=1):
-        trace, side = axes[row]
-        values = result.theta[:, i]
-        colours: dict[str, Any] = {"c": mass[shown] / mass.max(), "cmap": _WEIGHT, "vmin": 0, "vmax": 1}
+    colours: dict[str, Any] = {"c": mass[shown] / mass.max(), "cmap": _WEIGHT, "vmin": 0, "vmax": 1}
+    for (trace, side), i in zip(axes[1:], columns, strict=True):
+        values, span = result.theta[:, i], _axis_limits(result, i)
         trace.scatter(depth[shown], values[shown], s=5, linewidths=0, rasterized=True, **colours)
-        last = row == n
-        canvas.label_axes(trace, x=_DEPTH if last else "", y=_parameter_label(result.names[i]))
-        span = _axis_limits(result, i)
+        canvas.label_axes(trace, x="", y=_parameter_label(result.names[i]))
         centres, density = _centres_and_smoothed_density(values, result.weight, span, result.n_eff)
-        side.fill_betweenx(centres, density, color=canvas.BLUE, alpha=0.25, lw=0)
+        side.fill_betweenx(centres, density, **canvas.FILLED)
         side.plot(density, centres, color=canvas.BLUE, linewidth=1.2)
         side.set_xlim(left=0)
         side.set_ylim(span)
-        canvas.label_axes(side, x="posterior" if last else "", y="")
+        canvas.label_axes(side, x="", y="")
         side.set_xticks([])
         side.yaxis.tick_right()
         side.tick_params(labelsize=canvas.SMALL_PT)
@@ -86,8 +82,10 @@ def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None)
             ax.yaxis.set_major_locator(MaxNLocator(3))
     for ax in axes[:, 0]:
         ax.set_xlim(0, depth[-1])
-        if ax is not axes[-1, 0]:
-            ax.set_xticklabels([])
+    for ax in axes[:-1, 0]:
+        ax.set_xticklabels([])
+    axes[-1, 0].set_xlabel(_DEPTH)
+    axes[-1, 1].set_xlabel("posterior")
     top.figure.align_ylabels(list(axes[:, 0]))
     return axes
 
@@ -106,11 +104,12 @@ def corner_plot(result: Posterior, *, parameters: Sequence[str] | None = None) -
     columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
     side = (min(1.9, (canvas.PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
-    sheet, drawn = _corner_axes(n, side)
+    width, height, size = _LEFT_IN + n * side + _RIGHT_IN, _BOTTOM_IN + n * side + _TOP_IN, side - _GAP_IN
+    sheet, drawn = canvas.new_figure((width, height)), np.full((n, n), None, dtype=np.object_)
     spans = [_axis_limits(result, i) for i in columns]
-    for (row, column), ax in np.ndenumerate(drawn):
-        if ax is None:
-            continue
+    for row, column in zip(*np.tril_indices(n), strict=True):
+        left, bottom = _LEFT_IN + column * side, _BOTTOM_IN + (n - 1 - row) * side
+        ax = drawn[row, column] = sheet.add_axes((left / width, bottom / height, size / width, size / height))
         if row == column:
             _draw_marginal(ax, result, columns[row], spans[row], titled=n <= _FEW)
         else:
@@ -122,21 +121,18 @@ def corner_plot(result: Posterior, *, parameters: Sequence[str] | None = None) -
         ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
         if row == n - 1:
             ax.set_xlabel(_parameter_label(result.names[columns[column]]))
-            ax.xaxis.set_label_coords(0.5, -0.6 / (side - _GAP_IN))
+            ax.xaxis.set_label_coords(0.5, -0.6 / size)
         else:
             ax.set_xticklabels([])
         if column == 0 and row > 0:
             ax.set_ylabel(_parameter_label(result.names[columns[row]]))
-            ax.yaxis.set_label_coords(-0.65 / (side - _GAP_IN), 0.5)
+            ax.yaxis.set_label_coords(-0.65 / size, 0.5)
         elif row != column:
             ax.set_yticklabels([])
     if n > 1:
-        patches = [
-            Patch(facecolor=colour, label=f"{mass:.0%}".replace("%", " %"))
-            for mass, colour in zip(_MASSES, reversed(_SHADES), strict=True)
-        ]
+        shades = zip(_MASSES, reversed(_SHADES), strict=True)
         sheet.legend(
-            handles=patches,
+            handles=[Patch(facecolor=colour, label=f"{100 * mass:.0f} %") for mass, colour in shades],
             title=f"{_evidence_text(result)}\nposterior within",
             loc="upper right",
             frameon=False,
@@ -147,18 +143,6 @@ def corner_plot(result: Posterior, *, parameters: Sequence[str] | None = None) -
     return drawn
 
 
-def _corner_axes(n: int, side_in: float) -> tuple[Figure, canvas.AxesGrid]:
-    """Open a figure with square axes on and below the diagonal: (n, n), None elsewhere."""
-    width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
-    sheet = canvas.new_figure((width, height))
-    cells = np.full((n, n), None, dtype=np.object_)
-    size = side_in - _GAP_IN
-    for row, column in zip(*np.tril_indices(n), strict=True):
-        left, bottom = _LEFT_IN + column * side_in, _BOTTOM_IN + (n - 1 - row) * side_in
-        cells[row, column] = sheet.add_axes((left / width, bottom / height, size / width, size / height))
-    return sheet, cells
-
-
 def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     """Draw the histogram of insertion ranks of new points, with the band expected of a correct sampler.
 
@@ -167,29 +151,27 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     bars at once in 99 of 100 correct runs (binomial, Šidák's correction); bars outside it are red.
     """
     require_kind("result", result, NestedResult, _A_RUN)
-    ax = canvas.label_axes(
-        canvas.axes_or_new(ax, size_in=(6.4, 3.6)), x="rank among the live points (0: worst, 1: best)", y=_NEW
-    )
+    ax = canvas.axes_or_new(ax, size_in=(6.4, 3.6))
+    canvas.label_axes(ax, x="rank among the live points (0: worst, 1: best)", y=_NEW)
     n = result.insertion_rank.size
     if n == 0:
         ax.text(0.5, 0.5, "no point was inserted", transform=ax.transAxes, ha="center", va="center")
         return ax
     edges = np.linspace(0.0, 1.0, int(np.clip(n / 60, 4, 25)) + 1)
-    counts = _new_points_per_bar(result.insertion_rank, result.insertion_n_ranked, edges)
+    # With m ranked points, each of the m + 1 ranks is spread evenly over its part of the axis from 0 to 1.
+    rank, parts = result.insertion_rank, result.insertion_n_ranked + 1.0
+    first, width = rank / parts, (rank + 1.0) / parts - rank / parts
+    counts = np.diff([np.clip((edge - first) / width, 0.0, 1.0).sum() for edge in edges])
     n_bars = len(counts)
     tail = (1.0 - 0.99 ** (1.0 / n_bars)) / 2.0
     low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
-    outside = (counts < low) | (counts > high)
-    colour = np.where(outside, canvas.VERMILLION, _SHADES[0])
+    colour = np.where((counts < low) | (counts > high), canvas.VERMILLION, _SHADES[0])
     ax.bar(edges[:-1], counts, 1.0 / n_bars, align="edge", color=colour, edgecolor="white", linewidth=0.6)
     ax.axhspan(low, high, color=canvas.GREY, alpha=0.25, lw=0, label="99 % of correct runs")
     ax.axhline(n / n_bars, color=canvas.BLACK, linewidth=0.9, label="uniform")
-    ax.set_xlim(0, 1)
-    ax.set_ylim(0, 1.3 * max(high, counts.max()))
-    ax.legend(
-        frameon=False, fontsize=canvas.SMALL_PT, loc="upper right", ncols=2
-    )  # leaves room for the text above every bar
-    ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", fontsize="medium", loc="left")
+    ax.set(xlim=(0, 1), ylim=(0, 1.3 * max(high, counts.max())))  # room for the text above every bar
+    ax.legend(frameon=False, fontsize=canvas.SMALL_PT, loc="upper right", ncols=2)
+    ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", **canvas.TITLE)
     return ax
 
 
@@ -200,7 +182,7 @@ def run_plot(result: NestedResult) -> canvas.AxesGrid:
     """
     require_kind("result", result, NestedResult, _A_RUN)
     axes = canvas.grid_of_axes(4, 1, size_in=(7.0, 7.6), sharex=True)
-    depth, mass = -result.log_volume, _mass_per_nat(result)
+    depth, mass = _depth_and_mass_per_nat(result)
     likelihood, posterior, alive, evidence = axes[:, 0]
     peak = float(result.log_likelihood.max())
     below = max(20.0 * (peak - float(result.log_likelihood[int(np.argmax(mass))])), 30.0)
@@ -228,7 +210,7 @@ def run_plot(result: NestedResult) -> canvas.AxesGrid:
 
 
 def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray, *, linewidth: float) -> None:
-    ax.fill_between(depth, mass, color=canvas.BLUE, alpha=0.25, lw=0)
+    ax.fill_between(depth, mass, **canvas.FILLED)
     ax.plot(depth, mass, color=canvas.BLUE, linewidth=linewidth)
     ax.set_ylim(bottom=0)
 
@@ -260,9 +242,9 @@ def _parameter_label(name: str) -> str:
     return words_without_unit(name)
 
 
-def _mass_per_nat(result: NestedResult) -> FloatArray:
-    """Return the posterior mass per nat of log volume, (n_dead,): a death among n live points takes 1 / n nats."""
-    return result.weight * result.n_at_death
+def _depth_and_mass_per_nat(result: NestedResult) -> tuple[FloatArray, FloatArray]:
+    """Return -ln X and the posterior mass per nat of it, (n_dead,): a death among n live points takes 1 / n nats."""
+    return -result.log_volume, result.weight * result.n_at_death
 
 
 def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
@@ -328,13 +310,3 @@ def _draw_pair(
     middles = [(edges[:-1] + edges[1:]) / 2 for edges in (x_edges, y_edges)]
     ax.contourf(*middles, smooth.T, levels=[*levels, top * 1.001], colors=_SHADES)
     ax.contour(*middles, smooth.T, levels=levels, colors=canvas.BLUE, linewidths=0.6)
-
-
-def _new_points_per_bar(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:
-    """Return the number of new points per bar, (n_bars,), as fractions.
-
-    With m ranked points, each of the m + 1 ranks is spread evenly over its part of the axis from 0 to 1.
-    """
-    low, high = rank / (n_ranked + 1.0), (rank + 1.0) / (n_ranked + 1.0)
-    below = np.array([np.clip((edge - low) / (high - low), 0.0, 1.0).sum() for edge in edges])
-    return np.asarray(np.diff(below))

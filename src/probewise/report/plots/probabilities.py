@@ -123,8 +123,7 @@ def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, 
             ax.axvline(number[k] - 0.5, color="black", linestyle="--", linewidth=1.0)
     ax.set(ylim=(0, 1), xlim=(0.4, len(left_out) + 0.6))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    canvas.legend_above(ax)
-    return canvas.label_axes(ax, x="reading", y="probability")
+    return canvas.finish(ax, x="reading", y="probability", plain="")
 
 
 def audit_matrix(

@@ -169,7 +169,7 @@ def quadrant_patterns(recording: Recording) -> canvas.AxesGrid:
     for ax, (name, pattern, readings) in zip(axes.flat, quadrants, strict=False):
         mean = float(readings.mean()) if readings.size else float("nan")
         _draw_quadrant(ax, pattern, number_text(mean, decimals_to_show(mean, 1)))
-        ax.set_title(f"{name.replace('_', ' ')} ({unit})", fontsize="medium", loc="left")
+        ax.set_title(f"{name.replace('_', ' ')} ({unit})", **canvas.TITLE)
     return axes
 
 
@@ -252,10 +252,7 @@ def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: 
 
 
 def standardised_residuals(recording: Recording, mean: FloatArray, sd: FloatArray, *, ax: Axes | None = None) -> Axes:
-    """Draw (recorded minus predicted) / sd by reading number; dashed lines at ±1.96 should hold 95 %.
-
-    Parameters are as for `predicted_and_recorded_by_scan`.
-    """
+    """Draw (recorded minus predicted) / sd, (n_points,), by reading number; dashed lines at ±1.96 should hold 95 %."""
     require_recording(recording)
     ax = canvas.axes_or_new(ax, size_in=(7.2, 2.8))
     ok = np.flatnonzero(recording.usable)
@@ -276,8 +273,7 @@ def residuals_by_scan(recording: Recording, before: FloatArray, after: FloatArra
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in tracks]
     shown = [tracks[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // 3), 1)
-    size = (canvas.PAGE_IN, 1.75 * n_rows + 0.7)
-    axes = canvas.grid_of_axes(n_rows, 3, size_in=size, sharex=True, sharey=True)
+    axes = canvas.grid_of_axes(n_rows, 3, size_in=(canvas.PAGE_IN, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
     models = {"calibrated model": (before, canvas.VERMILLION), "repaired model": (after, canvas.BLUE)}
     for ax, track in zip(axes.flat, shown, strict=False):
         ok = recording.usable[track.rows]
@@ -286,7 +282,7 @@ def residuals_by_scan(recording: Recording, before: FloatArray, after: FloatArra
             residual = recording.readings[rows] - predicted[rows]
             ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
             draw_running_mean(ax, along, residual, colour=colour, width=1.8)
-        ax.axhline(0.0, color=canvas.BLACK, linewidth=0.7)
+        ax.axhline(0.0, **canvas.THIN)
         scan = recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])]
         canvas.label_axes(ax, x="", y="", title=scan.replace("_", " "))
     canvas.hide_unused(axes, len(shown))

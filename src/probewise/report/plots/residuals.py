@@ -39,10 +39,9 @@ _WHITE = "95 % of white noise"
 def draw_running_mean(
     ax: Axes, x: FloatArray, y: FloatArray, *, colour: str, line: Any = "-", width: float = 1.6, name: str = ""
 ) -> None:
-    """Draw means of y, (n,), over up to 20 groups of neighbours in x as a curve.
+    """Draw means of y, (n,), over up to 20 groups of neighbours in x as a curve, named after the model `name`.
 
-    Where x has few values, no curve joins them: each has its mean with the 95 % interval of that. `name` is that of the
-    model, for the legend.
+    Where x has few values, no curve joins them: each has its mean with the 95 % interval of that.
     """
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]
@@ -79,7 +78,7 @@ def mean_residuals_along(
     ax = canvas.axes_or_panel(ax)
     if each is not None:
         _draw_dots(ax, *each, canvas.GREY, "one reading")
-    ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
+    ax.axhline(0, **canvas.THIN)
     band: dict[str, Any] = {"color": canvas.GREY, "alpha": 0.3, "label": _CHANCE}
     if names:
         ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, **band)
@@ -124,7 +123,7 @@ def scan_with_residuals(
     axes = canvas.stack_of_axes([2.5, 2.0])
     above, below = axes
     above.plot(along, readings, "o", color=canvas.BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
-    below.axhline(0, color=canvas.BLACK, linewidth=0.7)
+    below.axhline(0, **canvas.THIN)
     for (name, predicted), (colour, marker, line) in zip(models, _STYLES, strict=False):
         style = {"color": colour, "marker": marker, "markersize": 3.2, "alpha": 0.8, "linestyle": "none"}
         curve = {"color": colour, "linewidth": 1.6, "linestyle": line}
@@ -159,7 +158,7 @@ def residuals_against_covariates(
     """
     axes = canvas.stack_of_axes([2.2] * len(covariates))
     for ax, (label, at) in zip(axes, covariates, strict=True):
-        ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
+        ax.axhline(0, **canvas.THIN)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
             _draw_dots(ax, at, residuals, colour, "")
             draw_running_mean(ax, at, residuals, colour=colour, line=line, width=2.0, name=name)
@@ -182,10 +181,10 @@ def heldout_gain_by_scan(
     gains = np.array([gain for _, gain in ranked])
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[canvas.BLUE if gain >= 0 else canvas.VERMILLION for gain in gains])
-    ax.axvspan(mean - sd, mean + sd, color=canvas.GREY, alpha=0.3, linewidth=0, zorder=0)
+    ax.axvspan(mean - sd, mean + sd, zorder=0, **canvas.BAND)
     total = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number_text(sd, 3)} nats per reading"
     ax.axvline(mean, color=canvas.GREY, linewidth=1.4, label=total)
-    ax.axvline(0, color=canvas.BLACK, linewidth=0.7)
+    ax.axvline(0, **canvas.THIN)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
     return canvas.finish(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}", plain="x")
@@ -204,9 +203,7 @@ def recorded_against_predicted(
     ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     ax.plot(ends, ends, color=canvas.BLACK, lw=0.9, label="as predicted")
-    canvas.label_axes(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
-    canvas.legend_above(ax)
-    return ax
+    return canvas.finish(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})", plain="")
 
 
 def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
@@ -244,8 +241,8 @@ def residual_autocorrelation(
         pairs = pairs[np.isfinite(pairs)]
         if pairs.size:
             correlation[k], chance[k] = pairs.mean() / variance, _SD_95 / np.sqrt(pairs.size)
-    ax.fill_between(lags, -chance, chance, color=canvas.GREY, alpha=0.3, linewidth=0, label=_WHITE)
-    ax.axhline(0, color=canvas.BLACK, linewidth=0.7)
+    ax.fill_between(lags, -chance, chance, label=_WHITE, **canvas.BAND)
+    ax.axhline(0, **canvas.THIN)
     ax.vlines(lags, 0, correlation, color=canvas.VERMILLION, linewidth=1.4)
     ax.plot(lags, correlation, "o", color=canvas.VERMILLION, markersize=5, label="residuals")
     if rho is not None:
@@ -276,7 +273,7 @@ def spread_by_level(
     overall = float(np.sqrt(np.mean(residuals[ok] ** 2)))
     half = _SD_95 * overall / root
     ax.errorbar(at, rms, _SD_95 * rms / root, fmt="o", color=canvas.VERMILLION, capsize=3, label="residuals, 95 %")
-    ax.fill_between(at, overall - half, overall + half, color=canvas.GREY, alpha=0.3, linewidth=0, label=_WHITE)
+    ax.fill_between(at, overall - half, overall + half, label=_WHITE, **canvas.BAND)
     if model_sd is not None:
         by_model = np.array([np.sqrt(np.mean(model_sd[p] ** 2)) for p in parts])
         ax.plot(at, by_model, "--", color=canvas.BLUE, linewidth=1.6, label="noise model found")
@@ -307,7 +304,7 @@ def lost_readings_against_predicted(
     ax = canvas.axes_or_panel(ax)
     ax.plot(predicted[~lost], readings[~lost], "o", color=canvas.GREY, markersize=3, label="reading")
     ax.plot(predicted[lost], readings[lost], "X", color=canvas.VERMILLION, markersize=7, label="lost reading")
-    ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, color=canvas.BLACK, linewidth=0.7)
+    ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, **canvas.THIN)
     return canvas.finish(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -105,7 +104,7 @@ def playing_field(
         lego.set_xlabel("LEGO distance units (8 mm)", fontsize=canvas.SMALL_PT)
         lego.tick_params(labelsize=canvas.SMALL_PT)
     if title:
-        ax.set_title(title, fontsize="medium", loc="left")
+        ax.set_title(title, **canvas.TITLE)
     return ax
 
 
@@ -120,9 +119,9 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     The default is the paper's stopping rule: 4 mm, half the spacing of LEGO holes (section 3.2).
     """
     ax = canvas.axes_or_new(ax, size_in=(6.4, 3.6))
-    for (name, sd), colour in zip(widths_mm.items(), itertools.cycle(canvas.CYCLE), strict=False):
+    for k, (name, sd) in enumerate(widths_mm.items()):
         label = f"{name}: {count_with_noun(len(sd), 'reading')}"
-        ax.plot(np.arange(1, len(sd) + 1), sd, marker="o", markersize=3.5, color=colour, label=label)
+        ax.plot(np.arange(1, len(sd) + 1), sd, label=label, **_dots_and_line(k))
     canvas.legend_above(ax)
     return set_up_width_axes(ax, target_mm)
 
@@ -150,10 +149,13 @@ def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
 def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
     """Draw prior minus posterior differential entropy (bits) after each reading, (n_readings,), of each run by name."""
     ax = canvas.axes_or_new(ax, size_in=(6.4, 3.6))
-    for (name, gained), colour in zip(bits.items(), itertools.cycle(canvas.CYCLE), strict=False):
+    for k, (name, gained) in enumerate(bits.items()):
         per_reading = gained[-1] / len(gained) if len(gained) else 0.0
-        number, label = np.arange(len(gained) + 1), f"{name}: {per_reading:.2f} bits per reading"
-        ax.plot(number, np.r_[0.0, gained], marker="o", markersize=3.5, color=colour, label=label)
+        label = f"{name}: {per_reading:.2f} bits per reading"
+        ax.plot(np.arange(len(gained) + 1), np.r_[0.0, gained], label=label, **_dots_and_line(k))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    canvas.legend_above(ax)
-    return canvas.label_axes(ax, x="number of readings", y="information about the shape (bits)")
+    return canvas.finish(ax, x="number of readings", y="information about the shape (bits)", plain="")
+
+
+def _dots_and_line(k: int) -> dict[str, Any]:
+    return {"marker": "o", "markersize": 3.5, "color": canvas.CYCLE[k % len(canvas.CYCLE)]}

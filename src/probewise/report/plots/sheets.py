@@ -20,16 +20,7 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
-from probewise.report.sheets import (
-    BOTTOM_MM,
-    LEFT_MM,
-    OVERLAP_MM,
-    PAPERS_MM,
-    Sheet,
-    Tile,
-    points_of_lines,
-    tiles_of,
-)
+from probewise.report.sheets import BOTTOM_MM, LEFT_MM, OVERLAP_MM, PAPERS_MM, Sheet, Tile, points_of_lines, tiles_of
 from probewise.scene import region_of
 
 _MM_PER_IN = 25.4
@@ -60,8 +51,7 @@ _LABEL_MM = 15.0  # half the length of the text on a glue strip
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
     """Draw cover pages with instructions, one per five sheets, then every sheet at true scale on "a4" or "letter".
 
-    Return the PDF, reproducible byte for byte. ParameterError if a sheet needs more than 400 pages, or for another
-    paper.
+    Return the PDF, reproducible byte for byte. ParameterError for more than 400 pages of a sheet, or another paper.
     """
     cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
     n_covers = -(-len(cut) // _SHEETS_PER_COVER)
@@ -152,43 +142,44 @@ def _draw_thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[
 
 def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
     ax = _new_page_axes(tile.page_mm)
-    low, high = np.array(tile.low_mm), np.array(tile.high_mm)
-    size, beyond = high - low, np.array(tile.beyond_mm)
-    clip = ax.add_patch(Rectangle((LEFT_MM, BOTTOM_MM), *(size + beyond), fc="none", ec="none"))
+    low, high, beyond = np.array(tile.low_mm), np.array(tile.high_mm), np.array(tile.beyond_mm)
+    near = np.array([LEFT_MM, BOTTOM_MM])
+    far = near + (high - low)
+    clip = ax.add_patch(Rectangle((LEFT_MM, BOTTOM_MM), *(high - low + beyond), fc="none", ec="none"))
     _draw_sheet_part(ax, sheet, tuple(low), tuple(high + beyond), tile.on_page_mm, clip)
-    (x0, y0), (x1, y1) = (LEFT_MM, BOTTOM_MM), (LEFT_MM + size[0], BOTTOM_MM + size[1])
-    far_x, far_y = x1 + beyond[0], y1 + beyond[1]
     line: dict[str, Any] = {"color": BLACK, "lw": 0.4, "solid_capstyle": "butt"}
-    for y in (y0, y1):
-        ax.plot([x0 - 8.0, x0 - 1.0], [y, y], **line)
-        ax.plot([far_x + 1.0, far_x + 5.0], [y, y], **line)
-    for x in (x0, x1):
-        ax.plot([x, x], [y0 - 4.0, y0 - 1.0], **line)
-        ax.plot([x, x], [far_y + 1.0, far_y + 4.0], **line)
     said: dict[str, Any] = {"fontsize": _SMALL, "va": "center", "ha": "center"}
-    for x, value in ((x0, low[0]), (x1, high[0])):
-        if abs(value) > 12 or value == 0:
-            ax.text(x, y0 - 6.0, f"x = {value:.4g} mm", **{**said, "ha": "left" if x == x0 else "right"})
-    for y, value in ((y0, low[1]), (y1, high[1])):
-        if abs(value) > 12 or value == 0:
-            ends = {**said, "va": "bottom" if y == y0 else "top"}  # away from the corner, where x is written
-            ax.text(x0 - 10.0, y, f"y = {value:.4g} mm", rotation=90, **ends)
-    heavy = line | {"lw": 1.2, "color": VERMILLION}
-    if low[0] < 0 < high[0]:
-        x = x0 - low[0]
-        ax.plot([x, x], [y0 - 4.0, y0 - 0.5], **heavy)
-        ax.plot([x, x], [far_y + 0.5, far_y + 4.0], **heavy)
-        ax.text(x, y0 - 6.0, "x = 0", color=VERMILLION, **said)
-    if low[1] < 0 < high[1]:
-        y = y0 - low[1]
-        ax.plot([x0 - 8.0, x0 - 0.5], [y, y], **heavy)
-        ax.plot([far_x + 0.5, far_x + 5.0], [y, y], **heavy)
-        ax.text(x0 - 10.0, y, "y = 0", color=VERMILLION, rotation=90, **said)
+
+    def draw_marks(axis: int, at: float, gap: float, style: dict[str, Any]) -> None:
+        """Draw the marks of a place along x (axis 0) or y in both margins."""
+        begin, end, (before, after) = near[1 - axis], (far + beyond)[1 - axis], ((4.0, 4.0), (8.0, 5.0))[axis]
+        for ends in ([begin - before, begin - gap], [end + gap, end + after]):
+            ax.plot(*(([at, at], ends) if axis == 0 else (ends, [at, at])), **style)
+
+    def write(axis: int, at: float, text: str, **style: Any) -> None:
+        """Write a text beside the mark of a place."""
+        x, y = (at, near[1] - 6.0) if axis == 0 else (near[0] - 10.0, at)
+        ax.text(x, y, text, rotation=90 * axis, **{**said, **style})
+
+    for axis in (1, 0):
+        for at in (near[axis], far[axis]):
+            draw_marks(axis, at, 1.0, line)
+    for axis, name in enumerate("xy"):
+        # Away from the corner, where both are written.
+        for at, value, aside in (
+            (near[axis], low[axis], ("left", "bottom")),
+            (far[axis], high[axis], ("right", "top")),
+        ):
+            if abs(value) > 12 or value == 0:
+                write(axis, at, f"{name} = {value:.4g} mm", **{("ha", "va")[axis]: aside[axis]})
+    for axis, name in enumerate("xy"):
+        if low[axis] < 0 < high[axis]:
+            draw_marks(axis, near[axis] - low[axis], 0.5, line | {"lw": 1.2, "color": VERMILLION})
+            write(axis, near[axis] - low[axis], f"{name} = 0", color=VERMILLION)
     _draw_ruler(ax, LEFT_MM, 6.5)
     place = f", {number}, column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
-    ax.text(
-        LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
-    )
+    title = f"{sheet.name}{place}: {sheet.lines[0]}"
+    ax.text(LEFT_MM + 3.0, tile.page_mm[1] - 6.0, title, fontsize=_USUAL, va="center")
     ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
     _label_glue_strips(ax, sheet, tiles, tile, first)
     return ax.figure  # type: ignore[return-value]
@@ -306,8 +297,7 @@ def _draw_raster(ax: Axes, pattern: Pattern, low_mm: Any, high_mm: Any, place: A
     n_x, n_y = (max(round((high - low) / _PIXEL_MM), 1) for low, high in zip(low_mm, high_mm, strict=True))
     x = low_mm[0] + (np.arange(n_x) + 0.5) * (high_mm[0] - low_mm[0]) / n_x
     y = low_mm[1] + (np.arange(n_y) + 0.5) * (high_mm[1] - low_mm[1]) / n_y
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    shades = region_of(pattern).albedo(points)[0].reshape(n_y, n_x)
+    shades = region_of(pattern).albedo(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[0].reshape(n_y, n_x)
     (left, bottom), (right, top) = place(np.array([low_mm, high_mm], dtype=np.float64))
     ax.imshow(
         np.clip(shades, 0.0, 1.0),

@@ -17,10 +17,7 @@ from probewise.sensor import SSFField
 
 
 def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str = "") -> Axes:
-    """Draw an SSF in the sensor frame, with contours at 1/2 and 1/10 of its peak; a cross marks the package's centre.
-
-    ParameterError if `field` is no SSFField.
-    """
+    """Draw an SSF in the sensor frame, with contours at 1/2 and 1/10 of its peak; a cross at the package's centre."""
     require_kind("field", field, SSFField, "an SSFField: the .field of a FittedSensor")
     ax = canvas.axes_or_new(ax, size_in=(4.8, 4.0))
     values, x, y = np.asarray(field.values), field.u_mm, field.v_mm
@@ -40,10 +37,7 @@ def _set_half_width(ax: Axes, reach_mm: float) -> None:
 
 
 def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
-    """Return the half width (mm) of a square about the origin that holds the SSF above 1 % of its peak.
-
-    It has a tenth to spare, and is rounded up to a multiple of half the power of ten below it.
-    """
+    """Return the half width (mm), rounded up, of a square about the origin that holds the SSF above 1 % of its peak."""
     matters = values > 0.01 * values.max()
     far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
     unit = 0.5 * 10 ** np.floor(np.log10(far))
@@ -51,9 +45,7 @@ def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_
 
 
 def ssf_by_n_gaussians(
-    fields: Mapping[int, SSFField],
-    log_z: Mapping[int, float],
-    log_z_error: Mapping[int, float],
+    fields: Mapping[int, SSFField], log_z: Mapping[int, float], log_z_error: Mapping[int, float]
 ) -> canvas.AxesGrid:
     """Draw the mean SSF of each number of Gaussians with its log evidence and standard error (paper, figure 6).
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from probewise.errors import ParameterError
 from probewise.inquiry import Readout, bits_gained, capacity_bits, entropy_bits, fewest_readings, prior_entropy
-from probewise.inquiry.utilities import WeightsGivenReading
+from probewise.inquiry.predictive import WeightsGivenReading
 from probewise.nested import run
 from probewise.priors import Normal, Product, Uniform
 

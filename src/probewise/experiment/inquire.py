@@ -42,7 +42,7 @@ from probewise.inquiry import (
     utility_map,
 )
 from probewise.inquiry.forecast import resampled_rows_and_weights
-from probewise.inquiry.utilities import WeightsGivenReading
+from probewise.inquiry.predictive import WeightsGivenReading
 from probewise.nested import Weighted
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines

@@ -6,12 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import ndtr
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, require
 from probewise.priors import Prior
+
+MOST_LEVELS = 1000
+"""Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 
 _REACH = 5.0  # noise sds beyond the levels that the cells cover
 _FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
@@ -31,6 +33,19 @@ def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int |
     low, high = min(low, high), max(low, high)
     n = max(2, int(np.ceil((high - low) / spacing)) + 1)
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
+
+
+def nearest_level_index(answers: FloatArray, levels: FloatArray) -> IntArray:
+    """Return the index of the nearest of evenly spaced levels to each prediction, of the same shape."""
+    return np.asarray(np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
+
+
+def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
+    """Sum the weights, (n,), of hypotheses that predict each level, index (n, n_designs) -> (n_designs, n_levels)."""
+    n_designs = index.shape[1]
+    key = index + np.arange(n_designs) * n_levels
+    counted = np.bincount(key.ravel(), np.repeat(weight, n_designs), minlength=n_designs * n_levels)
+    return np.asarray(counted.reshape(n_designs, n_levels), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -107,6 +122,8 @@ class Readout:
 
 def _probability_of_sum(probability: FloatArray, n: int) -> FloatArray:
     """Return the probability of the sum of `n` numbers, drawn alike: (n_levels, n_cells) -> (n_levels, n_sums)."""
+    from scipy.fft import irfft, next_fast_len, rfft  # slow to import, and few need it
+
     n_sums = n * (probability.shape[1] - 1) + 1
     size = next_fast_len(n_sums, real=True)
     spectrum = rfft(probability, size, axis=1)

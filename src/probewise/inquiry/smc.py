@@ -19,7 +19,6 @@ from functools import cache
 from typing import Any, Protocol, Self
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
@@ -52,6 +51,7 @@ _SMALLEST = 1e-100  # spread of a coordinate that is zero in all points, whose s
 _BLOCK = 256  # points per batch, to fit the cache
 _DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 _FEW = 600  # points up to which all distances are faster than a tree
+_FEW_ROWS, _FEW_FOR_FEW_ROWS = 60, 10_000  # and points up to which they are from that few of them
 
 
 class SequentialProblem(Protocol):
@@ -96,6 +96,7 @@ class UpdateSettings:
 THOROUGH = UpdateSettings(1.5, _MOST_KERNELS, 0.5, math.inf)
 STEADY = UpdateSettings(1.2, 120, 0.4, 12)
 BRIEF = UpdateSettings(1.0, 75, 0.3, 10)
+LIGHT = UpdateSettings(1.2, 40, 0.3, 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,7 +549,9 @@ class LocalKernels:
 
 def _nearest_rows(points: FloatArray, rows: IntArray, n: int) -> IntArray:
     """Return the indices, (n_rows, n), of the `n` points nearest to each point of `rows`, itself included; no order."""
-    if len(points) > _FEW:
+    if len(points) > (_FEW if len(rows) > _FEW_ROWS else _FEW_FOR_FEW_ROWS):
+        from scipy.spatial import cKDTree  # slow to import, and few need it
+
         return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
     square = (points**2).sum(axis=1)
     away = square - 2.0 * points[rows] @ points.T  # less the row's own square, the same for all

@@ -7,7 +7,8 @@ import pytest
 
 from probewise.experiment import Experiment, least_readings
 from probewise.inference import GaussianKnown
-from probewise.inquiry import Readout, capacity_bits, target_entropy
+from probewise.inquiry import Readout
+from probewise.inquiry.readout import capacity_bits, target_entropy
 from probewise.scene import Circle, Field, HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture
 

@@ -13,7 +13,8 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, ParameterError
-from probewise.experiment import OneScan, arm_over, begin, explore, inquire, loop, read_journal, step
+from probewise.experiment import arm_over, begin, explore, inquire, loop, read_journal, step
+from probewise.experiment.paper import OneScan
 from probewise.experiment.stopping import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, UtilityMap, prior_entropy

@@ -14,15 +14,14 @@ from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, NotConvergedError, ParameterError
 from probewise.experiment import (
     NestedSampling,
-    OneScan,
     experiment_for,
     explore,
     find_shape,
     naive_levels_from_recording,
     naive_levels_from_world,
     read_journal,
-    student_t_likelihood,
 )
+from probewise.experiment.paper import OneScan, student_t_likelihood
 from probewise.inference import Naive
 from probewise.inquiry import Grid, InformationGain, ReadingEntropy
 from probewise.nested import EvidenceChange, RemainingEvidence

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from probewise.errors import ParameterError, ReachError
-from probewise.inquiry import Grid, ReadingEntropy, choose, entropy_map, label_entropy
+from probewise.inquiry import Grid, ReadingEntropy, choose, entropy_map
+from probewise.inquiry.entropy import label_entropy
 
 
 @dataclass(frozen=True)

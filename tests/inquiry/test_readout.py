@@ -9,8 +9,9 @@ import pytest
 from scipy.stats import norm
 
 from probewise.errors import ParameterError
-from probewise.inquiry import Readout, bits_gained, capacity_bits, entropy_bits, fewest_readings, prior_entropy
+from probewise.inquiry import Readout, bits_gained, prior_entropy
 from probewise.inquiry.predictive import WeightsGivenReading
+from probewise.inquiry.readout import capacity_bits, entropy_bits, fewest_readings
 from probewise.nested import run
 from probewise.priors import Normal, Product, Uniform
 

@@ -37,12 +37,12 @@ from probewise.inquiry import (
     UtilityMap,
     choose,
     choose_several,
-    entropy_bits,
-    reachable_rows,
     utility_map,
 )
+from probewise.inquiry.entropy import reachable_rows
 from probewise.inquiry.forecast import resampled_rows_and_weights
 from probewise.inquiry.predictive import WeightsGivenReading
+from probewise.inquiry.readout import entropy_bits
 from probewise.nested import Weighted
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines

@@ -19,7 +19,8 @@ from probewise.experiment.kinds import Posterior
 from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
-from probewise.inquiry import Bound, UtilityMap, capacity_bits, fewest_readings, prior_entropy, target_entropy
+from probewise.inquiry import UtilityMap, prior_entropy
+from probewise.inquiry.readout import Bound, capacity_bits, fewest_readings, target_entropy
 from probewise.nested import Weighted
 from probewise.scene.shapes import AnyOf, mean_angles, with_angles_near
 

@@ -13,35 +13,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from probewise.inquiry.any_instrument import Inquiry
-    from probewise.inquiry.disc_table import DiscForecast, DiscTable, TabulatedChain, forecast_of
-    from probewise.inquiry.entropy import (
-        UtilityMap,
-        best_places_mask,
-        choose,
-        entropy_map,
-        label_entropy,
-        reachable_rows,
-    )
-    from probewise.inquiry.forecast import DirectForecast, Forecast, PredictiveDistributions, cards_of
-    from probewise.inquiry.grid import Design, Designs, Grid
+    from probewise.inquiry.disc_table import DiscForecast, TabulatedChain, forecast_of
+    from probewise.inquiry.entropy import UtilityMap, choose, entropy_map
+    from probewise.inquiry.forecast import DirectForecast, cards_of
+    from probewise.inquiry.grid import Designs, Grid
     from probewise.inquiry.predictive import ReadingNoise
-    from probewise.inquiry.readout import (
-        Bound,
-        Readout,
-        bits_gained,
-        capacity_bits,
-        entropy_bits,
-        fewest_readings,
-        prior_entropy,
-        target_entropy,
-    )
+    from probewise.inquiry.readout import Readout, bits_gained, prior_entropy
     from probewise.inquiry.utilities import (
-        UTILITY_NAMES,
         Finishing,
         Goal,
         InformationAbout,
         InformationGain,
-        Label,
         ParameterValue,
         PerSecond,
         ReadingEntropy,
@@ -54,24 +36,17 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "UTILITY_NAMES",
-    "Bound",
-    "Design",
     "Designs",
     "DirectForecast",
     "DiscForecast",
-    "DiscTable",
     "Finishing",
-    "Forecast",
     "Goal",
     "Grid",
     "InformationAbout",
     "InformationGain",
     "Inquiry",
-    "Label",
     "ParameterValue",
     "PerSecond",
-    "PredictiveDistributions",
     "ReadingEntropy",
     "ReadingNoise",
     "Readout",
@@ -80,20 +55,13 @@ __all__ = [
     "UtilityInput",
     "UtilityMap",
     "WhichShape",
-    "best_places_mask",
     "bits_gained",
-    "capacity_bits",
     "cards_of",
     "choose",
     "choose_several",
-    "entropy_bits",
     "entropy_map",
-    "fewest_readings",
     "forecast_of",
-    "label_entropy",
     "prior_entropy",
-    "reachable_rows",
-    "target_entropy",
     "utility_map",
     "utility_named",
 ]

@@ -20,7 +20,7 @@ from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
 from probewise.inquiry import UtilityMap, prior_entropy
-from probewise.inquiry.readout import Bound, capacity_bits, fewest_readings, target_entropy
+from probewise.inquiry.readout import capacity_bits, entropy_bits
 from probewise.nested import Weighted
 from probewise.scene.shapes import AnyOf, mean_angles, with_angles_near
 
@@ -332,6 +332,25 @@ def stop_reason(
     return None
 
 
+@dataclass(frozen=True)
+class Bound:
+    """Lower bound on the mean number of readings, for search and refinement separately.
+
+    Attributes
+    ----------
+    search_bits, refinement_bits
+        Bits needed until the first reading on the shape, and from there to the target.
+    search_capacity_bits, capacity_bits
+        Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
+        yes; afterwards, that of the sensor.
+    """
+
+    search_bits: float
+    refinement_bits: float
+    search_capacity_bits: float
+    capacity_bits: float
+
+
 def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
     """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
 
@@ -353,10 +372,12 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_sample
     beside = levels[int(mass.sum(axis=0).argmax())]
     covered = float(mass[:, np.abs(levels - beside) > _ON_SHAPE * experiment.noise_sd].sum(axis=1).max())
     prior_bits = prior_entropy(prior, rng=rng)
-    return fewest_readings(
-        prior_bits,
-        prior_bits + math.log2(covered),
-        target_entropy(len(prior.names), experiment.stop_sd_mm),
-        most_covered=covered,
-        capacity=capacity_bits(float(levels[0]), float(levels[-1]), experiment.readout),
+    yes = min(covered, 0.5)
+    # The largest entropy of parameters with the target's sd is that of independent Gaussians.
+    target_bits = len(prior.names) * 0.5 * math.log2(2 * math.pi * math.e * experiment.stop_sd_mm**2)
+    return Bound(
+        -math.log2(covered),
+        prior_bits + math.log2(covered) - target_bits,
+        float(entropy_bits(np.array([yes, 1.0 - yes]))),
+        capacity_bits(float(levels[0]), float(levels[-1]), experiment.readout),
     )

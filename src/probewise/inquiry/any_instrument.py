@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeAlias
 
@@ -80,11 +80,12 @@ class Settings:
             array = np.asarray(given)
         except ValueError as error:
             raise ParameterError("settings", given, _ALLOWED) from error
-        if array.ndim == 2 and array.shape[1] >= 1 and len(array):
-            _require_texts_given("settings", given, array)
-            columns = {str(k): _checked_column("settings", column) for k, column in enumerate(array.T)}
-            return cls(columns, "several")
-        return cls({"setting": _checked_column("settings", array)}, "one")
+        if array.ndim != 2 or not array.size:
+            return cls({"setting": _checked_column("settings", given)}, "one")
+        knobs = array.T if array.dtype.kind != "U" else np.asarray(given, dtype=object).T
+        columns = {str(k): _checked_column("settings", column.tolist()) for k, column in enumerate(knobs)}
+        require(len({column.dtype.kind for column in columns.values()}) == 1, "settings", given, _ALLOWED)
+        return cls(columns, "several")
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -117,42 +118,28 @@ class Settings:
 
         ParameterError if it is not of that form.
         """
-        if self.form == "name":
-            if not isinstance(setting, Mapping) or setting.keys() != self.columns.keys():
-                raise ParameterError("setting", setting, f"a dict of {', '.join(self.columns)}")
-            columns = {name: [setting[name]] for name in self.columns}
-        elif self.form == "one":
-            columns = {"setting": [setting]}
-        else:
-            if np.shape(setting) != (len(self.columns),):
-                raise ParameterError("setting", setting, f"{len(self.columns)} numbers, one for each knob")
-            columns = {name: [value] for name, value in zip(self.columns, setting, strict=True)}
-        made = {name: _checked_column("setting", values) for name, values in columns.items()}
-        for name, column in made.items():
-            if (column.dtype.kind == "U") != (self.columns[name].dtype.kind == "U"):
-                kind = "a name" if self.columns[name].dtype.kind == "U" else "a number"
-                raise ParameterError("setting", setting, f"{kind}, as in settings")
-        return Settings(made, self.form)
+        by_name = self.form == "name" and isinstance(setting, Mapping)
+        try:
+            one = Settings.of({name: [value] for name, value in setting.items()} if by_name else [setting])
+        except ParameterError:
+            one = Settings({}, self.form)
+        kinds, own = ({name: column.dtype.kind for name, column in of.columns.items()} for of in (one, self))
+        require(one.form == self.form and kinds == own, "setting", setting, f"one like those given, such as {self[0]}")
+        return one
 
 
 def _checked_column(name: str, values: Any) -> Column:
     """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
-    array = np.asarray(values)
+    array = np.array(values)
     require(array.ndim == 1 and array.size and array.dtype.kind in "biufU", name, values, _ALLOWED)
-    _require_texts_given(name, values, array)
-    if array.dtype.kind != "U":
+    if array.dtype.kind == "U":  # NumPy makes numbers among names texts
+        require(all(isinstance(one, str) for one in values), name, values, _ALLOWED)
+    else:
         array = array.astype(np.float64)
         if not np.isfinite(array).all():
             raise ParameterError(name, float(array[~np.isfinite(array)][0]), "finite numbers")
-    array = array.copy()
     array.flags.writeable = False
     return array
-
-
-def _require_texts_given(name: str, values: Any, array: Column) -> None:
-    """Raise ParameterError where `array`, of `values`, has numbers among names, which NumPy has made texts."""
-    if array.dtype.kind == "U" and not all(isinstance(one, str) for one in np.asarray(values, dtype=object).flat):
-        raise ParameterError(name, values, _ALLOWED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,11 +227,6 @@ class InstrumentModel:
         """Return the sd of the noise of each prediction, (n_samples, n_settings)."""
         return self.noise.scale(predicted, theta[:, -1] if self.noise.is_sd_inferred else None)
 
-    def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
-        """Return the log density of readings, one per setting, (n_settings,), under theta: (n_samples, n_settings)."""
-        predicted = self.predict(theta, settings)
-        return self.noise.log_density(readings, predicted, self.scale(theta, predicted))
-
 
 def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape: tuple[int, ...]) -> FloatArray:
     """Call a user's function; ShapeError unless its readings broadcast to `shape`, with as many axes."""
@@ -292,6 +274,15 @@ class ReadingsProblem:
         """Prior of the model's parameters."""
         return self.model.prior
 
+    def with_reading(self, last: ReadingsProblem) -> ReadingsProblem:
+        """Return the readings with one more; a setting that was read before is not listed again."""
+        same = np.all([c == last.settings.columns[n][0] for n, c in self.settings.columns.items()], axis=0)
+        row = int(np.argmax(same)) if same.any() else len(same)
+        settings = self.settings if same.any() else self.settings.joined(last.settings)
+        return replace(
+            self, settings=settings, row=np.append(self.row, row), values=np.append(self.values, last.values)
+        )
+
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
         at_once = max(_BLOCK // len(self.values), 1)
@@ -313,10 +304,6 @@ class ReadingsProblem:
         if noise.is_sd_inferred:  # wide enough, it explains any reading
             return 0.0
         return float(noise.log_density(last, last, noise.scale(last[None], None)[0])[0] - predicted[:, -1].max())
-
-    def log_density_of_last(self, theta: FloatArray) -> FloatArray:
-        """Return the log density of the last reading, (n_samples, n_params) -> (n_samples,)."""
-        return self.model.log_density(theta, self.settings.take(self.row[-1:]), self.values[-1:])[:, 0]
 
     def p_value_and_worst_reading(self, theta: FloatArray) -> tuple[float, int]:
         """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
@@ -508,8 +495,9 @@ class Inquiry(ShowsItself):
             )
             raise ParameterError("setting", None, way_out)
         at = self._settings.checked_setting(self._next if setting is None else setting)
-        readings = _append_reading(self._readings, self._model, at, value)
-        of_prior = self._prior_log_likelihood + readings.log_density_of_last(self._prior_theta)
+        last = ReadingsProblem(self._model, at, np.array([0]), np.array([value]))
+        readings = last if self._readings is None else self._readings.with_reading(last)
+        of_prior = self._prior_log_likelihood + last.predict(self._prior_theta)[:, 0]
         by_prior = float(np.logaddexp.reduce(of_prior)) - math.log(self._n_samples)
         search = partial(nested_sampling_from_scratch, readings, n_live=self._n_live, rng=self._rng)
         found = update(self._particles, readings, rng=self._rng, fall_back=search, effort=LIGHT)
@@ -649,18 +637,3 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
             raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
         require(checked_finite_number(f"goal[{name!r}]", sd) > 0, f"goal[{name!r}]", sd, "greater than 0")
     return dict(goal)
-
-
-def _append_reading(
-    readings: ReadingsProblem | None, model: InstrumentModel, at: Settings, value: float
-) -> ReadingsProblem:
-    """Return the readings with one more; a setting that was read before is not listed again."""
-    if readings is None:
-        return ReadingsProblem(model, at, np.array([0]), np.array([value]))
-    known = readings.settings
-    same = np.ones(len(known), dtype=np.bool_)
-    for name, column in known.columns.items():
-        same &= column == at.columns[name][0]
-    row = int(np.argmax(same)) if same.any() else len(known)
-    settings = known if same.any() else known.joined(at)
-    return ReadingsProblem(model, settings, np.append(readings.row, row), np.append(readings.values, value))

@@ -197,37 +197,35 @@ def update(
     Return as many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
     given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
-    before = previous.weighted
-    n = len(before.theta)
+    before, n = previous.weighted, len(previous.weighted.theta)
     least = effort.least_share * n
     if before.log_z == -math.inf:
         return previous
     predicted = problem.predict(before.theta)
-    strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if problem.least_misfit_nats(predicted) > _SURPRISED:
-        if fall_back is not None:
-            return particles_from_run(fall_back(), n, problem, n_calls=n, rng=rng)
-        strained = True
     now = _EvaluatedSamples(
         before.theta, problem.prior.log_prob(before.theta), *problem.log_likelihoods(predicted, 1.0)
     )
-    log_weight, base = before.log_weight, before.log_likelihood
-    log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
+    log_weight, base, ancestor, strained = (
+        before.log_weight,
+        before.log_likelihood,
+        previous.ancestor,
+        previous.strained,
+    )
+    log_z, variance, n_calls, share, degrees = before.log_z, before.log_z_error**2, n, 0.0, 0
+    stuck = problem.least_misfit_nats(predicted) > _SURPRISED
     while True:
         all_at_once = n_effective(_updated_log_weights(log_weight, now.after, base))
+        given_up = degrees >= effort.most_temperatures
+        stuck |= all_at_once == 0.0 or (given_up and all_at_once < least)
+        if stuck and fall_back is not None:
+            return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
         if all_at_once == 0.0:
-            if fall_back is not None:
-                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
             return replace(previous.with_zero_evidence(), strained=True)
-        given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
-        if given_up and all_at_once < least:
-            if fall_back is not None:
-                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
-            strained = True
+        strained |= stuck
         if all_at_once >= least or given_up:
             share = 1.0
         else:
-            if n_resampled == previous.n_resampled:  # the first temperature: only now the readings before count too
+            if degrees == 0:  # the first temperature: only now the readings before count too
                 now = replace(now, before=problem.log_likelihoods(predicted, share)[0])
             share = _next_power(log_weight, base, now, share, least)
         weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
@@ -240,13 +238,10 @@ def update(
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         parts = _partition_rows(rows) if fall_back is None else [np.arange(n)]
         now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), share, problem, rng, parts, effort)
-        n_calls, n_resampled, ancestor = n_calls + n_moves, n_resampled + 1, ancestor[rows]
-        if accepted < _STIFF:
-            if fall_back is not None:
-                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
-            strained = True
+        n_calls, degrees, ancestor, stuck = n_calls + n_moves, degrees + 1, ancestor[rows], accepted < _STIFF
         base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
-        if share == 1.0:
+        if share == 1.0 and (fall_back is None or not stuck):
+            strained |= stuck
             break
     found = Weighted(
         before.names,
@@ -259,12 +254,11 @@ def update(
         n_calls=before.n_calls + n_calls,
         pareto_k=pareto_k(log_weight) if n_eff < n else -math.inf,
     )
-    degrees = n_resampled - previous.n_resampled
     return replace(
         previous,
         weighted=found,
         ancestor=ancestor,
-        n_resampled=n_resampled,
+        n_resampled=previous.n_resampled + degrees,
         strained=strained,
         hurried=previous.hurried or degrees >= _MANY_DEGREES,
     )

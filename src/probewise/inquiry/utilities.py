@@ -96,29 +96,22 @@ class UtilityInput:
         noise_sd = self.readout.noise_sd / np.sqrt(max(self.designs.repeats))
         return self.forecast.predictive(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
 
-    def information(self, weight: FloatArray) -> FloatArray:
-        """Return the expected information in bits of a reading at every available design, for weights (n_samples,)."""
-        out = np.empty(len(self.rows))
-        for at, mass in self.predictive.level_weights(weight):
-            chance = self._cell_probability(at)
-            out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
-        return out
+    def information(self, weight: FloatArray, *, with_noise: bool = False) -> FloatArray:
+        """Return the expected information in bits of a reading at every available design, for weights (n_samples,).
 
-    def reading_entropy(self, weight: FloatArray) -> FloatArray:
-        """Return the entropy in bits of the reading at every available design, including noise, rounding and range.
-
-        The weights, (n_samples,), need not sum to one, and may be 0 for some hypotheses.
+        `with_noise`: the whole entropy of the reading, of which noise, rounding and range are not subtracted. The
+        weights need not sum to one, and may be 0 for some hypotheses.
         """
         out = np.empty(len(self.rows))
         for at, mass in self.predictive.level_weights(weight):
-            out[at] = _entropy_of_readings(mass, self._cell_probability(at))
+            n = int(self.designs.n_repeats[self.rows[at[0]]])  # the same for all of them
+            exact = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
+            chance = np.asarray(exact.astype(np.float32))
+            out[at] = _entropy_of_readings(mass, chance)
+            if not with_noise:
+                of_noise = mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1)
+                out[at] = np.maximum(out[at] - of_noise, 0.0)
         return out
-
-    def _cell_probability(self, at: IntArray) -> FloatArray:
-        """Return the probability of each cell given each level, (n_levels, n_cells), at designs of equal repeats."""
-        n = int(self.designs.n_repeats[self.rows[at[0]]])
-        chance = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
-        return np.asarray(chance.astype(np.float32))
 
 
 def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
@@ -133,11 +126,6 @@ def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
         part /= part.sum(axis=1, keepdims=True)
         out[block] = entropy_bits(part @ chance)
     return out
-
-
-def _entropy_of_noise(mass: FloatArray, chance: FloatArray) -> FloatArray:
-    """Return the mean entropy in bits of a reading given its level, for unnormalised weights (n, n_levels): (n,)."""
-    return np.asarray(mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1))
 
 
 class Utility(Protocol):
@@ -207,11 +195,11 @@ class InformationAbout:
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Return the bits at every available design, (n,)."""
         labels = self.of(utility_input.names, utility_input.theta, utility_input.weight)
-        bits = utility_input.reading_entropy(utility_input.weight)
+        bits = utility_input.information(utility_input.weight, with_noise=True)
         for value in np.unique(labels):
             weight = np.where(labels == value, utility_input.weight, 0.0)
             if weight.sum() > 0:
-                bits -= weight.sum() * utility_input.reading_entropy(weight)
+                bits -= weight.sum() * utility_input.information(weight, with_noise=True)
         return np.maximum(bits, 0.0)
 
 

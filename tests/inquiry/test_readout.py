@@ -50,7 +50,7 @@ def test_the_information_of_a_reading_counts_the_noise_at_each_level(sd, black):
     grey, few_white = rng.uniform(30.0, 33.0, 800), rng.choice([black, 59.5], 800, p=[0.95, 0.05])
     answers = np.stack([np.full(800, black), few_white, grey, np.full(800, 59.5)], axis=1)
     readout = Readout(sd, 1.0, 1.0, 100.0)
-    found = WeightsGivenReading(answers, weight, readout).information_bits
+    found = WeightsGivenReading.of(answers, weight, readout).information_bits
     for column, bits in zip(answers.T, found, strict=True):
         chance = readout.cell_probability(column)
         exact = entropy_bits(weight @ chance) - weight @ entropy_bits(chance)

@@ -307,7 +307,7 @@ def utilities_near_end(
         return expected_bits_about_left_out_effect(weight, own, names, given.readout, repeats=n)
 
     def information_bits(own: FloatArray, n: int) -> FloatArray:
-        return WeightsGivenReading(own, weight, given.readout, repeats=n).information_bits
+        return WeightsGivenReading.of(own, weight, given.readout, repeats=n).information_bits
 
     if known and not far:
         return map_of(rows, _by_repeats(bits_about_names, answers, n_repeats), NAMES)
@@ -321,7 +321,7 @@ def utilities_near_end(
     off_mm, goal_sd_mm = OFF_SDS * experiment.stop_sd_mm, given.goal.sd
 
     def chances(own: FloatArray, n: int) -> FloatArray:
-        after = WeightsGivenReading(own, weight, given.readout, repeats=n)
+        after = WeightsGivenReading.of(own, weight, given.readout, repeats=n)
         return after.probability_of_knowing(lengths - weight @ lengths, goal_sd_mm, off=off_mm, most_off=MOST_OFF)
 
     of_best = answers[:, best], n_repeats[best]
@@ -456,7 +456,7 @@ def _expected_bits_by_cells(
     weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout, repeats: int
 ) -> FloatArray:
     """Return bits about the name, (n_designs,): entropy of the histogram of readings minus its mean given the name."""
-    given = WeightsGivenReading(answers, weight, readout, fine=_CELL, repeats=repeats)
+    given = WeightsGivenReading.of(answers, weight, readout, fine=_CELL, repeats=repeats)
     bits = entropy_bits(given.weight_by_cell)
     for own in each:
         part = float(weight[own].sum())

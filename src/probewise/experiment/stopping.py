@@ -33,6 +33,7 @@ MOST_MISSING = 8
 _TREND_P = 1e-3  # p-value of the residuals' strongest trend, every look counted, below which no kind is believed
 _FEWEST_FOR_TREND = 12  # readings
 _WHOLE = 1.0 - 1e-12  # a correlation beyond which rounding rules
+_N_OF_PRIOR = 20_000
 _ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on the shape
 
 
@@ -351,17 +352,17 @@ class Bound:
     capacity_bits: float
 
 
-def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
+def least_readings(experiment: Experiment, *, rng: np.random.Generator) -> Bound:
     """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
 
     The search ends with the first reading on the shape. Any reading before is on the shape with probability p at most,
     that of the best first place, and so carries at most the information of a yes or no with probability p; a yes leaves
     a share p of all hypotheses. From there to the target sd, a reading carries at most the sensor's capacity. The
-    experiment has one shape and a known sensor; `n_samples` are drawn from the prior.
+    experiment has one shape and a known sensor.
     """
     prior = experiment.prior
-    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
-    weight = np.full(n_samples, 1.0 / n_samples)
+    theta = prior.from_unit_cube(rng.random((_N_OF_PRIOR, len(prior.names))))
+    weight = np.full(_N_OF_PRIOR, 1.0 / _N_OF_PRIOR)
     designs = experiment.designs
     plan = replace(designs.plan(PATTERN), instrumentation=experiment.instrumentation)
     predictive = experiment.forecast.predictive(

@@ -185,61 +185,53 @@ def _is_range(value: Any) -> bool:
         return False
 
 
+@dataclass(frozen=True, eq=False)
 class WeightsGivenReading:
     """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
 
     A cell is a range of readings recorded as one. Hypotheses with nearly equal predictions are summed first, so that
-    the noise is applied to some hundred levels instead of every hypothesis.
-
-    Parameters
-    ----------
-    answers
-        Predicted readings, (n, n_designs).
-    weight
-        Weights of the hypotheses, (n,).
-    readout
-        The cells of a reading and its noise.
-    fine
-        Width of a cell in noise sds, if readings are not rounded.
-    repeats
-        Number of readings at each design, of which the mean counts.
+    the noise is applied to some hundred levels instead of every hypothesis: `index` is the level that each predicts,
+    (n, n_designs), `weight` its weight, (n,), `chance` the probability of each cell given each level, (n_levels,
+    n_cells).
     """
 
-    def __init__(
-        self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
-    ) -> None:
-        sd = readout.noise_sd / math.sqrt(repeats)
-        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
-        self._index = nearest_level_index(answers, levels)
-        self._weight = weight
-        self._chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
+    index: IntArray
+    weight: FloatArray
+    chance: FloatArray
 
     @classmethod
-    def from_levels(cls, index: IntArray, weight: FloatArray, chance: FloatArray) -> Self:
-        """Build from the level that each hypothesis predicts, (n, n_designs), and each level's cells' probability."""
-        made = cls.__new__(cls)
-        made._index, made._weight, made._chance = index, weight, chance
-        return made
+    def of(
+        cls, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
+    ) -> Self:
+        """Build from predicted readings, (n, n_designs), and the weights of the hypotheses, (n,).
+
+        `fine`: width of a cell in noise sds, if readings are not rounded; `repeats`: number of readings at each design,
+        of which the mean counts.
+        """
+        sd = readout.noise_sd / math.sqrt(repeats)
+        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
+        chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
+        return cls(nearest_level_index(answers, levels), weight, chance)
 
     @cached_property
     def weight_by_cell(self) -> FloatArray:
         """Total weight in each cell, (n_designs, n_cells); never 0."""
-        return np.maximum(self._weight_by_level @ self._chance, _LEAST)
+        return np.maximum(self._weight_by_level @ self.chance, _LEAST)
 
     @cached_property
     def information_bits(self) -> FloatArray:
         """Expected information about the hypotheses, whose weights sum to one, in bits, (n_designs,)."""
-        of_noise = self._weight_by_level @ entropy_bits(self._chance)
+        of_noise = self._weight_by_level @ entropy_bits(self.chance)
         return np.asarray(np.maximum(entropy_bits(self.weight_by_cell) - of_noise, 0.0))
 
     @cached_property
     def _weight_by_level(self) -> FloatArray:
         """Total weight of the hypotheses at each level, (n_designs, n_levels)."""
-        return weight_by_level(self._index, self._weight, len(self._chance))
+        return weight_by_level(self.index, self.weight, len(self.chance))
 
     def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
         """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
-        return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
+        return np.asarray(weight_by_level(self.index, self.weight * values, len(self.chance)) @ self.chance)
 
     def probability_of_knowing(
         self, lengths: FloatArray, sd: float, *, off: float = math.inf, most_off: float = 1.0
@@ -256,7 +248,7 @@ class WeightsGivenReading:
             ends &= self.weighted_sum_by_cell(length**2) / weight - means[-1] ** 2 < sd**2
         for design in np.flatnonzero(ends.any(axis=1)) if math.isfinite(off) else ():
             apart = np.abs(lengths[:, :, None] - np.array(means)[:, design]) > off
-            joint = self._weight[:, None] * self._chance[self._index[:, design]]
+            joint = self.weight[:, None] * self.chance[self.index[:, design]]
             ends[design] &= np.where(apart.any(axis=1), joint, 0.0).sum(axis=0) < most_off * weight[design]
         return np.asarray((weight * ends).sum(axis=1) / weight.sum(axis=1))
 
@@ -301,7 +293,7 @@ def readings_given_noise(
         below, above = min(below, low - _REACH * far_low), max(above, high + _REACH * far_high)
     edges = np.unique(np.concatenate([*lower, inner, *upper]))
     chance = np.diff(noise.cdf(edges, level[:, None], sd[:, None]), axis=1, prepend=0.0, append=1.0)
-    return WeightsGivenReading.from_levels(index, weight, np.maximum(chance, 0.0))
+    return WeightsGivenReading(index, weight, np.maximum(chance, 0.0))
 
 
 def _n_cells(width_sds: float, most: int) -> int:

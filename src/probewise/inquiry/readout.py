@@ -23,6 +23,7 @@ _LEAST = np.float32(1e-30)
 _PER_SD = 4.0  # levels per noise sd, for the capacity
 _MOST_ROUNDS = 2000
 _CLOSE_BITS = 1e-4
+_N_OF_PRIOR = 20_000
 
 
 def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
@@ -156,9 +157,9 @@ def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, p
     return (information + float(weight @ log_prior)) / math.log(2) + prior_entropy_bits
 
 
-def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20_000) -> float:
-    """Return the differential entropy of a prior in bits: minus the mean log2 density of `n_samples` draws."""
-    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
+def prior_entropy(prior: Prior, *, rng: np.random.Generator) -> float:
+    """Return the differential entropy of a prior in bits: minus the mean log2 density of 20,000 draws."""
+    theta = prior.from_unit_cube(rng.random((_N_OF_PRIOR, len(prior.names))))
     return -float(np.mean(prior.log_prob(theta))) / math.log(2)
 
 

@@ -281,11 +281,10 @@ def resample_and_move(
         return particles
     rows = resampled_rows(had.weight, n, rng)
     log_likelihood = had.log_likelihood[rows]
-    moved = _EvaluatedSamples(
+    start = _EvaluatedSamples(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), log_likelihood, log_likelihood.copy()
     )
-    moved, _, n_moves = _move_by_metropolis(moved, 1.0, problem, rng, [np.arange(n)], effort)
-    found = replace(_replace_samples(had, moved), n_calls=had.n_calls + n_moves)
+    found = _moved_apart(start, had, problem, n_calls=had.n_calls, run=had.run, rng=rng, effort=effort)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
@@ -294,9 +293,40 @@ def particles_from_posterior(
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     start = _EvaluatedSamples.of(found.theta[resampled_rows(found.weight, n, rng)], problem, 1.0)
-    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(n)], effort)
-    drawn = replace(_replace_samples(found, moved), n_calls=found.n_calls + n + n_moves)
+    drawn = _moved_apart(start, found, problem, n_calls=found.n_calls + n, run=found.run, rng=rng, effort=effort)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
+
+
+def particles_from_run(
+    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
+) -> Particles:
+    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
+    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
+    drawn = _moved_apart(start, run, problem, n_calls=n_calls + run.n_calls + n, run=run, rng=rng, effort=THOROUGH)
+    return Particles(drawn, np.arange(n), run.log_z_error**2)
+
+
+def _moved_apart(
+    start: _EvaluatedSamples,
+    found: Weighted | NestedResult,
+    problem: SequentialProblem,
+    *,
+    n_calls: int,
+    run: NestedResult | None,
+    rng: np.random.Generator,
+    effort: UpdateSettings,
+) -> Weighted:
+    """Move samples, some of them copies; return them equally weighted, with the evidence of `found`."""
+    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(len(start.theta))], effort)
+    return evenly_weighted(
+        found.names,
+        moved.theta,
+        moved.after,
+        log_z=found.log_z,
+        log_z_error=found.log_z_error,
+        n_calls=n_calls + n_moves,
+        run=run,
+    )
 
 
 def nested_sampling_from_scratch(
@@ -311,37 +341,6 @@ def nested_sampling_from_scratch(
         stop=RemainingEvidence(_DLOGZ),
         max_cost=1.0,  # speed matters, since the robot waits
         return_interrupted=False,
-    )
-
-
-def particles_from_run(
-    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
-) -> Particles:
-    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
-    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
-    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(n)], THOROUGH)
-    drawn = evenly_weighted(
-        run.names,
-        moved.theta,
-        moved.after,
-        log_z=run.log_z,
-        log_z_error=run.log_z_error,
-        n_calls=n_calls + run.n_calls + n + n_moves,
-        run=run,
-    )
-    return Particles(drawn, np.arange(n), run.log_z_error**2)
-
-
-def _replace_samples(posterior: Weighted, samples: _EvaluatedSamples) -> Weighted:
-    """Return a posterior with other samples, equally weighted; the evidence stays."""
-    n = len(samples.theta)
-    return replace(
-        posterior,
-        theta=samples.theta,
-        log_likelihood=samples.after,
-        log_weight=np.full(n, -math.log(n)),
-        n_eff=float(n),
-        pareto_k=-math.inf,
     )
 
 
@@ -499,18 +498,7 @@ class LocalKernels:
         covariance = np.einsum("kni,knj->kij", spread, spread) / n_near
         covariance += _RIDGE * (overall + np.diag(scale**2))
         covariance *= widened**2
-        return cls.from_moments(away[rows], covariance, origin=origin)
-
-    @classmethod
-    def from_moments(cls, centre: FloatArray, covariance: FloatArray, *, origin: FloatArray | None = None) -> Self:
-        """Build from centres, (n_kernels, n_params), and covariances, (n_kernels, n_params, n_params).
-
-        The centres are relative to `origin`; without it, absolute.
-        """
-        if origin is None:
-            origin = np.asarray(centre.mean(axis=0))
-            centre = centre - origin
-        n_params = centre.shape[1]
+        centre = away[rows]
         root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         precision = np.linalg.inv(covariance)
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)

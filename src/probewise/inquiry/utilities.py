@@ -294,7 +294,7 @@ def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: Int
     out = np.empty(len(designs))
     for n in np.unique(n_repeats).tolist():
         own = n_repeats == n
-        given = WeightsGivenReading(answers[:, own], share, utility_input.readout, repeats=n)
+        given = WeightsGivenReading.of(answers[:, own], share, utility_input.readout, repeats=n)
         out[own] = given.probability_of_knowing(away, goal.sd)
     return out
 

@@ -113,30 +113,19 @@ class Readout:
         if repeats > 1 and self.step is not None and self.noise_sd < _WIDE * self.step:
             n_sums = repeats * len(self.cell_edges(levels)) + 1
             if n_sums <= _MOST_SUMS:
-                return _merged(_probability_of_sum(self.cell_probability(levels), repeats), most)
+                from scipy.fft import irfft, next_fast_len, rfft  # slow to import, and few need it
+
+                size = next_fast_len(n_sums, real=True)
+                spectrum = rfft(self.cell_probability(levels), size, axis=1)
+                of_sum = np.maximum(irfft(spectrum**repeats, size, axis=1)[:, :n_sums], 0.0)
+                if most is None or n_sums <= most:
+                    return of_sum
+                return np.asarray(np.add.reduceat(of_sum, np.arange(0, n_sums, math.ceil(n_sums / most)), axis=1))
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
         below = ndtr((each.cell_edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
         ends = np.zeros((len(levels), 1)), np.ones((len(levels), 1))
         return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
-
-
-def _probability_of_sum(probability: FloatArray, n: int) -> FloatArray:
-    """Return the probability of the sum of `n` numbers, drawn alike: (n_levels, n_cells) -> (n_levels, n_sums)."""
-    from scipy.fft import irfft, next_fast_len, rfft  # slow to import, and few need it
-
-    n_sums = n * (probability.shape[1] - 1) + 1
-    size = next_fast_len(n_sums, real=True)
-    spectrum = rfft(probability, size, axis=1)
-    return np.maximum(irfft(spectrum**n, size, axis=1)[:, :n_sums], 0.0)
-
-
-def _merged(probability: FloatArray, most: int | None) -> FloatArray:
-    """Merge neighbouring cells to at most `most`, (n_levels, n_cells); None: all as they are."""
-    n_cells = probability.shape[1]
-    if most is None or n_cells <= most:
-        return probability
-    return np.asarray(np.add.reduceat(probability, np.arange(0, n_cells, math.ceil(n_cells / most)), axis=1))
 
 
 def entropy_bits(probability: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ A `Utility` gives each available design a number from the whole posterior, the d
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Protocol
@@ -291,11 +292,25 @@ def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: Int
         utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
     )
     n_repeats = utility_input.designs.n_repeats[utility_input.rows[designs]]
-    out = np.empty(len(designs))
+
+    def chance(own: FloatArray, n: int) -> FloatArray:
+        given = WeightsGivenReading.of(own, share, utility_input.readout, repeats=n)
+        return given.probability_of_knowing(away, goal.sd)
+
+    return by_repeats(chance, answers, n_repeats)
+
+
+def by_repeats(
+    utility: Callable[[FloatArray, int], FloatArray], answers: FloatArray, n_repeats: IntArray
+) -> FloatArray:
+    """Return the utility of each design, (n_designs,), from predictions, (n, n_designs), by its number of repeats.
+
+    `utility` takes the predictions of designs with the same number of repeats, of which the mean counts.
+    """
+    out = np.empty(answers.shape[1])
     for n in np.unique(n_repeats).tolist():
-        own = n_repeats == n
-        given = WeightsGivenReading.of(answers[:, own], share, utility_input.readout, repeats=n)
-        out[own] = given.probability_of_knowing(away, goal.sd)
+        own = np.flatnonzero(n_repeats == n)
+        out[own] = utility(answers[:, own], n)
     return out
 
 

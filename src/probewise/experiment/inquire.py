@@ -345,7 +345,7 @@ def _draw_theta_lengths_weights(
         own = particles.weighted.samples(int(n), rng=rng) if n else np.empty((0, len(kind.prior.names)))
         theta.append(own)
         if n:
-            whole.append(kind.to_whole_theta(own, rng))
+            whole.append(kind.member.to_whole_theta(own, rng))
             weight.append(np.full(n, p / n))
     share = np.concatenate(weight)
     aligned = theta_with_aligned_angles(experiment, np.concatenate(whole), share)

@@ -285,8 +285,7 @@ class ReadingsProblem:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
-        at_once = max(_BLOCK // len(self.values), 1)
-        return np.concatenate([self.predict(theta[k : k + at_once]).sum(axis=1) for k in range(0, len(theta), at_once)])
+        return np.asarray(self.predict(theta).sum(axis=1))
 
     def predict(self, theta: FloatArray) -> FloatArray:
         """Return the log density of every reading, (n_samples, n_params) -> (n_samples, n_readings)."""

@@ -107,7 +107,7 @@ class UtilityInput:
         for at, mass in self.predictive.level_weights(weight):
             n = int(self.designs.n_repeats[self.rows[at[0]]])  # the same for all of them
             exact = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
-            chance = np.asarray(exact.astype(np.float32))
+            chance: FloatArray = np.asarray(exact.astype(np.float32))
             out[at] = _entropy_of_readings(mass, chance)
             if not with_noise:
                 of_noise = mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1)

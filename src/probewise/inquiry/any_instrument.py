@@ -22,7 +22,13 @@ from probewise._arrays import FloatArray, IntArray, floats, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError, ShapeError, did_you_mean, require
-from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
+from probewise.inquiry.predictive import (
+    AnyNoise,
+    ReadingNoise,
+    expected_nats_above_goal,
+    gaussian_nats_above_goal,
+    readings_given_noise,
+)
 from probewise.inquiry.smc import LIGHT, nested_sampling_from_scratch, particles_from_run, prior_particles, update
 from probewise.nested import Weighted, make_problem
 from probewise.nested.problem import AnyPrior
@@ -45,7 +51,7 @@ _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 _TIE = 1e-9  # utilities closer than this differ by rounding only
 _N_ASKED = 500  # samples whose predictions value the settings
 _FEWER_ASKED = 200  # of a model that is called for one sample at a time
-_N_ROUGH = 120  # samples that pick the settings worth a closer look
+_N_ROUGH = 120  # samples that pick the settings worth a closer look, far from a goal
 _N_BEST = 32  # settings that get it
 _FEW_SETTINGS = 64  # all of which get it
 _N_IMAGINED = 8
@@ -461,7 +467,7 @@ class Inquiry(ShowsItself):
     def next(self) -> Any:
         """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random.
 
-        Of more than 64 settings, it is the best of the 32 that a few posterior samples value most.
+        Of more than 64 settings, it is the best of the 32 that a rougher estimate ranks highest.
         """
         if self._next is None:
             self._next = self._settings[self._best_row()]
@@ -577,14 +583,24 @@ class Inquiry(ShowsItself):
         return np.asarray(self.posterior.theta[rows])
 
     def _best_row(self) -> int:
-        """Choose the index of the best setting: of many, of those that a few of the hypotheses value most."""
-        rows, cost_s = np.arange(len(self._settings)), self._costs_s(self._last_setting)
-        if self._utility is not None or len(rows) <= _FEW_SETTINGS or not self._model.broadcasts:
+        """Choose the index of the best setting: of many, of those that a rougher estimate ranks highest."""
+        theta, settings, cost_s = self._hypotheses, self._settings, self._costs_s(self._last_setting)
+        if self._utility is not None or len(settings) <= _FEW_SETTINGS or not self._model.broadcasts:
             return self._choose(self.utility)
-        rough = self._utility_of(self._hypotheses[:_N_ROUGH], rows, n_levels=_N_ROUGH) / cost_s
-        rows = np.sort(np.argpartition(-rough, _N_BEST)[:_N_BEST])
-        fine = self._utility_of(self._hypotheses, rows) / np.broadcast_to(cost_s, rough.shape)[rows]
+        if self._is_near_goal:  # where settings differ little, all hypotheses count
+            predicted = self._model.predict(theta, settings)
+            values, goal = self._values_and_goals(theta)
+            above = gaussian_nats_above_goal(predicted, self._model.scale(theta, predicted), values, goal)
+            rough = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum() - above
+        else:
+            rough = self._utility_of(theta[:_N_ROUGH], np.arange(len(settings)), n_levels=_N_ROUGH)
+        rows = np.sort(np.argpartition(-rough / cost_s, _N_BEST)[:_N_BEST])
+        fine = self._utility_of(theta, rows) / np.broadcast_to(cost_s, rough.shape)[rows]
         return int(rows[self._choose(fine)])
+
+    def _values_and_goals(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the columns of theta that have a goal, (n, n_values), and their goals, (n_values,)."""
+        return theta[:, [self.posterior.names.index(name) for name in self._goal]], np.array([*self._goal.values()])
 
     def _utility_of(self, theta: FloatArray, rows: IntArray, **levels: int) -> FloatArray:
         """Compute the acquisition function per reading at the settings `rows`, (n,), for equally weighted samples."""
@@ -592,9 +608,9 @@ class Inquiry(ShowsItself):
         even = np.full(len(theta), 1.0 / len(theta))
         given = readings_given_noise(predicted, self._model.scale(theta, predicted), even, self._model.noise, **levels)
         if self._is_near_goal:
-            values, goal = theta[:, [self.posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
+            values, goal = self._values_and_goals(theta)
             now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
-            fall = np.asarray(now - expected_nats_above_goal(given, values, np.array(goal)))
+            fall = np.asarray(now - expected_nats_above_goal(given, values, goal))
             if fall.max() > 0.0:  # else most readings lead to the goal, but a few far away from it
                 return fall
         return given.information_bits

@@ -42,6 +42,7 @@ _CELL = 0.4  # sds: wide as a cell of a reading, which loses 1.3 % of a small in
 _REACH = 5.0  # sds beyond the levels that the cells cover
 _NARROWEST = 1e-6  # sds, for predictions that are all alike
 _LEAST_SHARE = 1e-9  # of a goal's variance
+_BELOW = 0.01  # weight of nats below a goal
 _OUTERMOST = 0.01  # of the outliers' range, at each end: a tail is not smaller
 
 
@@ -313,3 +314,20 @@ def expected_nats_above_goal(given: WeightsGivenReading, values: FloatArray, goa
         variance = given.weighted_sum_by_cell(value**2) / weight - mean**2
         far += np.maximum(0.5 * np.log(np.maximum(variance, _LEAST_SHARE * sd**2)) - math.log(sd), 0.0)
     return np.asarray((weight * far).sum(axis=1) / weight.sum(axis=1))
+
+
+def gaussian_nats_above_goal(
+    predicted: FloatArray, scale: FloatArray, values: FloatArray, goal: FloatArray
+) -> FloatArray:
+    """Return `expected_nats_above_goal`, (n_settings,), as if predictions and values were jointly Gaussian.
+
+    `predicted`, `scale`: predictions and sds of their noise, (n_samples, n_settings), of equally weighted samples. An
+    sd below its goal counts a hundredth, which ranks settings that all reach it.
+    """
+    values, away = values - values.mean(axis=0), predicted - predicted.mean(axis=0)
+    total = (away**2).mean(axis=0) + (scale**2).mean(axis=0)
+    fallen = (values.T @ away / len(away)) ** 2 / total
+    left = (values**2).mean(axis=0)[:, None] - fallen
+    least = _LEAST_SHARE * goal[:, None] ** 2
+    far = 0.5 * np.log(np.maximum(left, least) / goal[:, None] ** 2)
+    return np.asarray(np.where(far > 0.0, far, _BELOW * far).sum(axis=0))

@@ -156,7 +156,7 @@ class NestedSampling:
             if n_own := int((which == k).sum()):
                 start = particles.weighted.samples(n_own, rng=rng)
                 moved = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
-                drawn.append(kind.to_whole_theta(moved, rng))
+                drawn.append(kind.member.to_whole_theta(moved, rng))
         return np.concatenate(drawn)
 
     def _nested_samples(

@@ -119,8 +119,9 @@ class Particles:
     hurried
         Whether, since that start, a reading needed four temperatures or more: then few samples were near the new
         posterior, and the product of mean weights is nearly always too small.
-    searched_at
-        Number of readings at the last search of the prior; -inf if there was none.
+    lost_log_z
+        Upper bound on the log evidence of a mode that the samples lack: at the last search of the prior it had less
+        than one sample, and it may have given every reading since exactly. Infinite if there was no search.
     asleep
         Whether the samples are those of fewer readings, and the evidence an upper bound: see `asleep_with`.
     """
@@ -131,7 +132,7 @@ class Particles:
     n_resampled: int = 0
     strained: bool = False
     hurried: bool = False
-    searched_at: float = -math.inf
+    lost_log_z: float = math.inf
     asleep: bool = False
 
     def __post_init__(self) -> None:
@@ -161,7 +162,13 @@ class Particles:
 
     def asleep_with(self, log_likelihood: float) -> Self:
         """Return the samples as they are, with the evidence as if they all gave a reading this log likelihood."""
-        return replace(self, weighted=replace(self.weighted, log_z=self.log_z + log_likelihood), asleep=True)
+        lost = self.lost_log_z + log_likelihood
+        had = replace(self.weighted, log_z=self.log_z + log_likelihood)
+        return replace(self, weighted=had, lost_log_z=lost, asleep=True)
+
+    def searched(self, log_z: float) -> Self:
+        """Return the samples as those of a search of the prior that has found this log evidence."""
+        return replace(self, lost_log_z=log_z - math.log(len(self.ancestor)))
 
     def with_zero_evidence(self) -> Self:
         """Return the samples with an evidence of zero: none of them could have given the readings."""
@@ -285,7 +292,9 @@ def resample_and_move(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), log_likelihood, log_likelihood.copy()
     )
     found = _moved_apart(start, had, problem, n_calls=had.n_calls, run=had.run, rng=rng, effort=effort)
-    return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
+    lost, n_resampled = max(particles.lost_log_z, had.log_z - math.log(n)), particles.n_resampled + 1
+    ancestor = particles.ancestor[rows]
+    return replace(particles, weighted=found, ancestor=ancestor, n_resampled=n_resampled, lost_log_z=lost)
 
 
 def particles_from_posterior(

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from probewise import __version__
 from probewise.calibration import Calibration, calibrate, default_prior, mixture_moments
-from probewise.calibration.search import ProblemsByOrder, search_prior_of_order
+from probewise.calibration.paper import ProblemsByOrder, search_prior_of_order
 from probewise.errors import DoubtfulResultWarning
 from probewise.recordings import Recording, paper_plan, read_recording, shipped, two_way_plan, write_text_atomically
 from probewise.world import Blob, World, gaussian_spot

@@ -44,6 +44,8 @@ templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"probewise {__version__}"
 html_static_path = ["_static"]
+html_css_files = ["code.css"]
+smartquotes_action = "qe"  # an option keeps its two hyphens in prose
 
 LEADS: dict[str, list[str]] = tomllib.loads((HERE / "reference" / "leads.toml").read_text(encoding="utf-8"))
 

@@ -10,8 +10,8 @@ estimated from a recording, then a robot arm finds a circle. Each step is one fi
 import matplotlib.pyplot as plt
 import numpy as np
 
-from probewise import calibrate
 from probewise.arm import SimulatedArm
+from probewise.calibration import estimate_ssf
 from probewise.experiment import find_shape
 from probewise.experiment.paper import student_t_likelihood
 from probewise.inquiry import Grid, entropy_map
@@ -28,9 +28,10 @@ rng = np.random.default_rng(seed)
 # %%
 # "Estimating SSF MoG Model Parameters": one Gaussian, with few live points so that it runs in seconds.
 recording = read_recording(shipped("paper"))
-calibration = calibrate(recording, orders=(1,), n_live=50, method="paper", rng=rng, progress=False)
+((_, posterior, field),) = estimate_ssf(recording, orders=(1,), n_live=50, rng=rng)
+print(f"log evidence of one Gaussian {posterior.log_z:.1f} ± {posterior.log_z_error:.1f}")
 fig, ax = plt.subplots()
-plots.spatial_sensitivity(calibration.sensor.field, ax=ax)
+plots.spatial_sensitivity(field, ax=ax)
 
 # %%
 # "Robotic Arm Test Bed" and "Models Describing a Light Sensor": an arm over a white circle; its sensor's SSF.

@@ -1,4 +1,4 @@
-"""The paper's method in eight files: each opens with its section, and they import little beside each other."""
+"""The paper's method in eight files and a ninth: each opens with its section, and imports little beside the others."""
 
 import ast
 import re
@@ -16,6 +16,7 @@ PAPER = (
     "nested.diversify",
     "inquiry.entropy",
     "experiment.paper",
+    "calibration.paper",
 )
 BESIDE = {
     "_arrays",
@@ -35,11 +36,14 @@ BESIDE = {
     "nested.weights",
     "nested.save",
     "nested.check",
+    "nested.importance",
     "inquiry.grid",
     "inquiry.forecast",
     "experiment.journal",
+    "calibration.fields",
+    "calibration.priors",
 }
-"""What the eight may import beside each other, NumPy and SciPy."""
+"""What the nine may import beside each other, NumPy and SciPy."""
 
 
 def tree(name):

@@ -19,7 +19,7 @@ from probewise.recordings import Disc, paper_plan
 from probewise.world import World
 from probewise.world.spots import Blob, gaussian_spot
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.single_case]
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "instruments" / "printer.py"
 ORIGIN_MM = (110.0, 110.0)

@@ -68,9 +68,16 @@ def short_demo(monkeypatch):
 QUICK = ("audit data.csv", "explore", "study --circles")
 
 
+def marks_of(words):
+    if words == "demo":
+        return [pytest.mark.slow, pytest.mark.single_case]
+    return [] if words.startswith(QUICK) else pytest.mark.slow
+
+
 @pytest.mark.usefixtures("short_demo")
 @pytest.mark.parametrize(
-    "command", [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS]
+    "command",
+    [pytest.param(words, marks=marks_of(words)) for words in COMMANDS],
 )
 def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_1(
     command, recording_file, sensor_file, tmp_path, monkeypatch, capsys

@@ -98,6 +98,7 @@ def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
 
 
 @pytest.mark.slow
+@pytest.mark.single_case
 def test_an_investigation_goes_on_from_whatever_stands_on_the_disk(thin_plan, tmp_path, monkeypatch):
     """Before and after any file is put in place, and after its only round; no diagnosis is computed twice."""
     made, standing, whole = {}, [], tmp_path / "whole"
@@ -141,7 +142,7 @@ BEGUN = {"explore": "journal.jsonl", "investigate": "rounds/settings.json"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", BEGUN)
+@pytest.mark.parametrize("verb", ["explore", pytest.param("investigate", marks=pytest.mark.single_case)])
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(verb, sensor_file, thin_plan, tmp_path):
     """As processes, with all pictures; killed twice in all, and no run more often than that."""

@@ -123,7 +123,7 @@ def test_a_search_that_ends_in_a_false_mode_is_set_right_where_the_leader_has_th
     kinds = experiment.kinds[0], [kind for kind in experiment.kinds if kind.left_out == "backlash"][3]
     start = prior_posterior(kinds, 600, rng=rng)
     led = from_nothing(kinds[0].problem(recording), rng=rng)
-    leader = replace(start.particles[0], weighted=led, ancestor=np.arange(len(led.theta)), searched_at=len(taken))
+    leader = replace(start.particles[0], weighted=led, ancestor=np.arange(len(led.theta)), lost_log_z=-math.inf)
     lost = replace(start.particles[1].with_zero_evidence(), strained=True)
     now = replace(start, particles=(leader, lost))
     found = experiment.inference_method.reconsidered(now, recording, rng=rng).particles[1]
@@ -140,7 +140,7 @@ def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_pri
     recording = journal(doubting, 3)
     now = method.updated(prior_posterior(kinds, 1000, rng=rng), recording.take(np.arange(1)), rng=rng)
     leader, other = now.particles
-    other = replace(other, weighted=replace(other.weighted, log_z=leader.log_z - behind), searched_at=1, asleep=True)
+    other = replace(other, weighted=replace(other.weighted, log_z=leader.log_z - behind), lost_log_z=0.0, asleep=True)
     two = recording.take(np.arange(2))
     found = method.updated(replace(now, particles=(leader, other)), two, rng=rng).particles[1]
     assert found.asleep == sleeps
@@ -148,6 +148,25 @@ def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_pri
         np.testing.assert_array_equal(found.weighted.theta, other.weighted.theta)
         assert found.log_z == pytest.approx(other.log_z + kinds[1].problem(two).perfect_log_likelihood)
     else:
-        assert found.searched_at == 2
+        assert found.lost_log_z < found.log_z
         right = nested_sampling_from_scratch(kinds[1].problem(two), n_live=400, rng=rng)
         assert found.log_z == pytest.approx(right.log_z, abs=0.3 + 2 * right.log_z_error)
+
+
+@pytest.mark.parametrize(("least", "solved"), [(-2.0, True), (-12.0, False)])
+def test_before_a_run_ends_a_kind_is_solved_again_that_could_matter_by_a_mode_that_it_lost(doubting, least, solved):
+    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "nonlinearity")]
+    method, rng = replace(doubting, n_live=100).inference_method, np.random.default_rng(1)
+    recording = journal(doubting, 3)
+    start = prior_posterior(kinds, 1000, rng=rng)
+    found = [from_nothing(kind.problem(recording), rng=rng) for kind in kinds]
+    parts = [
+        replace(own, weighted=f, ancestor=np.arange(len(f.theta)), lost_log_z=-math.inf)
+        for own, f in zip(start.particles, found, strict=True)
+    ]
+    now = replace(start, particles=tuple(parts)).with_raised_fault_odds()
+    poor = replace(found[1], log_z=found[1].log_z - 7.0)
+    lost_log_z = now.log_z + least - now.kinds[1].log_prior
+    now = replace(start, particles=(parts[0], replace(parts[1], weighted=poor, lost_log_z=lost_log_z)))
+    again = method.reconsidered(now, recording, rng=rng).particles[1]
+    assert again.log_z == pytest.approx(found[1].log_z if solved else poor.log_z, abs=0.5)

@@ -9,7 +9,8 @@ from hand_made import NAMES, sensor_of
 
 from probewise.arm.instrument import Reading
 from probewise.effects import Origin
-from probewise.experiment import AdjustedMixture, experiment_for, sensor_change_prior
+from probewise.experiment import experiment_for
+from probewise.experiment.from_sensor import AdjustedMixture, sensor_change_prior
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.scene import Circle, Field, HypothesisScene

@@ -12,16 +12,8 @@ from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import EFFECTS, Known, Origin
 from probewise.errors import FileError, LinkError, ParameterError
-from probewise.experiment import (
-    HiddenShape,
-    JournalWriter,
-    PosteriorSummary,
-    geometry_entry,
-    read_journal,
-    recording_of,
-    require_same_settings,
-    value_digest,
-)
+from probewise.experiment import HiddenShape, JournalWriter, geometry_entry, read_journal, recording_of
+from probewise.experiment.journal import PosteriorSummary, require_same_settings, value_digest
 from probewise.recordings.patterns import Disc
 from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card, CardedScene, Circle, Field, HypothesisScene

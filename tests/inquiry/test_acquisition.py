@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from probewise.inquiry import ReadingNoise
-from probewise.inquiry.predictive import expected_nats_above_goal, readings_given_noise
+from probewise.inquiry.predictive import expected_nats_above_goal, gaussian_nats_above_goal, readings_given_noise
 from probewise.priors import LogUniform
 
 
@@ -108,6 +108,8 @@ def test_the_expected_fall_of_a_gaussians_sd_is_the_closed_form():
     goal = np.array([0.01])
     expected = -0.5 * np.log(1 + slopes**2) - math.log(0.01)
     np.testing.assert_allclose(expected_nats_above_goal(predictive, x[:, None], goal), expected, atol=0.02)
+    scale = np.ones((len(x), len(slopes)))
+    np.testing.assert_allclose(gaussian_nats_above_goal(x[:, None] * slopes, scale, x[:, None], goal), expected)
 
 
 def test_what_is_within_its_goal_counts_no_more():

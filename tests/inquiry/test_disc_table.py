@@ -10,7 +10,6 @@ from probewise.inquiry import (
     Designs,
     DirectForecast,
     DiscForecast,
-    DiscTable,
     Grid,
     InformationGain,
     Readout,
@@ -18,6 +17,7 @@ from probewise.inquiry import (
     UtilityInput,
     forecast_of,
 )
+from probewise.inquiry.disc_table import DiscTable
 from probewise.inquiry.forecast import MOST_LEVELS
 from probewise.scene import Circle, HypothesisScene, Rectangle
 from probewise.sensor import Chain, FixedLevels, FixedMixture

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from probewise.errors import ParameterError
-from probewise.inquiry import Design, Designs, Grid
+from probewise.inquiry import Designs, Grid
+from probewise.inquiry.grid import Design
 
 SMALL = Grid(2.0, 1.0, 3, 2)
 

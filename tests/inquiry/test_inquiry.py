@@ -1,6 +1,8 @@
 """An inquiry over any settings: its posterior against a closed form, its choices, its forms, what it refuses."""
 
 import math
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -217,6 +219,21 @@ def test_readings_that_no_hypothesis_explains_are_doubted():
         asked.tell(3.0 * (x - 1) ** 2, x)
     assert "no hypothesis explains the readings" in asked.doubt
     assert "doubtful: no hypothesis" in asked.summary()
+
+
+def test_the_choice_of_many_settings_is_the_best_of_all_of_them():
+    """A few samples pick the settings worth a closer look; the offset alone is read at zero, in the middle."""
+    asked = inquiry(goal={"offset": 0.9}, settings=np.linspace(-2.0, 2.0, 401), n_samples=2000)
+    at = asked.next()
+    assert abs(at) < 0.15
+    assert asked.utility[np.argmin(np.abs(np.linspace(-2.0, 2.0, 401) - at))] > 0.98 * asked.utility.max()
+
+
+def test_an_inquiry_loads_neither_fields_of_shapes_nor_simulators():
+    """They take longer to load than a dozen readings to choose."""
+    heavy = "'probewise.scene', 'probewise.effects', 'probewise.systems', 'scipy.spatial', 'scipy.interpolate'"
+    code = f"import sys; from probewise import Inquiry; sys.exit(' '.join({{{heavy}}} & {{*sys.modules}}) or 0)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_the_summary_names_readings_evidence_and_goal():

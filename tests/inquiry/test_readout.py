@@ -9,8 +9,9 @@ import pytest
 from scipy.stats import norm
 
 from probewise.errors import ParameterError
-from probewise.inquiry import Readout, bits_gained, capacity_bits, entropy_bits, fewest_readings, prior_entropy
-from probewise.inquiry.utilities import WeightsGivenReading
+from probewise.inquiry import Readout, bits_gained, prior_entropy
+from probewise.inquiry.predictive import WeightsGivenReading
+from probewise.inquiry.readout import capacity_bits, entropy_bits
 from probewise.nested import run
 from probewise.priors import Normal, Product, Uniform
 
@@ -49,7 +50,7 @@ def test_the_information_of_a_reading_counts_the_noise_at_each_level(sd, black):
     grey, few_white = rng.uniform(30.0, 33.0, 800), rng.choice([black, 59.5], 800, p=[0.95, 0.05])
     answers = np.stack([np.full(800, black), few_white, grey, np.full(800, 59.5)], axis=1)
     readout = Readout(sd, 1.0, 1.0, 100.0)
-    found = WeightsGivenReading(answers, weight, readout).information_bits
+    found = WeightsGivenReading.of(answers, weight, readout).information_bits
     for column, bits in zip(answers.T, found, strict=True):
         chance = readout.cell_probability(column)
         exact = entropy_bits(weight @ chance) - weight @ entropy_bits(chance)
@@ -108,23 +109,6 @@ def test_cells_taken_together_hold_what_they_held_apart():
 def test_two_levels_far_apart_carry_at_least_a_bit_and_noise_free_steps_their_log():
     """A rounding sensor of little noise tells apart as many levels as it has steps."""
     assert capacity_bits(10.0, 17.0, Readout(0.05, 1.0)) == pytest.approx(3.0, abs=0.01)
-
-
-def test_search_and_refinement_are_divided_by_what_each_can_carry():
-    bound = fewest_readings(25.0, 21.0, 12.0, most_covered=0.11, capacity=3.0)
-    yes = -0.11 * log2(0.11) - 0.89 * log2(0.89)
-    assert bound.readings_of_search == pytest.approx(4.0 / yes)
-    assert bound.readings_of_refinement == pytest.approx(3.0)
-    assert bound.readings == pytest.approx(4.0 / yes + 3.0)
-
-
-@pytest.mark.parametrize(
-    "change", [{"most_covered": 0.0}, {"met_bits": 30.0}, {"target_bits": 24.0}], ids=["covered", "met", "target"]
-)
-def test_a_bound_of_what_cannot_be_is_refused(change):
-    asked = {"prior_bits": 25.0, "met_bits": 21.0, "target_bits": 12.0, "most_covered": 0.1, "capacity": 3.0, **change}
-    with pytest.raises(ParameterError):
-        fewest_readings(**asked)
 
 
 def test_the_entropy_of_a_prior_is_its_closed_form():

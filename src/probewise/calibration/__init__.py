@@ -14,6 +14,7 @@ from probewise.calibration.fields import (
 )
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan
+from probewise.calibration.paper import OrderPosterior, estimate_ssf, problem_for
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,
@@ -24,7 +25,6 @@ from probewise.calibration.priors import (
     paper_prior,
     scan_geometry,
 )
-from probewise.calibration.search import OrderPosterior, problem_for
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "choose_pixel_mm",
     "default_prior",
     "draw_sd",
+    "estimate_ssf",
     "mixture_moments",
     "noise_by_scan",
     "paper_prior",

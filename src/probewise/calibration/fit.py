@@ -23,9 +23,9 @@ from probewise.calibration.fields import (
     posterior_mean_ssf_field,
 )
 from probewise.calibration.noise import draw_sd, noise_by_scan
+from probewise.calibration.paper import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.priors import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.quick import fit_orders_quickly
-from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.errors import DoubtfulResultWarning, ParameterError, require
 from probewise.inference import sd_ceiling, sd_floor

@@ -23,9 +23,9 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.calibration.about_peaks import MOST_RELABELLED, distinct_peaks, laplace, weigh_draws_about_peaks
 from probewise.calibration.coordinates import WholeFootprintCoordinates
+from probewise.calibration.paper import OrderPosterior, ProblemsByOrder, Progress, Search
 from probewise.calibration.peaks import climb, starts_of_climbs
 from probewise.calibration.priors import SSFPrior, view_by_kind_and_gaussian
-from probewise.calibration.search import OrderPosterior, ProblemsByOrder, Progress, Search
 from probewise.errors import DoubtfulResultWarning
 from probewise.inference import SensorProblem
 from probewise.nested import NestedResult, Samplable, Weighted, least_live, run

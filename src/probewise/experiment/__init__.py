@@ -1,37 +1,19 @@
 """The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
-from probewise.experiment.arm_error import ArmError
 from probewise.experiment.from_sensor import (
     TRUST,
-    AdjustedMixture,
     MethodName,
     experiment_for,
     naive_levels_from_recording,
     naive_levels_from_world,
-    sensor_change_prior,
 )
-from probewise.experiment.inquire import ArmReachAndTravel
-from probewise.experiment.journal import (
-    Entry,
-    Journal,
-    JournalWriter,
-    PosteriorSummary,
-    read_journal,
-    recording_of,
-    require_same_settings,
-    value_digest,
-)
-from probewise.experiment.loop import ExplorationState, begin, explore, run_from_place, shadow_run, step
+from probewise.experiment.journal import Journal, JournalWriter, read_journal, recording_of
+from probewise.experiment.loop import begin, explore, run_from_place, shadow_run, step
 from probewise.experiment.method import Method, NestedSampling, SequentialMonteCarlo
-from probewise.experiment.paper import OneScan, find_shape, student_t_likelihood
+from probewise.experiment.paper import find_shape
 from probewise.experiment.result import (
     CLEAN,
-    OFF_MM,
-    PAPER_BITS,
     Exploration,
-    FoundParameter,
-    FoundShape,
-    LeftOutEffects,
     Step,
     found_shape,
     left_out_after_step,
@@ -57,29 +39,17 @@ from probewise.experiment.stopping import least_readings, probability_of_length_
 
 __all__ = [
     "CLEAN",
-    "OFF_MM",
-    "PAPER_BITS",
     "TRUST",
-    "AdjustedMixture",
-    "ArmError",
-    "ArmReachAndTravel",
-    "Entry",
     "Experiment",
     "Exploration",
-    "ExplorationState",
     "FittedArm",
-    "FoundParameter",
-    "FoundShape",
     "HiddenShape",
     "Journal",
     "JournalWriter",
-    "LeftOutEffects",
     "Method",
     "MethodName",
     "Model",
     "NestedSampling",
-    "OneScan",
-    "PosteriorSummary",
     "RandomStreams",
     "SequentialMonteCarlo",
     "Step",
@@ -100,17 +70,13 @@ __all__ = [
     "read_journal",
     "recording_of",
     "repaired_sensor",
-    "require_same_settings",
     "result_json",
     "run_from_place",
     "samples_csv",
     "scale_of",
-    "sensor_change_prior",
     "sensor_entry",
     "shadow_run",
     "step",
-    "student_t_likelihood",
-    "value_digest",
     "with_cards",
     "world_like",
 ]

@@ -2,10 +2,9 @@
 
 Samples that are carried from reading to reading keep only the modes that they have, and their evidence accumulates
 errors. One rule sets that right: kinds are solved from the prior, at a doubt a few at a time, and before a run ends
-all whose samples had difficulties, or that were not solved since half of the readings were taken, those that were ruled
-out among them. A quick run of nested sampling finds the modes; importance sampling about its samples and the carried
-ones gives evidence and samples. A kind that is so far behind that perfect predictions of all readings since could not
-bring it back sleeps until they could.
+all whose samples had difficulties or may lack a mode that could matter by now. A quick run of nested sampling finds the
+modes; importance sampling about its samples and the carried ones gives evidence and samples. A kind that is so far
+behind that perfect predictions of all readings since could not bring it back sleeps until they could.
 """
 
 from __future__ import annotations
@@ -25,10 +24,9 @@ from probewise.nested import Weighted
 from probewise.nested.importance import evenly_weighted, weighted_draws
 
 _MATTERS = 1e-4  # probability, by the raised odds, from which on a kind is solved at a doubt, and wakes
-_HAS_A_SAY = 0.02  # probability of a kind that is searched for lost modes where no effect can be left out
+_HAS_A_SAY = 0.02  # probability, by the raised odds, from which on a lost mode is searched for before a run ends
 _SLEEPS = 1e-8  # probability, by the raised odds, below which a kind falls asleep
-_EACH = 2  # kinds that are solved after a reading: the most probable of the unsure, and those solved longest ago
-_OLD = 0.5  # share of the readings: a kind that was solved with fewer is solved again before a run ends
+_EACH = 2  # kinds that are solved after a reading: the most probable of the unsure, and those that most could matter
 _MOVES = 4.0  # of each new live point: its samples are only where draws are made
 _BEHIND = 20.0  # nats behind what the prior's search found, from which on carried samples are not drawn about
 _LOST_SHARE = 0.05  # of a posterior that may lie outside the samples' range, besides what chance leaves there
@@ -45,7 +43,7 @@ def can_sleep_mask(now: Posterior) -> BoolArray:
     exactly, it would be; which is what its evidence then says.
     """
     raised = now.with_raised_fault_odds().probability
-    known = np.array([p.asleep or (p.searched_at > -math.inf and not p.is_doubtful) for p in now.particles])
+    known = np.array([p.asleep or (p.lost_log_z < math.inf and not p.is_doubtful) for p in now.particles])
     return np.asarray(known & (raised < _SLEEPS) & now.doubts_sensor)
 
 
@@ -58,27 +56,28 @@ def with_evidence_from_prior(
     at_end: bool,
     rng: np.random.Generator,
 ) -> Posterior:
-    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, those of few readings too.
+    """Return the posterior with the kinds in doubt solved from the prior; before a run ends, all that could matter.
 
     `problems` are those of the kinds, given all readings; `n_particles` the samples of a probable kind. Unsure is a
     kind whose samples followed a reading with difficulty or were woken, and in doubt one never solved, too. After a
-    reading, a few of these are solved; before a run ends, all, with those that were last solved with fewer than half of
-    the readings: samples lose a mode without a sign. Where no effect can be left out, the end changes samples only if
-    they had lost a mode.
+    reading, a few of these are solved; before a run ends, all, with those in which a mode could matter that the samples
+    lack: they lose one without a sign. Where no effect can be left out, the end changes samples only if they had lost
+    a mode.
     """
-    n_readings, possible = len(problems[0].recording), np.isfinite(now.log_odds).any()
-    raised = now.with_raised_fault_odds().probability if possible else np.ones(len(problems))
+    possible, by_raised = np.isfinite(now.log_odds).any(), now.with_raised_fault_odds()
+    raised = by_raised.probability if possible else np.ones(len(problems))
     asleep, doubtful = (np.array([getattr(p, name) for p in now.particles]) for name in ("asleep", "is_doubtful"))
-    searched_at, matters = np.array([p.searched_at for p in now.particles]), raised > _MATTERS
-    unsure = np.where(asleep, matters, doubtful | (searched_at == -math.inf))
+    lost, matters = np.array([p.lost_log_z for p in now.particles]), raised > _MATTERS
+    unsure = np.where(asleep, matters, doubtful | (lost == math.inf))
+    log_lost = lost + np.array([kind.log_prior for kind in by_raised.kinds])
     if at_end:
-        unsure |= searched_at < _OLD * n_readings
+        unsure |= log_lost > by_raised.log_z + math.log(_HAS_A_SAY)
         due = np.flatnonzero(unsure & (now.doubts_sensor | (raised > _HAS_A_SAY)))
     else:
         in_doubt = raised[doubtful].sum() > 0.5 or (now.doubts_sensor and possible and now.left_out[""] < 0.5)
         unsure &= np.full(len(raised), in_doubt) | ((doubtful | asleep) & matters)
-        likely, old = np.lexsort((-raised, ~unsure)), np.lexsort((-raised, searched_at, ~unsure))
-        due = np.unique(np.concatenate([likely[:_EACH], old[:_EACH]]))
+        likely, open_ones = np.lexsort((-raised, ~unsure)), np.lexsort((-raised, -log_lost, ~unsure))
+        due = np.unique(np.concatenate([likely[:_EACH], open_ones[:_EACH]]))
         due = due[unsure[due]]
     particles, leader = list(now.particles), now.most_probable_kind_index
     leading = now.particles[leader].weighted
@@ -95,12 +94,12 @@ def with_evidence_from_prior(
         keep = not own.is_doubtful and not now.doubts_sensor and not (found and _has_lost_mode(own.weighted, found))
         if found is None:
             none = own.with_zero_evidence()
-            particles[k] = replace(none, strained=False, hurried=False, asleep=False, searched_at=n_readings)
+            particles[k] = replace(none, strained=False, hurried=False, asleep=False, lost_log_z=-math.inf)
         elif keep:
-            particles[k] = replace(own, searched_at=n_readings)
+            particles[k] = own.searched(found.log_z)
         else:
             fresh = particles_from_posterior(found, n, problem, rng=rng, effort=BRIEF)
-            particles[k] = replace(fresh, searched_at=n_readings)
+            particles[k] = fresh.searched(found.log_z)
     return replace(now, particles=tuple(particles))
 
 

@@ -37,12 +37,13 @@ from probewise.inquiry import (
     UtilityMap,
     choose,
     choose_several,
-    entropy_bits,
-    reachable_rows,
     utility_map,
 )
+from probewise.inquiry.entropy import reachable_rows
 from probewise.inquiry.forecast import resampled_rows_and_weights
-from probewise.inquiry.utilities import WeightsGivenReading
+from probewise.inquiry.predictive import WeightsGivenReading
+from probewise.inquiry.readout import entropy_bits
+from probewise.inquiry.utilities import by_repeats
 from probewise.nested import Weighted
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
@@ -203,13 +204,8 @@ def next_poses(
     best design of the map is taken. If some of the `readings` so far are missing, the utility above the least of the
     map counts by the chance that a reading is not missing.
     """
-    plan, grid = given.plan, experiment.grid
-    reach_mm = _MISSING_REACH * math.hypot(grid.width_mm, grid.height_mm)
-    places_mm = np.stack([plan.x_mm, plan.y_mm], axis=1)
-    chance = chance_of_value(readings, places_mm, reach_mm=reach_mm)
-    if experiment.trust < 1 and readings:
-        again = worth_beside_earlier_readings(readings, places_mm, experiment.footprint_mm)
-        chance = again if chance is None else chance * again
+    plan = given.plan
+    chance = _worth_beside_earlier_readings(experiment, readings, np.stack([plan.x_mm, plan.y_mm], axis=1))
     if experiment.batch > 1 and utilities.label == InformationGain.label:
         weight = None if chance is None else chance[given.rows]
         rows = choose_several(given, experiment.batch, rng=rng, chance=weight)
@@ -227,31 +223,31 @@ def next_poses(
     return tuple(poses)
 
 
-def chance_of_value(readings: Sequence[Reading], places_mm: FloatArray, *, reach_mm: float) -> FloatArray | None:
-    """Return the chance that a reading at each place is not missing, (n_places, 2) -> (n_places,).
+def _worth_beside_earlier_readings(
+    experiment: Experiment, readings: Sequence[Reading], places_mm: FloatArray
+) -> FloatArray | None:
+    """Return the factor of a reading's worth at each place, (n_places, 2) -> (n_places,); None: 1 everywhere.
 
-    It is the share of values among the readings so far, each weighted by one over its squared distance. One value at
-    the distance `reach_mm` is added, so that a missing reading hardly counts farther away than that. So it is near 0
-    where a reading was missing, and near 1 where one was not. None if no reading is missing.
+    If a reading is missing, it is the chance that one there is not: the share of values among the readings so far,
+    each weighted by one over its squared distance. One value at a tenth of the field's diagonal is added, so that a
+    missing reading hardly counts farther away than that.
+
+    With doubt in the sensor, a reading within a footprint of n others counts 1/(1 + n): kinds that fail in a way that
+    none of them has would say that it tells more, again and again.
     """
     missing = np.array([math.isnan(reading.value) for reading in readings], dtype=np.bool_)
-    if not missing.any():
+    crowded = experiment.trust < 1 and len(readings) > 0
+    if not missing.any() and not crowded:
         return None
-    square = ((places_mm[:, None] - _places_of(readings)) ** 2).sum(axis=2) + _SAME_MM**2
-    weight = reach_mm**2 / square
-    return np.asarray((1.0 + weight[:, ~missing].sum(axis=1)) / (1.0 + weight.sum(axis=1)))
-
-
-def worth_beside_earlier_readings(
-    readings: Sequence[Reading], places_mm: FloatArray, footprint_mm: float
-) -> FloatArray:
-    """Return the factor of a reading's worth at each place, (n_places, 2) -> (n_places,): 1 away from earlier readings.
-
-    A reading within a footprint of n others counts 1/(1 + n): kinds that fail in a way that none of them has would say
-    that it tells more, again and again.
-    """
     square = ((places_mm[:, None] - _places_of(readings)) ** 2).sum(axis=2)
-    return np.asarray(1.0 / (1.0 + (square < footprint_mm**2).sum(axis=1)))
+    worth = np.ones(len(places_mm))
+    if missing.any():
+        reach_mm = _MISSING_REACH * math.hypot(experiment.grid.width_mm, experiment.grid.height_mm)
+        weight = reach_mm**2 / (square + _SAME_MM**2)
+        worth = (1.0 + weight[:, ~missing].sum(axis=1)) / (1.0 + weight.sum(axis=1))
+    if crowded:
+        worth = worth * (1.0 / (1.0 + (square < experiment.footprint_mm**2).sum(axis=1)))
+    return np.asarray(worth)
 
 
 def utilities_near_end(
@@ -307,11 +303,11 @@ def utilities_near_end(
         return expected_bits_about_left_out_effect(weight, own, names, given.readout, repeats=n)
 
     def information_bits(own: FloatArray, n: int) -> FloatArray:
-        return WeightsGivenReading(own, weight, given.readout, repeats=n).information_bits
+        return WeightsGivenReading.of(own, weight, given.readout, repeats=n).information_bits
 
     if known and not far:
-        return map_of(rows, _by_repeats(bits_about_names, answers, n_repeats), NAMES)
-    utility = _by_repeats(information_bits, answers, n_repeats)
+        return map_of(rows, by_repeats(bits_about_names, answers, n_repeats), NAMES)
+    utility = by_repeats(information_bits, answers, n_repeats)
     if known:
         # The far side first: it has to be read in any case, and tells something about the names too.
         there = seen if seen.any() else np.isin(rows, far)
@@ -321,30 +317,16 @@ def utilities_near_end(
     off_mm, goal_sd_mm = OFF_SDS * experiment.stop_sd_mm, given.goal.sd
 
     def chances(own: FloatArray, n: int) -> FloatArray:
-        after = WeightsGivenReading(own, weight, given.readout, repeats=n)
+        after = WeightsGivenReading.of(own, weight, given.readout, repeats=n)
         return after.probability_of_knowing(lengths - weight @ lengths, goal_sd_mm, off=off_mm, most_off=MOST_OFF)
 
     of_best = answers[:, best], n_repeats[best]
-    chance = _by_repeats(chances, *of_best)
+    chance = by_repeats(chances, *of_best)
     if chance.max() < _LEAST_CHANCE:
         return map_of(rows, utility, INFORMATION)
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
-    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + _by_repeats(bits_about_names, *of_best)
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + by_repeats(bits_about_names, *of_best)
     return map_of(rows[best], ends, ENDS)
-
-
-def _by_repeats(
-    utility: Callable[[FloatArray, int], FloatArray], answers: FloatArray, n_repeats: IntArray
-) -> FloatArray:
-    """Return the utility of each design, (n_designs,), from predictions, (n, n_designs), by its number of repeats.
-
-    `utility` takes the predictions of designs with the same number of repeats, of which the mean counts.
-    """
-    out = np.empty(answers.shape[1])
-    for n in np.unique(n_repeats).tolist():
-        own = np.flatnonzero(n_repeats == n)
-        out[own] = utility(answers[:, own], n)
-    return out
 
 
 def _draw_theta_lengths_weights(
@@ -363,7 +345,7 @@ def _draw_theta_lengths_weights(
         own = particles.weighted.samples(int(n), rng=rng) if n else np.empty((0, len(kind.prior.names)))
         theta.append(own)
         if n:
-            whole.append(kind.to_whole_theta(own, rng))
+            whole.append(kind.member.to_whole_theta(own, rng))
             weight.append(np.full(n, p / n))
     share = np.concatenate(weight)
     aligned = theta_with_aligned_angles(experiment, np.concatenate(whole), share)
@@ -456,7 +438,7 @@ def _expected_bits_by_cells(
     weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout, repeats: int
 ) -> FloatArray:
     """Return bits about the name, (n_designs,): entropy of the histogram of readings minus its mean given the name."""
-    given = WeightsGivenReading(answers, weight, readout, fine=_CELL, repeats=repeats)
+    given = WeightsGivenReading.of(answers, weight, readout, fine=_CELL, repeats=repeats)
     bits = entropy_bits(given.weight_by_cell)
     for own in each:
         part = float(weight[own].sum())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -78,32 +78,30 @@ class HypothesisKind:
 
     Attributes
     ----------
-    shape
-        Name of the model's shape in a set of shapes; "" for a single shape.
+    member
+        The model's shape, one of a set or the single one.
     left_out
         Name of the effect that the sensor model leaves out; "" if none.
     log_prior
         Natural log of the model's prior probability.
     prior, model, likelihood
         Prior, model and likelihood of the model's own parameters.
-    to_whole_theta
-        Function of the model's parameters, (n, n_own), and a random generator; returns the parameters of the whole
-        experiment, (n, n_params): missing ones are drawn from the prior, the effect's are dropped.
-    whole_names
-        Names of the experiment's parameters.
     effect
         The effect left out, if it acts on the noise-free reading; its parameters are the last ones.
     """
 
-    shape: str
+    member: _MemberShape
     left_out: str
     log_prior: float
     prior: Prior
     model: SensorModel
     likelihood: Likelihood
-    to_whole_theta: Callable[[FloatArray, np.random.Generator], FloatArray]
-    whole_names: tuple[str, ...]
     effect: DescribedEffect | None = None
+
+    @property
+    def shape(self) -> str:
+        """Name of the model's shape in a set of shapes; "" for a single shape."""
+        return self.member.label
 
     def at_pace(self, particles: Particles, before_s: float, now_s: float) -> Particles:
         """Return the samples of the same hypotheses where a paced second stands for another time.
@@ -152,17 +150,23 @@ def kinds_of(
     kinds = []
     for part in _member_shapes(shape, sensor_prior, prior):
         whole = _prior_and_model_with_estimated_effects(part.prior, chain, quick) if trust < 1 else (part.prior, quick)
-        kinds.append(part.kind("", trust, *whole, likelihood))
+        made: list[tuple[str, float, Prior, SensorModel, Likelihood, DescribedEffect | None]]
+        made = [("", trust, *whole, likelihood, None)]
         for rival in rivals:
             share = (1.0 - trust) / (len(ways) * ways[rival.name])
             if rival.effect is None:
-                kinds.append(part.kind(rival.name, share, part.prior, quick, rival.likelihood or likelihood))
+                made.append((rival.name, share, part.prior, quick, rival.likelihood or likelihood, None))
                 continue
             assert isinstance(chain, Chain)
             both = Joint((part.prior, _PrefixedPrior(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
-            model = TabulatedChain.of(acting, quick) or acting
-            kinds.append(part.kind(rival.name, share, both, model, likelihood, rival.effect))
+            made.append((rival.name, share, both, TabulatedChain.of(acting, quick) or acting, likelihood, rival.effect))
+        kinds += [
+            HypothesisKind(
+                part, name, math.log(part.share) + math.log(p), prior, part.restrict_model(model), law, effect
+            )
+            for name, p, prior, model, law, effect in made
+        ]
     return tuple(kinds)
 
 
@@ -195,28 +199,6 @@ class _MemberShape:
     columns: IntArray
     number: int | None
     n_sensor: int
-
-    def kind(
-        self,
-        left_out: str,
-        probability: float,
-        prior: Prior,
-        model: SensorModel,
-        likelihood: Likelihood,
-        effect: DescribedEffect | None = None,
-    ) -> HypothesisKind:
-        """Return a kind of this shape with a prior probability given the shape, and a model of all parameters."""
-        return HypothesisKind(
-            self.label,
-            left_out,
-            log_prior=math.log(self.share) + math.log(probability),
-            prior=prior,
-            model=self.restrict_model(model),
-            likelihood=likelihood,
-            to_whole_theta=self.to_whole_theta,
-            whole_names=self.whole.names,
-            effect=effect,
-        )
 
     def to_whole_theta(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Return the experiment's parameters for own ones, (n, n_own); draw those missing, drop the effect's."""
@@ -348,12 +330,14 @@ class Posterior:
         probability = self.probability
         some = [k for k, p in enumerate(probability) if p > 0]
         own = [self.particles[k].weighted for k in some]
-        theta = np.concatenate([self.kinds[k].to_whole_theta(w.theta, rng) for k, w in zip(some, own, strict=True)])
+        theta = np.concatenate(
+            [self.kinds[k].member.to_whole_theta(w.theta, rng) for k, w in zip(some, own, strict=True)]
+        )
         log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
         weight = np.exp(log_weight)
         errors = np.array([self.particles[k].log_z_error for k in some])
         return Weighted(
-            self.kinds[0].whole_names,
+            self.kinds[0].member.whole.names,
             theta,
             log_likelihood=np.concatenate([w.log_likelihood for w in own]),
             log_weight=log_weight,

@@ -86,7 +86,8 @@ class SequentialMonteCarlo:
                 updated[k] = own.asleep_with(problem.perfect_log_likelihood)
             else:
                 effort = BRIEF if kind.left_out and probability[k] < unsuspected else usual
-                updated[k] = update(kind.at_pace(own, *each_s), problem, rng=rng, effort=effort)
+                found = update(kind.at_pace(own, *each_s), problem, rng=rng, effort=effort)
+                updated[k] = replace(found, lost_log_z=own.lost_log_z + problem.perfect_log_likelihood)
         now = replace(previous, particles=tuple(updated))
         now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():
@@ -156,7 +157,7 @@ class NestedSampling:
             if n_own := int((which == k).sum()):
                 start = particles.weighted.samples(n_own, rng=rng)
                 moved = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
-                drawn.append(kind.to_whole_theta(moved, rng))
+                drawn.append(kind.member.to_whole_theta(moved, rng))
         return np.concatenate(drawn)
 
     def _nested_samples(

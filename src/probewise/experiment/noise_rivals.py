@@ -87,7 +87,10 @@ class DeclaredNoise:
             within = _rounded(float(sd), step).log_cell_probability(np.abs(readings - predicted) / sd)
         else:
             within = log_rounding_cell_density(readings, predicted, np.asarray(sd), step) + math.log(step)
-        return self._with_probability_at_ends(readings, predicted, sd, within)
+        inside = self.inside_scale_mask(readings)
+        if self.ends is None or inside.all():
+            return within
+        return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))
 
     def log_uniform_density(self, readings: FloatArray, low: float, high: float) -> FloatArray:
         """Return the log density, (n_points,), of readings that are uniform from `low` to `high`; -inf outside."""
@@ -97,15 +100,6 @@ class DeclaredNoise:
             width = np.where(ends.highest_reading_mask(readings), high - ends.highest_cell + 0.5 * self.step, width)
         possible = (readings >= low) & (readings <= high) & (width > 0)
         return np.log(np.where(possible, width, 1.0) / (high - low)) + np.where(possible, 0.0, -np.inf)
-
-    def _with_probability_at_ends(
-        self, readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, within: FloatArray
-    ) -> FloatArray:
-        """Replace the log densities of readings at an end of the scale by the log probability of all values beyond."""
-        inside = self.inside_scale_mask(readings)
-        if self.ends is None or inside.all():
-            return within
-        return np.where(inside, within, self.ends.log_prob_at_ends(readings, predicted, sd))
 
 
 @lru_cache(maxsize=64)  # a sensor has some thirty

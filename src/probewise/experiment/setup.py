@@ -22,18 +22,8 @@ from probewise.experiment.kinds import HypothesisKind, KindProblem, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.rivals import Pace, SensorModelRival, rivals_of
 from probewise.inference.problem import Likelihood, require_likelihood, require_model
-from probewise.inquiry import (
-    Designs,
-    Finishing,
-    Forecast,
-    Goal,
-    Grid,
-    InformationGain,
-    Readout,
-    Utility,
-    cards_of,
-    forecast_of,
-)
+from probewise.inquiry import Designs, Finishing, Goal, Grid, InformationGain, Readout, Utility, cards_of, forecast_of
+from probewise.inquiry.forecast import Forecast
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card

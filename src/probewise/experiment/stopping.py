@@ -19,7 +19,8 @@ from probewise.experiment.kinds import Posterior
 from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
-from probewise.inquiry import Bound, UtilityMap, capacity_bits, fewest_readings, prior_entropy, target_entropy
+from probewise.inquiry import UtilityMap, prior_entropy
+from probewise.inquiry.readout import capacity_bits, entropy_bits
 from probewise.nested import Weighted
 from probewise.scene.shapes import AnyOf, mean_angles, with_angles_near
 
@@ -32,6 +33,7 @@ MOST_MISSING = 8
 _TREND_P = 1e-3  # p-value of the residuals' strongest trend, every look counted, below which no kind is believed
 _FEWEST_FOR_TREND = 12  # readings
 _WHOLE = 1.0 - 1e-12  # a correlation beyond which rounding rules
+_N_OF_PRIOR = 20_000
 _ON_SHAPE = 5.0  # noise sds from the background at which a reading counts as on the shape
 
 
@@ -331,17 +333,36 @@ def stop_reason(
     return None
 
 
-def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
+@dataclass(frozen=True)
+class Bound:
+    """Lower bound on the mean number of readings, for search and refinement separately.
+
+    Attributes
+    ----------
+    search_bits, refinement_bits
+        Bits needed until the first reading on the shape, and from there to the target.
+    search_capacity_bits, capacity_bits
+        Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
+        yes; afterwards, that of the sensor.
+    """
+
+    search_bits: float
+    refinement_bits: float
+    search_capacity_bits: float
+    capacity_bits: float
+
+
+def least_readings(experiment: Experiment, *, rng: np.random.Generator) -> Bound:
     """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
 
     The search ends with the first reading on the shape. Any reading before is on the shape with probability p at most,
     that of the best first place, and so carries at most the information of a yes or no with probability p; a yes leaves
     a share p of all hypotheses. From there to the target sd, a reading carries at most the sensor's capacity. The
-    experiment has one shape and a known sensor; `n_samples` are drawn from the prior.
+    experiment has one shape and a known sensor.
     """
     prior = experiment.prior
-    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
-    weight = np.full(n_samples, 1.0 / n_samples)
+    theta = prior.from_unit_cube(rng.random((_N_OF_PRIOR, len(prior.names))))
+    weight = np.full(_N_OF_PRIOR, 1.0 / _N_OF_PRIOR)
     designs = experiment.designs
     plan = replace(designs.plan(PATTERN), instrumentation=experiment.instrumentation)
     predictive = experiment.forecast.predictive(
@@ -352,10 +373,12 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_sample
     beside = levels[int(mass.sum(axis=0).argmax())]
     covered = float(mass[:, np.abs(levels - beside) > _ON_SHAPE * experiment.noise_sd].sum(axis=1).max())
     prior_bits = prior_entropy(prior, rng=rng)
-    return fewest_readings(
-        prior_bits,
-        prior_bits + math.log2(covered),
-        target_entropy(len(prior.names), experiment.stop_sd_mm),
-        most_covered=covered,
-        capacity=capacity_bits(float(levels[0]), float(levels[-1]), experiment.readout),
+    yes = min(covered, 0.5)
+    # The largest entropy of parameters with the target's sd is that of independent Gaussians.
+    target_bits = len(prior.names) * 0.5 * math.log2(2 * math.pi * math.e * experiment.stop_sd_mm**2)
+    return Bound(
+        -math.log2(covered),
+        prior_bits + math.log2(covered) - target_bits,
+        float(entropy_bits(np.array([yes, 1.0 - yes]))),
+        capacity_bits(float(levels[0]), float(levels[-1]), experiment.readout),
     )

@@ -8,59 +8,45 @@ hypotheses directly (`DirectForecast`). For an instrument that reads no field of
 settings.
 """
 
-from probewise.inquiry.any_instrument import Inquiry
-from probewise.inquiry.disc_table import DiscForecast, DiscTable, TabulatedChain, forecast_of
-from probewise.inquiry.entropy import UtilityMap, best_places_mask, choose, entropy_map, label_entropy, reachable_rows
-from probewise.inquiry.forecast import DirectForecast, Forecast, PredictiveDistributions, cards_of
-from probewise.inquiry.grid import Design, Designs, Grid
-from probewise.inquiry.predictive import ReadingNoise
-from probewise.inquiry.readout import (
-    Bound,
-    Readout,
-    bits_gained,
-    capacity_bits,
-    entropy_bits,
-    fewest_readings,
-    prior_entropy,
-    target_entropy,
-)
-from probewise.inquiry.utilities import (
-    UTILITY_NAMES,
-    Finishing,
-    Goal,
-    InformationAbout,
-    InformationGain,
-    Label,
-    ParameterValue,
-    PerSecond,
-    ReadingEntropy,
-    Utility,
-    UtilityInput,
-    WhichShape,
-    choose_several,
-    utility_map,
-    utility_named,
-)
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from probewise.inquiry.any_instrument import Inquiry
+    from probewise.inquiry.disc_table import DiscForecast, TabulatedChain, forecast_of
+    from probewise.inquiry.entropy import UtilityMap, choose, entropy_map
+    from probewise.inquiry.forecast import DirectForecast, cards_of
+    from probewise.inquiry.grid import Designs, Grid
+    from probewise.inquiry.predictive import ReadingNoise
+    from probewise.inquiry.readout import Readout, bits_gained, prior_entropy
+    from probewise.inquiry.utilities import (
+        Finishing,
+        Goal,
+        InformationAbout,
+        InformationGain,
+        ParameterValue,
+        PerSecond,
+        ReadingEntropy,
+        Utility,
+        UtilityInput,
+        WhichShape,
+        choose_several,
+        utility_map,
+        utility_named,
+    )
 
 __all__ = [
-    "UTILITY_NAMES",
-    "Bound",
-    "Design",
     "Designs",
     "DirectForecast",
     "DiscForecast",
-    "DiscTable",
     "Finishing",
-    "Forecast",
     "Goal",
     "Grid",
     "InformationAbout",
     "InformationGain",
     "Inquiry",
-    "Label",
     "ParameterValue",
     "PerSecond",
-    "PredictiveDistributions",
     "ReadingEntropy",
     "ReadingNoise",
     "Readout",
@@ -69,20 +55,29 @@ __all__ = [
     "UtilityInput",
     "UtilityMap",
     "WhichShape",
-    "best_places_mask",
     "bits_gained",
-    "capacity_bits",
     "cards_of",
     "choose",
     "choose_several",
-    "entropy_bits",
     "entropy_map",
-    "fewest_readings",
     "forecast_of",
-    "label_entropy",
     "prior_entropy",
-    "reachable_rows",
-    "target_entropy",
     "utility_map",
     "utility_named",
 ]
+
+# In this order the first that has a name loads no other in vain.
+_MODULES = ("predictive", "any_instrument", "readout", "grid", "forecast", "entropy", "utilities", "disc_table")
+
+
+def __getattr__(name: str) -> object:
+    """Load the module of a public name when it is first asked for (PEP 562): `Inquiry` needs no field of shapes."""
+    for module in _MODULES if name in __all__ else ():
+        found = getattr(import_module(f"{__name__}.{module}"), name, None)
+        if found is not None:
+            return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

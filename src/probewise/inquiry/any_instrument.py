@@ -10,26 +10,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, logsumexp, ndtri
+from scipy.special import chdtrc, ndtri
 
 from probewise._arrays import FloatArray, IntArray, floats, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError, ShapeError, did_you_mean, require
-from probewise.inquiry.entropy import choose
-from probewise.inquiry.predictive import AnyNoise, ReadingNoise, expected_nats_above_goal, readings_given_noise
-from probewise.inquiry.smc import STEADY, nested_sampling_from_scratch, particles_from_run, prior_particles, update
+from probewise.inquiry.predictive import (
+    AnyNoise,
+    ReadingNoise,
+    expected_nats_above_goal,
+    gaussian_nats_above_goal,
+    readings_given_noise,
+)
+from probewise.inquiry.smc import LIGHT, nested_sampling_from_scratch, particles_from_run, prior_particles, update
 from probewise.nested import Weighted, make_problem
 from probewise.nested.problem import AnyPrior
 from probewise.nested.weights import resampled_rows
 from probewise.priors import Joint, Prior, Product, require_prior
-from probewise.systems.calls import Caller
 
 Column: TypeAlias = NDArray[Any]
 
@@ -43,8 +47,13 @@ _ALLOWED = (
 _BLOCK = 2_000_000  # densities held, or readings predicted, at a time
 _LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
 _N_PROBED = 3
+_SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
+_TIE = 1e-9  # utilities closer than this differ by rounding only
 _N_ASKED = 500  # samples whose predictions value the settings
 _FEWER_ASKED = 200  # of a model that is called for one sample at a time
+_N_ROUGH = 120  # samples that pick the settings worth a closer look, far from a goal
+_N_BEST = 32  # settings that get it
+_FEW_SETTINGS = 64  # all of which get it
 _N_IMAGINED = 8
 _DOUBT_P = 1e-6
 _NEAR_GOAL = 3.0  # times the sds that are asked for
@@ -77,11 +86,12 @@ class Settings:
             array = np.asarray(given)
         except ValueError as error:
             raise ParameterError("settings", given, _ALLOWED) from error
-        if array.ndim == 2 and array.shape[1] >= 1 and len(array):
-            _require_texts_given("settings", given, array)
-            columns = {str(k): _checked_column("settings", column) for k, column in enumerate(array.T)}
-            return cls(columns, "several")
-        return cls({"setting": _checked_column("settings", array)}, "one")
+        if array.ndim != 2 or not array.size:
+            return cls({"setting": _checked_column("settings", given)}, "one")
+        knobs = array.T if array.dtype.kind != "U" else np.asarray(given, dtype=object).T
+        columns = {str(k): _checked_column("settings", column.tolist()) for k, column in enumerate(knobs)}
+        require(len({column.dtype.kind for column in columns.values()}) == 1, "settings", given, _ALLOWED)
+        return cls(columns, "several")
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -94,11 +104,13 @@ class Settings:
         """Return these settings, then `other`."""
         return Settings({n: np.concatenate([c, other.columns[n]]) for n, c in self.columns.items()}, self.form)
 
-    def in_model_form(self, columns: Mapping[str, Column]) -> Any:
-        """Return `columns` in the form of these settings; several knobs as (n_knobs, n), to be unpacked."""
+    def in_model_form(self) -> Any:
+        """Return copies of the columns as the model gets them; several knobs as (n_knobs, n), to be unpacked."""
         if self.form == "one":
-            return columns["setting"]
-        return np.stack(list(columns.values())) if self.form == "several" else dict(columns)
+            return self.columns["setting"].copy()
+        if self.form == "several":
+            return np.stack(list(self.columns.values()))
+        return {name: column.copy() for name, column in self.columns.items()}
 
     def __getitem__(self, row: int) -> Any:
         """Return one setting: a number or a name, an array (n_knobs,), or a dict by name."""
@@ -112,49 +124,40 @@ class Settings:
 
         ParameterError if it is not of that form.
         """
-        if self.form == "name":
-            if not isinstance(setting, Mapping) or setting.keys() != self.columns.keys():
-                raise ParameterError("setting", setting, f"a dict of {', '.join(self.columns)}")
-            columns = {name: [setting[name]] for name in self.columns}
-        elif self.form == "one":
-            columns = {"setting": [setting]}
-        else:
-            if np.shape(setting) != (len(self.columns),):
-                raise ParameterError("setting", setting, f"{len(self.columns)} numbers, one for each knob")
-            columns = {name: [value] for name, value in zip(self.columns, setting, strict=True)}
-        made = {name: _checked_column("setting", values) for name, values in columns.items()}
-        for name, column in made.items():
-            if (column.dtype.kind == "U") != (self.columns[name].dtype.kind == "U"):
-                kind = "a name" if self.columns[name].dtype.kind == "U" else "a number"
-                raise ParameterError("setting", setting, f"{kind}, as in settings")
-        return Settings(made, self.form)
+        by_name = self.form == "name" and isinstance(setting, Mapping)
+        try:
+            one = Settings.of({name: [value] for name, value in setting.items()} if by_name else [setting])
+        except ParameterError:
+            one = Settings({}, self.form)
+        kinds, own = ({name: column.dtype.kind for name, column in of.columns.items()} for of in (one, self))
+        require(one.form == self.form and kinds == own, "setting", setting, f"one like those given, such as {self[0]}")
+        return one
 
 
 def _checked_column(name: str, values: Any) -> Column:
     """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
-    array = np.asarray(values)
+    array = np.array(values)
     require(array.ndim == 1 and array.size and array.dtype.kind in "biufU", name, values, _ALLOWED)
-    _require_texts_given(name, values, array)
-    if array.dtype.kind != "U":
+    if array.dtype.kind == "U":  # NumPy makes numbers among names texts
+        require(all(isinstance(one, str) for one in values), name, values, _ALLOWED)
+    else:
         array = array.astype(np.float64)
         if not np.isfinite(array).all():
             raise ParameterError(name, float(array[~np.isfinite(array)][0]), "finite numbers")
-    array = array.copy()
     array.flags.writeable = False
     return array
 
 
-def _require_texts_given(name: str, values: Any, array: Column) -> None:
-    """Raise ParameterError where `array`, of `values`, has numbers among names, which NumPy has made texts."""
-    if array.dtype.kind == "U" and not all(isinstance(one, str) for one in np.asarray(values, dtype=object).flat):
-        raise ParameterError(name, values, _ALLOWED)
-
-
 @dataclass(frozen=True, eq=False)
 class InstrumentModel:
-    """Prior, predictions and noise of one instrument."""
+    """Prior, predictions and noise of one instrument.
 
-    caller: Caller
+    `call` predicts readings, theta (n_samples, n_params) at settings -> (n_samples, n_settings); `broadcasts` says if
+    the user's function is called for all samples at once.
+    """
+
+    call: Callable[[FloatArray, Settings], FloatArray]
+    broadcasts: bool
     own_prior: Prior
     noise: ReadingNoise
 
@@ -162,28 +165,41 @@ class InstrumentModel:
     def from_function(
         cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings
     ) -> InstrumentModel:
-        """Make the model of a user's function; find out if it takes arrays, one sample, or one reading at a time."""
+        """Make the model of a user's function; find out if it takes arrays, one sample, or one reading at a time.
 
-        def call_with_arrays(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
-            return function(dict(parameters), settings.in_model_form(columns))
+        ParameterError if no prediction is finite, or if another call with the same parameters returns other readings.
+        """
+        names = prior.names
 
-        def call_for_one_sample(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
-            rows = Settings(columns, settings.form)
-            return np.array([function(dict(parameters), rows[k]) for k in range(len(rows))])
+        def together(theta: FloatArray, at: Settings) -> FloatArray:
+            parameters = {name: theta[:, [k]] for k, name in enumerate(names)}
+            return _called(function, parameters, at.in_model_form(), (len(theta), len(at)))
 
-        u = np.linspace(0.2, 0.8, _N_PROBED)[:, None] * np.ones(len(prior.names))
-        theta = prior.from_unit_cube(u)
-        samples = {name: theta[:, [k]] for k, name in enumerate(prior.names)}
-        some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int))).columns
+        def one_sample(values: bytes, at: Settings) -> FloatArray:
+            parameters = dict(zip(names, np.frombuffer(values).tolist(), strict=True))
+            return _called(function, parameters, at.in_model_form(), (len(at),))
+
+        def one_reading(values: bytes, at: Settings) -> FloatArray:
+            parameters = dict(zip(names, np.frombuffer(values).tolist(), strict=True))
+            return np.array([_called(function, dict(parameters), at[k], ()) for k in range(len(at))])
+
+        theta = prior.from_unit_cube(np.linspace(0.2, 0.8, _N_PROBED)[:, None] * np.ones(len(names)))
+        some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int)))
         try:
-            caller = Caller.from_trial_calls(
-                call_with_arrays, samples, some, per_run=(), broadcasts=False, name="model"
-            )
+            alone, one = _repeatable(one_sample, theta, some), one_sample
         except Exception:
-            caller = Caller.from_trial_calls(
-                call_for_one_sample, samples, some, per_run=(), broadcasts=False, name="model"
-            )
-        return cls(caller, prior, noise)
+            alone, one = _repeatable(one_reading, theta, some), one_reading
+        try:
+            if _nearly_equal(together(theta, some), alone):
+                return cls(together, True, prior, noise)
+        except Exception:  # it takes no arrays
+            pass
+        remembered = lru_cache(max(_BLOCK // len(settings), 1))(one)
+
+        def one_by_one(theta: FloatArray, at: Settings) -> FloatArray:
+            return np.array([remembered(own[: len(names)].tobytes(), at) for own in theta])
+
+        return cls(one_by_one, False, prior, noise)
 
     @cached_property
     def prior(self) -> Prior:
@@ -200,34 +216,50 @@ class InstrumentModel:
         ParameterError
             If a prediction is not finite. What the function itself raises is passed on.
         """
-        names, n = self.own_prior.names, len(settings)
-        at_once = max(_BLOCK // n, 1)
+        at_once = max(_BLOCK // len(settings), 1)
         if len(theta) > at_once:
             return np.concatenate(
                 [self.predict(theta[k : k + at_once], settings) for k in range(0, len(theta), at_once)]
             )
-        samples = {name: theta[:, [k]] for k, name in enumerate(names)}
-        out = self.caller(samples, settings.columns, strict=True)
+        out = self.call(theta, settings)
         if not np.isfinite(out).all():
-            self._raise_own_error(theta, settings, out)
+            sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
+            at = ", ".join(f"{name} = {theta[sample, k]:.10g}" for k, name in enumerate(self.own_prior.names))
+            name = f"the model at {at}, setting {settings[row]}"
+            raise ParameterError(name, float(out[sample, row]), "finite readings")
         return out
-
-    def _raise_own_error(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
-        """Raise the function's own error at the first sample without a finite prediction, else ParameterError."""
-        sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
-        own = {name: theta[[sample], k : k + 1] for k, name in enumerate(self.own_prior.names)}
-        self.caller(own, settings.columns, strict=True)
-        at = ", ".join(f"{name} = {theta[sample, k]:.10g}" for k, name in enumerate(self.own_prior.names))
-        raise ParameterError(f"the model at {at}, setting {settings[row]}", float(out[sample, row]), "finite readings")
 
     def scale(self, theta: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the sd of the noise of each prediction, (n_samples, n_settings)."""
         return self.noise.scale(predicted, theta[:, -1] if self.noise.is_sd_inferred else None)
 
-    def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
-        """Return the log density of readings, one per setting, (n_settings,), under theta: (n_samples, n_settings)."""
-        predicted = self.predict(theta, settings)
-        return self.noise.log_density(readings, predicted, self.scale(theta, predicted))
+
+def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Call a user's function; ShapeError unless its readings broadcast to `shape`, with as many axes."""
+    with np.errstate(all="ignore"):
+        out = np.asarray(function(parameters, settings), dtype=np.float64)
+    if out.ndim != len(shape) or any(have not in (1, want) for have, want in zip(out.shape, shape, strict=True)):
+        raise ShapeError(f"model returns an array of shape {out.shape}; allowed: {shape}, one number for each setting")
+    return out if out.shape == shape else np.array(np.broadcast_to(out, shape))
+
+
+def _repeatable(one: Callable[[bytes, Settings], FloatArray], theta: FloatArray, at: Settings) -> FloatArray:
+    """Return the readings, (n_samples, n_settings), of calls for one sample; ParameterError if they are of no use."""
+    alone = np.array([one(own.tobytes(), at) for own in theta])
+    sound = np.isfinite(alone).any(axis=1)
+    if not sound.any():
+        found = f"not finite at any of the {sound.size} points of the prior that were tried"
+        raise ParameterError("model", found, "finite readings: look for divisions by 0 and priors that are too wide")
+    if not _nearly_equal(one(theta[np.argmax(sound)].tobytes(), at), alone[np.argmax(sound)]):
+        found = "different when it is called again with the same parameters"
+        allowed = "the same readings each time: no random numbers, which `noise` stands for, no state between calls"
+        raise ParameterError("model", found, allowed)
+    return alone
+
+
+def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
+    size = float(np.abs(second[np.isfinite(second)]).max(initial=0.0))
+    return bool(np.allclose(first, second, rtol=_SAME, atol=_SAME * size, equal_nan=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,10 +280,18 @@ class ReadingsProblem:
         """Prior of the model's parameters."""
         return self.model.prior
 
+    def with_reading(self, last: ReadingsProblem) -> ReadingsProblem:
+        """Return the readings with one more; a setting that was read before is not listed again."""
+        same = np.all([c == last.settings.columns[n][0] for n, c in self.settings.columns.items()], axis=0)
+        row = int(np.argmax(same)) if same.any() else len(same)
+        settings = self.settings if same.any() else self.settings.joined(last.settings)
+        return replace(
+            self, settings=settings, row=np.append(self.row, row), values=np.append(self.values, last.values)
+        )
+
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
-        at_once = max(_BLOCK // len(self.values), 1)
-        return np.concatenate([self.predict(theta[k : k + at_once]).sum(axis=1) for k in range(0, len(theta), at_once)])
+        return np.asarray(self.predict(theta).sum(axis=1))
 
     def predict(self, theta: FloatArray) -> FloatArray:
         """Return the log density of every reading, (n_samples, n_params) -> (n_samples, n_readings)."""
@@ -269,10 +309,6 @@ class ReadingsProblem:
         if noise.is_sd_inferred:  # wide enough, it explains any reading
             return 0.0
         return float(noise.log_density(last, last, noise.scale(last[None], None)[0])[0] - predicted[:, -1].max())
-
-    def log_density_of_last(self, theta: FloatArray) -> FloatArray:
-        """Return the log density of the last reading, (n_samples, n_params) -> (n_samples,)."""
-        return self.model.log_density(theta, self.settings.take(self.row[-1:]), self.values[-1:])[:, 0]
 
     def p_value_and_worst_reading(self, theta: FloatArray) -> tuple[float, int]:
         """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
@@ -386,7 +422,8 @@ class Inquiry(ShowsItself):
         again.
         """
         if self._utility is None:
-            self._utility = self._utility_for_weights(self.posterior.weight) / self._costs_s(self._last_setting)
+            everywhere = np.arange(len(self._settings))
+            self._utility = self._utility_of(self._hypotheses, everywhere) / self._costs_s(self._last_setting)
             self._utility.flags.writeable = False
         return self._utility
 
@@ -428,10 +465,12 @@ class Inquiry(ShowsItself):
 
     @own_arithmetic
     def next(self) -> Any:
-        """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random."""
+        """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random.
+
+        Of more than 64 settings, it is the best of the 32 that a rougher estimate ranks highest.
+        """
         if self._next is None:
-            row = choose(self.utility, np.ones(len(self._settings), dtype=np.bool_), rng=self._rng)
-            self._next = self._settings[row]
+            self._next = self._settings[self._best_row()]
         return self._next
 
     @own_arithmetic
@@ -461,11 +500,12 @@ class Inquiry(ShowsItself):
             )
             raise ParameterError("setting", None, way_out)
         at = self._settings.checked_setting(self._next if setting is None else setting)
-        readings = _append_reading(self._readings, self._model, at, value)
-        of_prior = self._prior_log_likelihood + readings.log_density_of_last(self._prior_theta)
-        by_prior = float(logsumexp(of_prior)) - math.log(self._n_samples)
+        last = ReadingsProblem(self._model, at, np.array([0]), np.array([value]))
+        readings = last if self._readings is None else self._readings.with_reading(last)
+        of_prior = self._prior_log_likelihood + last.predict(self._prior_theta)[:, 0]
+        by_prior = float(np.logaddexp.reduce(of_prior)) - math.log(self._n_samples)
         search = partial(nested_sampling_from_scratch, readings, n_live=self._n_live, rng=self._rng)
-        found = update(self._particles, readings, rng=self._rng, fall_back=search, effort=STEADY)
+        found = update(self._particles, readings, rng=self._rng, fall_back=search, effort=LIGHT)
         # Samples of the prior that explain the readings better than the posterior does lie in a part that it has lost.
         if found.weighted.run is None and by_prior - found.log_z > _LOST_NATS + self._lost_nats:
             found = particles_from_run(search(), self._n_samples, readings, n_calls=0, rng=self._rng)
@@ -474,7 +514,8 @@ class Inquiry(ShowsItself):
         self._particles, self._prior_log_likelihood = found, of_prior
         self._readings = readings
         self._taken.append((at[0], value))
-        self._utility, self._next = None, None
+        self._utility = self._next = None
+        self.__dict__.pop("_hypotheses", None)
 
     @own_arithmetic
     def several(self, n: int) -> list[Any]:
@@ -486,8 +527,8 @@ class Inquiry(ShowsItself):
         ParameterError if `n` is below 1.
         """
         checked_whole("n", n)
-        everywhere = np.ones(len(self._settings), dtype=np.bool_)
-        rows = [choose(self.utility, everywhere, rng=self._rng)]
+        rows = [self._choose(self.utility)]
+        everywhere = np.arange(len(self._settings))
         theta, noise = self.posterior.theta, self._model.noise
         weights = [self.posterior.weight] * _N_IMAGINED
         while len(rows) < n:
@@ -499,8 +540,8 @@ class Inquiry(ShowsItself):
                 log_density = noise.log_density(imagined, predicted, scale)[:, 0]
                 weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
             cost_s = self._costs_s(self._settings[rows[-1]])
-            utility = np.mean([self._utility_for_weights(weight) for weight in weights], axis=0) / cost_s
-            rows.append(choose(utility, everywhere, rng=self._rng))
+            each = [self._utility_of(self._draw_hypotheses(weight), everywhere) for weight in weights]
+            rows.append(self._choose(np.mean(each, axis=0) / cost_s))
         return [self._settings[row] for row in rows]
 
     @own_arithmetic
@@ -530,21 +571,53 @@ class Inquiry(ShowsItself):
         """Whether the goal is not reached yet, but every sd is within three times its goal."""
         return bool(self._goal) and 1.0 < self._largest_sd_over_goal < _NEAR_GOAL
 
-    def _utility_for_weights(self, weight: FloatArray) -> FloatArray:
-        """Compute the acquisition function per reading, (n_settings,), for the posterior samples with these weights."""
-        n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
-        theta = self.posterior.theta[resampled_rows(weight, n, self._rng)]
-        theta = theta[self._rng.permutation(n)]  # copies of one sample apart
-        predicted = self._model.predict(theta, self._settings)
-        even = np.full(n, 1.0 / n)
-        given = readings_given_noise(predicted, self._model.scale(theta, predicted), even, self._model.noise)
+    @cached_property
+    def _hypotheses(self) -> FloatArray:
+        """Equally weighted posterior samples that value the settings until the next reading, (n, n_params)."""
+        return self._draw_hypotheses(self.posterior.weight)
+
+    def _draw_hypotheses(self, weight: FloatArray) -> FloatArray:
+        """Draw equally weighted samples from those of the posterior with these weights, copies of one sample apart."""
+        n = _N_ASKED if self._model.broadcasts else _FEWER_ASKED
+        rows: IntArray = self._rng.permutation(resampled_rows(weight, n, self._rng))
+        return np.asarray(self.posterior.theta[rows])
+
+    def _best_row(self) -> int:
+        """Choose the index of the best setting: of many, of those that a rougher estimate ranks highest."""
+        theta, settings, cost_s = self._hypotheses, self._settings, self._costs_s(self._last_setting)
+        if self._utility is not None or len(settings) <= _FEW_SETTINGS or not self._model.broadcasts:
+            return self._choose(self.utility)
+        if self._is_near_goal:  # where settings differ little, all hypotheses count
+            predicted = self._model.predict(theta, settings)
+            values, goal = self._values_and_goals(theta)
+            above = gaussian_nats_above_goal(predicted, self._model.scale(theta, predicted), values, goal)
+            rough = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum() - above
+        else:
+            rough = self._utility_of(theta[:_N_ROUGH], np.arange(len(settings)), n_levels=_N_ROUGH)
+        rows = np.sort(np.argpartition(-rough / cost_s, _N_BEST)[:_N_BEST])
+        fine = self._utility_of(theta, rows) / np.broadcast_to(cost_s, rough.shape)[rows]
+        return int(rows[self._choose(fine)])
+
+    def _values_and_goals(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the columns of theta that have a goal, (n, n_values), and their goals, (n_values,)."""
+        return theta[:, [self.posterior.names.index(name) for name in self._goal]], np.array([*self._goal.values()])
+
+    def _utility_of(self, theta: FloatArray, rows: IntArray, **levels: int) -> FloatArray:
+        """Compute the acquisition function per reading at the settings `rows`, (n,), for equally weighted samples."""
+        predicted = self._model.predict(theta, self._settings.take(rows))
+        even = np.full(len(theta), 1.0 / len(theta))
+        given = readings_given_noise(predicted, self._model.scale(theta, predicted), even, self._model.noise, **levels)
         if self._is_near_goal:
-            values, goal = theta[:, [self.posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
+            values, goal = self._values_and_goals(theta)
             now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
-            fall = np.asarray(now - expected_nats_above_goal(given, values, np.array(goal)))
+            fall = np.asarray(now - expected_nats_above_goal(given, values, goal))
             if fall.max() > 0.0:  # else most readings lead to the goal, but a few far away from it
                 return fall
         return given.information_bits
+
+    def _choose(self, utility: FloatArray) -> int:
+        """Draw the index of a setting at random among the best."""
+        return int(self._rng.choice(np.flatnonzero(utility >= utility.max() - _TIE)))
 
     @property
     def _last_setting(self) -> Any:
@@ -579,18 +652,3 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
             raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
         require(checked_finite_number(f"goal[{name!r}]", sd) > 0, f"goal[{name!r}]", sd, "greater than 0")
     return dict(goal)
-
-
-def _append_reading(
-    readings: ReadingsProblem | None, model: InstrumentModel, at: Settings, value: float
-) -> ReadingsProblem:
-    """Return the readings with one more; a setting that was read before is not listed again."""
-    if readings is None:
-        return ReadingsProblem(model, at, np.array([0]), np.array([value]))
-    known = readings.settings
-    same = np.ones(len(known), dtype=np.bool_)
-    for name, column in known.columns.items():
-        same &= column == at.columns[name][0]
-    row = int(np.argmax(same)) if same.any() else len(known)
-    settings = known if same.any() else known.joined(at)
-    return ReadingsProblem(model, settings, np.append(readings.row, row), np.append(readings.values, value))

@@ -20,20 +20,17 @@ from probewise.effects import Known
 from probewise.errors import ParameterError
 from probewise.inquiry.forecast import (
     MOST_ASKED,
-    MOST_LEVELS,
     DirectForecast,
     Forecast,
     PredictiveDistributions,
     cards_of,
     footprint_share_by_card,
-    nearest_level_index,
     predict_where_visible,
     resampled_rows_and_weights,
     rows_by_combination,
-    weight_by_level,
 )
 from probewise.inquiry.grid import Designs, Grid
-from probewise.inquiry.readout import evenly_spaced_levels
+from probewise.inquiry.readout import MOST_LEVELS, evenly_spaced_levels, nearest_level_index, weight_by_level
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.scene.scenes import mean_albedo_with_cards

@@ -63,11 +63,6 @@ class UtilityMap:
         values = self.values[self.reachable]
         return bool(np.ptp(values) <= FLAT and (len(values) > 1 or values[0] <= FLAT))
 
-    @property
-    def best_mask(self) -> BoolArray:
-        """Mask of the reachable designs with the largest utility, ties included, shape (n_designs,)."""
-        return best_places_mask(self.values, self.reachable)
-
 
 def entropy_map(
     model: SensorModel, theta: FloatArray, grid: Grid, plan: Plan, *, reachable: BoolArray, bin_width: float = 1.0

@@ -11,16 +11,13 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Designs
-from probewise.inquiry.readout import evenly_spaced_levels
+from probewise.inquiry.readout import MOST_LEVELS, evenly_spaced_levels, weight_by_level
 from probewise.recordings.plan import Plan
 from probewise.scene import Card, CardedScene, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import RegionsAndPoses, response
 from probewise.sensor.commanded import has_commanded_height_or_led
 from probewise.sensor.stages import Poses, SensorModel
-
-MOST_LEVELS = 1000
-"""Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
 MOST_ASKED = 400  # hypotheses predicted directly
@@ -96,19 +93,6 @@ class DirectForecast:
                 yield at, weight_by_level(index[:, at], weight[chosen] * stands_for, len(levels))
 
         return PredictiveDistributions(levels, level_weights)
-
-
-def nearest_level_index(answers: FloatArray, levels: FloatArray) -> IntArray:
-    """Return the index of the nearest of evenly spaced levels to each prediction, of the same shape."""
-    return np.asarray(np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
-
-
-def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
-    """Sum the weights, (n,), of hypotheses that predict each level, index (n, n_designs) -> (n_designs, n_levels)."""
-    n_designs = index.shape[1]
-    key = index + np.arange(n_designs) * n_levels
-    counted = np.bincount(key.ravel(), np.repeat(weight, n_designs), minlength=n_designs * n_levels)
-    return np.asarray(counted.reshape(n_designs, n_levels), dtype=np.float64)
 
 
 def rows_by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:

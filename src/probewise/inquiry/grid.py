@@ -64,17 +64,7 @@ class Grid:
         Each place is a scan of its own, because they are alternatives and not a sequence: effects of the order of
         readings must not act between them.
         """
-        n = self.n_places
-        return Plan(
-            x_mm=self.places_mm[:, 0],
-            y_mm=self.places_mm[:, 1],
-            orientation_rad=np.full(n, orientation_rad),
-            time_s=np.full(n, time_s),
-            scan=np.arange(n),
-            scan_names=tuple(str(k) for k in range(n)),
-            pattern=np.zeros(n, dtype=np.int64),
-            pattern_names=(pattern_name,),
-        )
+        return Designs(self, (orientation_rad,)).plan(pattern_name, time_s=time_s)
 
 
 @dataclass(frozen=True)
@@ -154,11 +144,15 @@ class Designs:
     def _plan_without_time(self) -> Plan:
         """The plan of all designs with time 0 and pattern name "", cached because it has thousands of scan names."""
         n_places, n_designs, combinations = self.grid.n_places, len(self), self.setting_combinations
-        return replace(
-            self.grid.plan("").take(np.tile(np.arange(n_places), len(combinations))),
+        return Plan(
+            x_mm=np.tile(self.grid.places_mm[:, 0], len(combinations)),
+            y_mm=np.tile(self.grid.places_mm[:, 1], len(combinations)),
             orientation_rad=np.repeat([c.orientation_rad for c in combinations], n_places),
+            time_s=np.zeros(n_designs),
             scan=np.arange(n_designs),
             scan_names=tuple(str(k) for k in range(n_designs)),
+            pattern=np.zeros(n_designs, dtype=np.int64),
+            pattern_names=("",),
             covariates={
                 name: np.repeat([dict(c.settings)[name] for c in combinations], n_places) for name, _ in self.settings
             },

@@ -1,6 +1,6 @@
 """The noise of a reading, and the weights of a posterior's samples given each possible reading of any setting.
 
-The same weights serve the robot (`utilities.WeightsGivenReading`): from them follow the expected information of a
+The same weights serve the robot (`WeightsGivenReading`): from them follow the expected information of a
 reading, and the expected distance of posterior sds from a goal.
 """
 
@@ -9,15 +9,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from functools import cached_property
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from scipy.special import gammaln, ndtr, stdtr
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import checked_number
 from probewise.errors import ParameterError, ShapeError, require
-from probewise.inquiry.utilities import WeightsGivenReading
+from probewise.inquiry.readout import (
+    MOST_LEVELS,
+    Readout,
+    entropy_bits,
+    evenly_spaced_levels,
+    nearest_level_index,
+    weight_by_level,
+)
 from probewise.priors import Marginal
 
 AnyNoise: TypeAlias = "float | Callable[[FloatArray], Any] | Marginal | ReadingNoise"
@@ -25,13 +33,16 @@ _ALLOWED_SD = (
     "a number greater than 0, a function of the predicted reading, or, where it is unknown, its prior, such as "
     "LogUniform(0.1, 10.0)"
 )
+_PER_SD = 2.0  # levels of the predicted reading per noise sd, given a reading
+_LEAST = 1e-12
 _LOG_2PI = math.log(2 * math.pi)
 _N_LEVELS = 256  # of a reading without noise: near a goal they are finer than a sample's error
-_N_SDS, _N_LEVELS_EACH = 8, 128  # where the sd of the noise is unknown
+_N_SDS = 8  # groups of samples where the sd of the noise is unknown
 _CELL = 0.4  # sds: wide as a cell of a reading, which loses 1.3 % of a small information
 _REACH = 5.0  # sds beyond the levels that the cells cover
 _NARROWEST = 1e-6  # sds, for predictions that are all alike
 _LEAST_SHARE = 1e-9  # of a goal's variance
+_BELOW = 0.01  # weight of nats below a goal
 _OUTERMOST = 0.01  # of the outliers' range, at each end: a tail is not smaller
 
 
@@ -83,7 +94,7 @@ class ReadingNoise:
         """Build the noise from a sd, a function of the prediction, the prior of a sd, or a ReadingNoise."""
         return given if isinstance(given, ReadingNoise) else cls(given)
 
-    @property
+    @cached_property
     def is_sd_inferred(self) -> bool:
         """Whether the sd is unknown: a parameter with a prior."""
         return isinstance(self.sd, Marginal)
@@ -175,14 +186,82 @@ def _is_range(value: Any) -> bool:
         return False
 
 
+@dataclass(frozen=True, eq=False)
+class WeightsGivenReading:
+    """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
+
+    A cell is a range of readings recorded as one. Hypotheses with nearly equal predictions are summed first, so that
+    the noise is applied to some hundred levels instead of every hypothesis: `index` is the level that each predicts,
+    (n, n_designs), `weight` its weight, (n,), `chance` the probability of each cell given each level, (n_levels,
+    n_cells).
+    """
+
+    index: IntArray
+    weight: FloatArray
+    chance: FloatArray
+
+    @classmethod
+    def of(
+        cls, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
+    ) -> Self:
+        """Build from predicted readings, (n, n_designs), and the weights of the hypotheses, (n,).
+
+        `fine`: width of a cell in noise sds, if readings are not rounded; `repeats`: number of readings at each design,
+        of which the mean counts.
+        """
+        sd = readout.noise_sd / math.sqrt(repeats)
+        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
+        chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
+        return cls(nearest_level_index(answers, levels), weight, chance)
+
+    @cached_property
+    def weight_by_cell(self) -> FloatArray:
+        """Total weight in each cell, (n_designs, n_cells); never 0."""
+        return np.maximum(self._weight_by_level @ self.chance, _LEAST)
+
+    @cached_property
+    def information_bits(self) -> FloatArray:
+        """Expected information about the hypotheses, whose weights sum to one, in bits, (n_designs,)."""
+        of_noise = self._weight_by_level @ entropy_bits(self.chance)
+        return np.asarray(np.maximum(entropy_bits(self.weight_by_cell) - of_noise, 0.0))
+
+    @cached_property
+    def _weight_by_level(self) -> FloatArray:
+        """Total weight of the hypotheses at each level, (n_designs, n_levels)."""
+        return weight_by_level(self.index, self.weight, len(self.chance))
+
+    def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
+        """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
+        return np.asarray(weight_by_level(self.index, self.weight * values, len(self.chance)) @ self.chance)
+
+    def probability_of_knowing(
+        self, lengths: FloatArray, sd: float, *, off: float = math.inf, most_off: float = 1.0
+    ) -> FloatArray:
+        """Return the probability, (n_designs,), that after the reading all lengths, (n, n_lengths), are known to `sd`.
+
+        And that the probability of a length more than `off` from its mean is below `most_off`. The lengths are those
+        of each hypothesis, best less their means, so that no digits are lost.
+        """
+        weight, means = self.weight_by_cell, []
+        ends = np.ones(weight.shape, dtype=np.bool_)
+        for length in lengths.T:
+            means.append(self.weighted_sum_by_cell(length) / weight)
+            ends &= self.weighted_sum_by_cell(length**2) / weight - means[-1] ** 2 < sd**2
+        for design in np.flatnonzero(ends.any(axis=1)) if math.isfinite(off) else ():
+            apart = np.abs(lengths[:, :, None] - np.array(means)[:, design]) > off
+            joint = self.weight[:, None] * self.chance[self.index[:, design]]
+            ends[design] &= np.where(apart.any(axis=1), joint, 0.0).sum(axis=0) < most_off * weight[design]
+        return np.asarray((weight * ends).sum(axis=1) / weight.sum(axis=1))
+
+
 def readings_given_noise(
-    predicted: FloatArray, scale: FloatArray, weight: FloatArray, noise: ReadingNoise
+    predicted: FloatArray, scale: FloatArray, weight: FloatArray, noise: ReadingNoise, *, n_levels: int = _N_LEVELS
 ) -> WeightsGivenReading:
     """Return the weights of samples given each possible reading at each setting.
 
     `predicted`, `scale`: predicted readings and sds of their noise, (n_samples, n_settings). Predictions count for the
-    nearest of some hundred levels, which are as far apart in sds of the noise everywhere. Where the sd is unknown,
-    samples of similar sds have levels of their own.
+    nearest of `n_levels` levels, which are as far apart in sds of the noise everywhere. Where the sd is unknown,
+    samples of similar sds have levels of their own, half as many.
     """
     low, high = float(predicted.min()), float(predicted.max())
     high = max(high, low + _NARROWEST * float(scale.min()), float(np.nextafter(low, np.inf)))
@@ -191,20 +270,21 @@ def readings_given_noise(
         group = np.empty(n, dtype=np.int64)
         group[order] = np.arange(n) * _N_SDS // n
         sds = np.array([math.sqrt(float((scale[group == k, 0] ** 2).mean())) for k in np.unique(group)])
-        levels = np.linspace(low, high, _N_LEVELS_EACH)
+        levels = np.linspace(low, high, n_levels // 2)
         index = np.rint((predicted - low) * ((len(levels) - 1) / (high - low))).astype(np.int64)
         index += group[:, None] * len(levels)
         level, sd = np.tile(levels, len(sds)), np.repeat(sds, len(levels))
-        inner = np.linspace(low, high, _n_cells((high - low) / sds[0]) + 1)
+        inner = np.linspace(low, high, _n_cells((high - low) / sds[0], n_levels) + 1)
         ends = np.sort(sds), np.sort(sds)
     else:
-        at = np.linspace(low, high, _N_LEVELS if callable(noise.sd) else 2)
+        at = np.linspace(low, high, n_levels if callable(noise.sd) else 2)
         per_sd = 1.0 / noise.scale(at[None], None)[0]
         sds_below = np.concatenate([[0.0], np.cumsum(0.5 * (per_sd[1:] + per_sd[:-1]) * np.diff(at))])
-        index = np.rint(np.interp(predicted, at, sds_below) * ((_N_LEVELS - 1) / sds_below[-1])).astype(np.int64)
-        level = np.interp(np.linspace(0.0, sds_below[-1], _N_LEVELS), sds_below, at)
+        sds = np.interp(predicted, at, sds_below) if callable(noise.sd) else (predicted - low) * per_sd[0]
+        index = np.rint(sds * ((n_levels - 1) / sds_below[-1])).astype(np.int64)
+        level = np.interp(np.linspace(0.0, sds_below[-1], n_levels), sds_below, at)
         sd = noise.scale(level[None], None)[0]
-        inner = np.interp(np.linspace(0.0, sds_below[-1], _n_cells(sds_below[-1]) + 1), sds_below, at)
+        inner = np.interp(np.linspace(0.0, sds_below[-1], _n_cells(sds_below[-1], n_levels) + 1), sds_below, at)
         ends = sd[:1], sd[-1:]
     below, above = low, high
     lower, upper = list[FloatArray](), list[FloatArray]()
@@ -214,11 +294,11 @@ def readings_given_noise(
         below, above = min(below, low - _REACH * far_low), max(above, high + _REACH * far_high)
     edges = np.unique(np.concatenate([*lower, inner, *upper]))
     chance = np.diff(noise.cdf(edges, level[:, None], sd[:, None]), axis=1, prepend=0.0, append=1.0)
-    return WeightsGivenReading.from_levels(index, weight, np.maximum(chance, 0.0))
+    return WeightsGivenReading(index, weight, np.maximum(chance, 0.0))
 
 
-def _n_cells(width_sds: float) -> int:
-    return int(min(max(math.ceil(width_sds / _CELL), 1), _N_LEVELS))
+def _n_cells(width_sds: float, most: int) -> int:
+    return int(min(max(math.ceil(width_sds / _CELL), 1), most))
 
 
 def expected_nats_above_goal(given: WeightsGivenReading, values: FloatArray, goal: FloatArray) -> FloatArray:
@@ -234,3 +314,20 @@ def expected_nats_above_goal(given: WeightsGivenReading, values: FloatArray, goa
         variance = given.weighted_sum_by_cell(value**2) / weight - mean**2
         far += np.maximum(0.5 * np.log(np.maximum(variance, _LEAST_SHARE * sd**2)) - math.log(sd), 0.0)
     return np.asarray((weight * far).sum(axis=1) / weight.sum(axis=1))
+
+
+def gaussian_nats_above_goal(
+    predicted: FloatArray, scale: FloatArray, values: FloatArray, goal: FloatArray
+) -> FloatArray:
+    """Return `expected_nats_above_goal`, (n_settings,), as if predictions and values were jointly Gaussian.
+
+    `predicted`, `scale`: predictions and sds of their noise, (n_samples, n_settings), of equally weighted samples. An
+    sd below its goal counts a hundredth, which ranks settings that all reach it.
+    """
+    values, away = values - values.mean(axis=0), predicted - predicted.mean(axis=0)
+    total = (away**2).mean(axis=0) + (scale**2).mean(axis=0)
+    fallen = (values.T @ away / len(away)) ** 2 / total
+    left = (values**2).mean(axis=0)[:, None] - fallen
+    least = _LEAST_SHARE * goal[:, None] ** 2
+    far = 0.5 * np.log(np.maximum(left, least) / goal[:, None] ** 2)
+    return np.asarray(np.where(far > 0.0, far, _BELOW * far).sum(axis=0))

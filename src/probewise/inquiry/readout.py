@@ -6,12 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import ndtr
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, require
 from probewise.priors import Prior
+
+MOST_LEVELS = 1000
+"""Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 
 _REACH = 5.0  # noise sds beyond the levels that the cells cover
 _FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
@@ -21,6 +23,7 @@ _LEAST = np.float32(1e-30)
 _PER_SD = 4.0  # levels per noise sd, for the capacity
 _MOST_ROUNDS = 2000
 _CLOSE_BITS = 1e-4
+_N_OF_PRIOR = 20_000
 
 
 def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
@@ -31,6 +34,19 @@ def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int |
     low, high = min(low, high), max(low, high)
     n = max(2, int(np.ceil((high - low) / spacing)) + 1)
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
+
+
+def nearest_level_index(answers: FloatArray, levels: FloatArray) -> IntArray:
+    """Return the index of the nearest of evenly spaced levels to each prediction, of the same shape."""
+    return np.asarray(np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
+
+
+def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
+    """Sum the weights, (n,), of hypotheses that predict each level, index (n, n_designs) -> (n_designs, n_levels)."""
+    n_designs = index.shape[1]
+    key = index + np.arange(n_designs) * n_levels
+    counted = np.bincount(key.ravel(), np.repeat(weight, n_designs), minlength=n_designs * n_levels)
+    return np.asarray(counted.reshape(n_designs, n_levels), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -97,28 +113,19 @@ class Readout:
         if repeats > 1 and self.step is not None and self.noise_sd < _WIDE * self.step:
             n_sums = repeats * len(self.cell_edges(levels)) + 1
             if n_sums <= _MOST_SUMS:
-                return _merged(_probability_of_sum(self.cell_probability(levels), repeats), most)
+                from scipy.fft import irfft, next_fast_len, rfft  # slow to import, and few need it
+
+                size = next_fast_len(n_sums, real=True)
+                spectrum = rfft(self.cell_probability(levels), size, axis=1)
+                of_sum = np.maximum(irfft(spectrum**repeats, size, axis=1)[:, :n_sums], 0.0)
+                if most is None or n_sums <= most:
+                    return of_sum
+                return np.asarray(np.add.reduceat(of_sum, np.arange(0, n_sums, math.ceil(n_sums / most)), axis=1))
         sd = self.noise_sd / math.sqrt(repeats)
         each = self if repeats == 1 else Readout(sd, self.step and self.step / repeats, self.low, self.high)
         below = ndtr((each.cell_edges(levels, fine=fine, most=most) - levels[:, None]) / sd)
         ends = np.zeros((len(levels), 1)), np.ones((len(levels), 1))
         return np.diff(np.concatenate([ends[0], below, ends[1]], axis=1), axis=1)
-
-
-def _probability_of_sum(probability: FloatArray, n: int) -> FloatArray:
-    """Return the probability of the sum of `n` numbers, drawn alike: (n_levels, n_cells) -> (n_levels, n_sums)."""
-    n_sums = n * (probability.shape[1] - 1) + 1
-    size = next_fast_len(n_sums, real=True)
-    spectrum = rfft(probability, size, axis=1)
-    return np.maximum(irfft(spectrum**n, size, axis=1)[:, :n_sums], 0.0)
-
-
-def _merged(probability: FloatArray, most: int | None) -> FloatArray:
-    """Merge neighbouring cells to at most `most`, (n_levels, n_cells); None: all as they are."""
-    n_cells = probability.shape[1]
-    if most is None or n_cells <= most:
-        return probability
-    return np.asarray(np.add.reduceat(probability, np.arange(0, n_cells, math.ceil(n_cells / most)), axis=1))
 
 
 def entropy_bits(probability: FloatArray) -> FloatArray:
@@ -139,69 +146,10 @@ def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, p
     return (information + float(weight @ log_prior)) / math.log(2) + prior_entropy_bits
 
 
-def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20_000) -> float:
-    """Return the differential entropy of a prior in bits: minus the mean log2 density of `n_samples` draws."""
-    theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
+def prior_entropy(prior: Prior, *, rng: np.random.Generator) -> float:
+    """Return the differential entropy of a prior in bits: minus the mean log2 density of 20,000 draws."""
+    theta = prior.from_unit_cube(rng.random((_N_OF_PRIOR, len(prior.names))))
     return -float(np.mean(prior.log_prob(theta))) / math.log(2)
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Lower bound on the mean number of readings, for search and refinement separately.
-
-    Attributes
-    ----------
-    search_bits, refinement_bits
-        Bits needed until the first reading on the shape, and from there to the target.
-    search_capacity_bits, capacity_bits
-        Capacity of one reading: before the shape is found, that of a yes or no with the largest possible probability of
-        yes; afterwards, that of the sensor.
-    """
-
-    search_bits: float
-    refinement_bits: float
-    search_capacity_bits: float
-    capacity_bits: float
-
-    @property
-    def readings_of_search(self) -> float:
-        """Number of readings until the shape is found."""
-        return self.search_bits / self.search_capacity_bits
-
-    @property
-    def readings_of_refinement(self) -> float:
-        """Number of readings from there until the target precision."""
-        return self.refinement_bits / self.capacity_bits
-
-    @property
-    def readings(self) -> float:
-        """Total number of readings."""
-        return self.readings_of_search + self.readings_of_refinement
-
-
-def fewest_readings(
-    prior_bits: float, met_bits: float, target_bits: float, *, most_covered: float, capacity: float
-) -> Bound:
-    """Bound the mean number of readings of any strategy.
-
-    `prior_bits`, `met_bits` and `target_bits` are differential entropies of the parameters: under the prior, at the
-    first reading on the shape (on average), and at the target (`target_entropy`), in descending order. `most_covered`
-    is the probability, above 0 and below 1, that the best first place lies on the shape: a search reading answers yes
-    or no, with at most this probability of yes as long as no better place arises. ParameterError for other numbers.
-    """
-    require(0 < most_covered < 1, "most_covered", most_covered, "greater than 0, less than 1")
-    if not prior_bits >= met_bits >= target_bits:
-        raise ParameterError(
-            "(prior_bits, met_bits, target_bits)", (prior_bits, met_bits, target_bits), "in descending order"
-        )
-    yes = min(most_covered, 0.5)
-    chance = np.array([yes, 1.0 - yes])
-    return Bound(prior_bits - met_bits, met_bits - target_bits, float(entropy_bits(chance)), capacity)
-
-
-def target_entropy(n_params: int, sd: float) -> float:
-    """Return the largest differential entropy in bits of parameters with a given sd: that of independent Gaussians."""
-    return n_params * 0.5 * math.log2(2 * math.pi * math.e * sd**2)
 
 
 def capacity_bits(low: float, high: float, readout: Readout) -> float:

@@ -19,7 +19,6 @@ from functools import cache
 from typing import Any, Protocol, Self
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
@@ -52,6 +51,7 @@ _SMALLEST = 1e-100  # spread of a coordinate that is zero in all points, whose s
 _BLOCK = 256  # points per batch, to fit the cache
 _DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 _FEW = 600  # points up to which all distances are faster than a tree
+_FEW_ROWS, _FEW_FOR_FEW_ROWS = 60, 10_000  # and points up to which they are from that few of them
 
 
 class SequentialProblem(Protocol):
@@ -96,6 +96,7 @@ class UpdateSettings:
 THOROUGH = UpdateSettings(1.5, _MOST_KERNELS, 0.5, math.inf)
 STEADY = UpdateSettings(1.2, 120, 0.4, 12)
 BRIEF = UpdateSettings(1.0, 75, 0.3, 10)
+LIGHT = UpdateSettings(1.2, 40, 0.3, 12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +119,9 @@ class Particles:
     hurried
         Whether, since that start, a reading needed four temperatures or more: then few samples were near the new
         posterior, and the product of mean weights is nearly always too small.
-    searched_at
-        Number of readings at the last search of the prior; -inf if there was none.
+    lost_log_z
+        Upper bound on the log evidence of a mode that the samples lack: at the last search of the prior it had less
+        than one sample, and it may have given every reading since exactly. Infinite if there was no search.
     asleep
         Whether the samples are those of fewer readings, and the evidence an upper bound: see `asleep_with`.
     """
@@ -130,7 +132,7 @@ class Particles:
     n_resampled: int = 0
     strained: bool = False
     hurried: bool = False
-    searched_at: float = -math.inf
+    lost_log_z: float = math.inf
     asleep: bool = False
 
     def __post_init__(self) -> None:
@@ -160,7 +162,13 @@ class Particles:
 
     def asleep_with(self, log_likelihood: float) -> Self:
         """Return the samples as they are, with the evidence as if they all gave a reading this log likelihood."""
-        return replace(self, weighted=replace(self.weighted, log_z=self.log_z + log_likelihood), asleep=True)
+        lost = self.lost_log_z + log_likelihood
+        had = replace(self.weighted, log_z=self.log_z + log_likelihood)
+        return replace(self, weighted=had, lost_log_z=lost, asleep=True)
+
+    def searched(self, log_z: float) -> Self:
+        """Return the samples as those of a search of the prior that has found this log evidence."""
+        return replace(self, lost_log_z=log_z - math.log(len(self.ancestor)))
 
     def with_zero_evidence(self) -> Self:
         """Return the samples with an evidence of zero: none of them could have given the readings."""
@@ -196,37 +204,35 @@ def update(
     Return as many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
     given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
-    before = previous.weighted
-    n = len(before.theta)
+    before, n = previous.weighted, len(previous.weighted.theta)
     least = effort.least_share * n
     if before.log_z == -math.inf:
         return previous
     predicted = problem.predict(before.theta)
-    strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if problem.least_misfit_nats(predicted) > _SURPRISED:
-        if fall_back is not None:
-            return particles_from_run(fall_back(), n, problem, n_calls=n, rng=rng)
-        strained = True
     now = _EvaluatedSamples(
         before.theta, problem.prior.log_prob(before.theta), *problem.log_likelihoods(predicted, 1.0)
     )
-    log_weight, base = before.log_weight, before.log_likelihood
-    log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
+    log_weight, base, ancestor, strained = (
+        before.log_weight,
+        before.log_likelihood,
+        previous.ancestor,
+        previous.strained,
+    )
+    log_z, variance, n_calls, share, degrees = before.log_z, before.log_z_error**2, n, 0.0, 0
+    stuck = problem.least_misfit_nats(predicted) > _SURPRISED
     while True:
         all_at_once = n_effective(_updated_log_weights(log_weight, now.after, base))
+        given_up = degrees >= effort.most_temperatures
+        stuck |= all_at_once == 0.0 or (given_up and all_at_once < least)
+        if stuck and fall_back is not None:
+            return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
         if all_at_once == 0.0:
-            if fall_back is not None:
-                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
             return replace(previous.with_zero_evidence(), strained=True)
-        given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
-        if given_up and all_at_once < least:
-            if fall_back is not None:
-                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
-            strained = True
+        strained |= stuck
         if all_at_once >= least or given_up:
             share = 1.0
         else:
-            if n_resampled == previous.n_resampled:  # the first temperature: only now the readings before count too
+            if degrees == 0:  # the first temperature: only now the readings before count too
                 now = replace(now, before=problem.log_likelihoods(predicted, share)[0])
             share = _next_power(log_weight, base, now, share, least)
         weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
@@ -239,13 +245,10 @@ def update(
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         parts = _partition_rows(rows) if fall_back is None else [np.arange(n)]
         now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), share, problem, rng, parts, effort)
-        n_calls, n_resampled, ancestor = n_calls + n_moves, n_resampled + 1, ancestor[rows]
-        if accepted < _STIFF:
-            if fall_back is not None:
-                return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
-            strained = True
+        n_calls, degrees, ancestor, stuck = n_calls + n_moves, degrees + 1, ancestor[rows], accepted < _STIFF
         base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
-        if share == 1.0:
+        if share == 1.0 and (fall_back is None or not stuck):
+            strained |= stuck
             break
     found = Weighted(
         before.names,
@@ -258,12 +261,11 @@ def update(
         n_calls=before.n_calls + n_calls,
         pareto_k=pareto_k(log_weight) if n_eff < n else -math.inf,
     )
-    degrees = n_resampled - previous.n_resampled
     return replace(
         previous,
         weighted=found,
         ancestor=ancestor,
-        n_resampled=n_resampled,
+        n_resampled=previous.n_resampled + degrees,
         strained=strained,
         hurried=previous.hurried or degrees >= _MANY_DEGREES,
     )
@@ -286,12 +288,13 @@ def resample_and_move(
         return particles
     rows = resampled_rows(had.weight, n, rng)
     log_likelihood = had.log_likelihood[rows]
-    moved = _EvaluatedSamples(
+    start = _EvaluatedSamples(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), log_likelihood, log_likelihood.copy()
     )
-    moved, _, n_moves = _move_by_metropolis(moved, 1.0, problem, rng, [np.arange(n)], effort)
-    found = replace(_replace_samples(had, moved), n_calls=had.n_calls + n_moves)
-    return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
+    found = _moved_apart(start, had, problem, n_calls=had.n_calls, run=had.run, rng=rng, effort=effort)
+    lost, n_resampled = max(particles.lost_log_z, had.log_z - math.log(n)), particles.n_resampled + 1
+    ancestor = particles.ancestor[rows]
+    return replace(particles, weighted=found, ancestor=ancestor, n_resampled=n_resampled, lost_log_z=lost)
 
 
 def particles_from_posterior(
@@ -299,9 +302,40 @@ def particles_from_posterior(
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     start = _EvaluatedSamples.of(found.theta[resampled_rows(found.weight, n, rng)], problem, 1.0)
-    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(n)], effort)
-    drawn = replace(_replace_samples(found, moved), n_calls=found.n_calls + n + n_moves)
+    drawn = _moved_apart(start, found, problem, n_calls=found.n_calls + n, run=found.run, rng=rng, effort=effort)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
+
+
+def particles_from_run(
+    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
+) -> Particles:
+    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
+    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
+    drawn = _moved_apart(start, run, problem, n_calls=n_calls + run.n_calls + n, run=run, rng=rng, effort=THOROUGH)
+    return Particles(drawn, np.arange(n), run.log_z_error**2)
+
+
+def _moved_apart(
+    start: _EvaluatedSamples,
+    found: Weighted | NestedResult,
+    problem: SequentialProblem,
+    *,
+    n_calls: int,
+    run: NestedResult | None,
+    rng: np.random.Generator,
+    effort: UpdateSettings,
+) -> Weighted:
+    """Move samples, some of them copies; return them equally weighted, with the evidence of `found`."""
+    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(len(start.theta))], effort)
+    return evenly_weighted(
+        found.names,
+        moved.theta,
+        moved.after,
+        log_z=found.log_z,
+        log_z_error=found.log_z_error,
+        n_calls=n_calls + n_moves,
+        run=run,
+    )
 
 
 def nested_sampling_from_scratch(
@@ -316,37 +350,6 @@ def nested_sampling_from_scratch(
         stop=RemainingEvidence(_DLOGZ),
         max_cost=1.0,  # speed matters, since the robot waits
         return_interrupted=False,
-    )
-
-
-def particles_from_run(
-    run: NestedResult, n: int, problem: SequentialProblem, *, n_calls: int, rng: np.random.Generator
-) -> Particles:
-    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
-    start = _EvaluatedSamples.of(run.samples(n, rng=rng), problem, 1.0)
-    moved, _, n_moves = _move_by_metropolis(start, 1.0, problem, rng, [np.arange(n)], THOROUGH)
-    drawn = evenly_weighted(
-        run.names,
-        moved.theta,
-        moved.after,
-        log_z=run.log_z,
-        log_z_error=run.log_z_error,
-        n_calls=n_calls + run.n_calls + n + n_moves,
-        run=run,
-    )
-    return Particles(drawn, np.arange(n), run.log_z_error**2)
-
-
-def _replace_samples(posterior: Weighted, samples: _EvaluatedSamples) -> Weighted:
-    """Return a posterior with other samples, equally weighted; the evidence stays."""
-    n = len(samples.theta)
-    return replace(
-        posterior,
-        theta=samples.theta,
-        log_likelihood=samples.after,
-        log_weight=np.full(n, -math.log(n)),
-        n_eff=float(n),
-        pareto_k=-math.inf,
     )
 
 
@@ -504,18 +507,7 @@ class LocalKernels:
         covariance = np.einsum("kni,knj->kij", spread, spread) / n_near
         covariance += _RIDGE * (overall + np.diag(scale**2))
         covariance *= widened**2
-        return cls.from_moments(away[rows], covariance, origin=origin)
-
-    @classmethod
-    def from_moments(cls, centre: FloatArray, covariance: FloatArray, *, origin: FloatArray | None = None) -> Self:
-        """Build from centres, (n_kernels, n_params), and covariances, (n_kernels, n_params, n_params).
-
-        The centres are relative to `origin`; without it, absolute.
-        """
-        if origin is None:
-            origin = np.asarray(centre.mean(axis=0))
-            centre = centre - origin
-        n_params = centre.shape[1]
+        centre = away[rows]
         root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         precision = np.linalg.inv(covariance)
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
@@ -548,7 +540,9 @@ class LocalKernels:
 
 def _nearest_rows(points: FloatArray, rows: IntArray, n: int) -> IntArray:
     """Return the indices, (n_rows, n), of the `n` points nearest to each point of `rows`, itself included; no order."""
-    if len(points) > _FEW:
+    if len(points) > (_FEW if len(rows) > _FEW_ROWS else _FEW_FOR_FEW_ROWS):
+        from scipy.spatial import cKDTree  # slow to import, and few need it
+
         return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
     square = (points**2).sum(axis=1)
     away = square - 2.0 * points[rows] @ points.T  # less the row's own square, the same for all

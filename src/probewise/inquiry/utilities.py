@@ -6,10 +6,10 @@ A `Utility` gives each available design a number from the whole posterior, the d
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -17,22 +17,18 @@ from probewise._arrays import FloatArray, IntArray, require_finite
 from probewise.errors import ParameterError, did_you_mean, require
 from probewise.inquiry.entropy import UtilityMap, choose, label_entropy, map_of_rows
 from probewise.inquiry.forecast import (
-    MOST_LEVELS,
     Forecast,
     PredictiveDistributions,
-    nearest_level_index,
     resampled_rows_and_weights,
-    weight_by_level,
 )
 from probewise.inquiry.grid import Designs
-from probewise.inquiry.readout import Readout, entropy_bits, evenly_spaced_levels
+from probewise.inquiry.predictive import WeightsGivenReading
+from probewise.inquiry.readout import MOST_LEVELS, Readout, entropy_bits
 from probewise.recordings.plan import Plan
 
 _CELL = 0.75  # width of a cell in noise sds, for unrounded readings: loses 2 % of a nat, uniformly
 _SETTLED = 1.0 - 1e-7  # weight of one level from which it counts as certain
 _BLOCK = 512  # designs per batch, to fit the cache
-_PER_SD = 2.0  # levels of the predicted reading per noise sd, given a reading
-_LEAST = 1e-12
 _NEAR = 15.0  # times the target sd: beyond it, no single reading ends a run
 _MOST_ASKED = 800  # hypotheses for the probability of ending a run
 _MOST_DESIGNS = 250  # the best by the other utility
@@ -101,29 +97,22 @@ class UtilityInput:
         noise_sd = self.readout.noise_sd / np.sqrt(max(self.designs.repeats))
         return self.forecast.predictive(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
 
-    def information(self, weight: FloatArray) -> FloatArray:
-        """Return the expected information in bits of a reading at every available design, for weights (n_samples,)."""
-        out = np.empty(len(self.rows))
-        for at, mass in self.predictive.level_weights(weight):
-            chance = self._cell_probability(at)
-            out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
-        return out
+    def information(self, weight: FloatArray, *, with_noise: bool = False) -> FloatArray:
+        """Return the expected information in bits of a reading at every available design, for weights (n_samples,).
 
-    def reading_entropy(self, weight: FloatArray) -> FloatArray:
-        """Return the entropy in bits of the reading at every available design, including noise, rounding and range.
-
-        The weights, (n_samples,), need not sum to one, and may be 0 for some hypotheses.
+        `with_noise`: the whole entropy of the reading, of which noise, rounding and range are not subtracted. The
+        weights need not sum to one, and may be 0 for some hypotheses.
         """
         out = np.empty(len(self.rows))
         for at, mass in self.predictive.level_weights(weight):
-            out[at] = _entropy_of_readings(mass, self._cell_probability(at))
+            n = int(self.designs.n_repeats[self.rows[at[0]]])  # the same for all of them
+            exact = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
+            chance: FloatArray = np.asarray(exact.astype(np.float32))
+            out[at] = _entropy_of_readings(mass, chance)
+            if not with_noise:
+                of_noise = mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1)
+                out[at] = np.maximum(out[at] - of_noise, 0.0)
         return out
-
-    def _cell_probability(self, at: IntArray) -> FloatArray:
-        """Return the probability of each cell given each level, (n_levels, n_cells), at designs of equal repeats."""
-        n = int(self.designs.n_repeats[self.rows[at[0]]])
-        chance = self.readout.cell_probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
-        return np.asarray(chance.astype(np.float32))
 
 
 def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
@@ -138,87 +127,6 @@ def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
         part /= part.sum(axis=1, keepdims=True)
         out[block] = entropy_bits(part @ chance)
     return out
-
-
-def _entropy_of_noise(mass: FloatArray, chance: FloatArray) -> FloatArray:
-    """Return the mean entropy in bits of a reading given its level, for unnormalised weights (n, n_levels): (n,)."""
-    return np.asarray(mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1))
-
-
-class WeightsGivenReading:
-    """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
-
-    A cell is a range of readings recorded as one. Hypotheses with nearly equal predictions are summed first, so that
-    the noise is applied to some hundred levels instead of every hypothesis.
-
-    Parameters
-    ----------
-    answers
-        Predicted readings, (n, n_designs).
-    weight
-        Weights of the hypotheses, (n,).
-    readout
-        The cells of a reading and its noise.
-    fine
-        Width of a cell in noise sds, if readings are not rounded.
-    repeats
-        Number of readings at each design, of which the mean counts.
-    """
-
-    def __init__(
-        self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
-    ) -> None:
-        sd = readout.noise_sd / math.sqrt(repeats)
-        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
-        self._index = nearest_level_index(answers, levels)
-        self._weight = weight
-        self._chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
-
-    @classmethod
-    def from_levels(cls, index: IntArray, weight: FloatArray, chance: FloatArray) -> Self:
-        """Build from the level that each hypothesis predicts, (n, n_designs), and each level's cells' probability."""
-        made = cls.__new__(cls)
-        made._index, made._weight, made._chance = index, weight, chance
-        return made
-
-    @cached_property
-    def weight_by_cell(self) -> FloatArray:
-        """Total weight in each cell, (n_designs, n_cells); never 0."""
-        return np.maximum(self._weight_by_level @ self._chance, _LEAST)
-
-    @cached_property
-    def information_bits(self) -> FloatArray:
-        """Expected information about the hypotheses, whose weights sum to one, in bits, (n_designs,)."""
-        of_noise = self._weight_by_level @ entropy_bits(self._chance)
-        return np.asarray(np.maximum(entropy_bits(self.weight_by_cell) - of_noise, 0.0))
-
-    @cached_property
-    def _weight_by_level(self) -> FloatArray:
-        """Total weight of the hypotheses at each level, (n_designs, n_levels)."""
-        return weight_by_level(self._index, self._weight, len(self._chance))
-
-    def weighted_sum_by_cell(self, values: FloatArray) -> FloatArray:
-        """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
-        return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
-
-    def probability_of_knowing(
-        self, lengths: FloatArray, sd: float, *, off: float = math.inf, most_off: float = 1.0
-    ) -> FloatArray:
-        """Return the probability, (n_designs,), that after the reading all lengths, (n, n_lengths), are known to `sd`.
-
-        And that the probability of a length more than `off` from its mean is below `most_off`. The lengths are those
-        of each hypothesis, best less their means, so that no digits are lost.
-        """
-        weight, means = self.weight_by_cell, []
-        ends = np.ones(weight.shape, dtype=np.bool_)
-        for length in lengths.T:
-            means.append(self.weighted_sum_by_cell(length) / weight)
-            ends &= self.weighted_sum_by_cell(length**2) / weight - means[-1] ** 2 < sd**2
-        for design in np.flatnonzero(ends.any(axis=1)) if math.isfinite(off) else ():
-            apart = np.abs(lengths[:, :, None] - np.array(means)[:, design]) > off
-            joint = self._weight[:, None] * self._chance[self._index[:, design]]
-            ends[design] &= np.where(apart.any(axis=1), joint, 0.0).sum(axis=0) < most_off * weight[design]
-        return np.asarray((weight * ends).sum(axis=1) / weight.sum(axis=1))
 
 
 class Utility(Protocol):
@@ -288,11 +196,11 @@ class InformationAbout:
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Return the bits at every available design, (n,)."""
         labels = self.of(utility_input.names, utility_input.theta, utility_input.weight)
-        bits = utility_input.reading_entropy(utility_input.weight)
+        bits = utility_input.information(utility_input.weight, with_noise=True)
         for value in np.unique(labels):
             weight = np.where(labels == value, utility_input.weight, 0.0)
             if weight.sum() > 0:
-                bits -= weight.sum() * utility_input.reading_entropy(weight)
+                bits -= weight.sum() * utility_input.information(weight, with_noise=True)
         return np.maximum(bits, 0.0)
 
 
@@ -384,11 +292,25 @@ def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: Int
         utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
     )
     n_repeats = utility_input.designs.n_repeats[utility_input.rows[designs]]
-    out = np.empty(len(designs))
+
+    def chance(own: FloatArray, n: int) -> FloatArray:
+        given = WeightsGivenReading.of(own, share, utility_input.readout, repeats=n)
+        return given.probability_of_knowing(away, goal.sd)
+
+    return by_repeats(chance, answers, n_repeats)
+
+
+def by_repeats(
+    utility: Callable[[FloatArray, int], FloatArray], answers: FloatArray, n_repeats: IntArray
+) -> FloatArray:
+    """Return the utility of each design, (n_designs,), from predictions, (n, n_designs), by its number of repeats.
+
+    `utility` takes the predictions of designs with the same number of repeats, of which the mean counts.
+    """
+    out = np.empty(answers.shape[1])
     for n in np.unique(n_repeats).tolist():
-        own = n_repeats == n
-        given = WeightsGivenReading(answers[:, own], share, utility_input.readout, repeats=n)
-        out[own] = given.probability_of_knowing(away, goal.sd)
+        own = np.flatnonzero(n_repeats == n)
+        out[own] = utility(answers[:, own], n)
     return out
 
 

@@ -15,16 +15,15 @@ import numpy as np
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm, Speed
 from probewise.experiment import (
-    AdjustedMixture,
     Experiment,
     NestedSampling,
     Step,
     explore,
     naive_levels_from_world,
     probability_of_length_off,
-    sensor_change_prior,
-    student_t_likelihood,
 )
+from probewise.experiment.from_sensor import AdjustedMixture, sensor_change_prior
+from probewise.experiment.paper import student_t_likelihood
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.nested import NESTED_STOP

@@ -12,7 +12,6 @@ from probewise._words import count_with_noun, unit_after_number, unit_of_name
 from probewise.effects import spoken_name
 from probewise.experiment import (
     CLEAN,
-    OFF_MM,
     Experiment,
     Exploration,
     Step,
@@ -20,7 +19,7 @@ from probewise.experiment import (
     left_out_after_step,
     probability_of_length_off,
 )
-from probewise.experiment.result import stop_reason_with_checks
+from probewise.experiment.result import OFF_MM, stop_reason_with_checks
 from probewise.inquiry import UtilityMap
 from probewise.report import html
 from probewise.report.plots.canvas import axes_of_frame, grid_of_axes, png

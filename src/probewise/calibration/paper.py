@@ -1,22 +1,28 @@
-"""Each order as an inference problem, and the search of its whole prior by nested sampling."""
+"""The SSF of a recording by the paper's method: nested sampling of each number of Gaussians; the evidence chooses one.
+
+Paper, "Estimating SSF MoG Model Parameters": Pr(theta | D, I) = Pr(theta | I) Pr(D | theta, I) / Z, with the parameters
+theta of N Gaussians and the two levels, and the evidence Z = Pr(D | I) of the order N. `estimate_ssf` is its loop;
+`calibrate` searches each order by `search_prior_of_order`, which can refine the evidence.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from probewise.calibration.priors import SSFPrior
+from probewise.calibration.fields import posterior_mean_ssf_field
+from probewise.calibration.priors import SSFPrior, paper_prior
 from probewise.errors import require
 from probewise.inference import SensorProblem, student_t_of
-from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
+from probewise.nested import EvidenceChange, NestedResult, RoundSummary, StopRule, Weighted, refine, run
 from probewise.nested.importance import MOST_K
 from probewise.recordings import Recording
 from probewise.scene import KnownScene
-from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
+from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture, SSFField
 
 Progress = Callable[[int, RoundSummary], None]
 
@@ -33,6 +39,43 @@ def problem_for(recording: Recording, prior: SSFPrior) -> SensorProblem:
     plan = recording.plan
     chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
     return SensorProblem(prior, chain, student_t_of(recording, plan.scan), recording)
+
+
+def estimate_ssf(
+    recording: Recording,
+    *,
+    orders: Sequence[int] = (1, 2, 3, 4),
+    n_live: int = 300,
+    pixel_mm: float = 1.0,
+    rng: np.random.Generator,
+) -> Generator[tuple[int, NestedResult, SSFField], None, None]:
+    """Estimate the SSF as a mixture of each number of Gaussians; the most probable number has the largest log Z.
+
+    Parameters
+    ----------
+    recording
+        Readings over known patterns.
+    orders
+        Numbers of Gaussians.
+    n_live
+        Live points of nested sampling.
+    pixel_mm
+        Width of a field's pixels.
+    rng
+        Source of randomness.
+
+    Yields
+    ------
+    The number of Gaussians, its posterior with the log evidence, and the weighted mean of the sampled SSF fields.
+    """
+    for n_gaussians in orders:
+        problem = problem_for(recording, paper_prior(recording, n_gaussians))
+        posterior = run(problem, n_live=n_live, stop=EvidenceChange(1e-8), max_cost=1.0, rng=rng)
+        yield (
+            n_gaussians,
+            posterior,
+            posterior_mean_ssf_field(posterior.theta, n_gaussians, pixel_mm=pixel_mm, weight=posterior.weight),
+        )
 
 
 @dataclass(frozen=True, eq=False)

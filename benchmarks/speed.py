@@ -159,7 +159,10 @@ def measured(python: Path, command: list[str], at: Path, limit_s: int | None, cw
 def told(name: str, row: dict) -> str:
     """Say one row of the table."""
     by = "calls" if "calls" in (row["now"] or [{}])[0] else "cpu_s"
-    before, now = ([f"{r[by]:.3g}" if by in r else f"over {r['over_s']}" for r in row[w]] for w in ("before", "now"))
+    before, now = (
+        [f"{r[by]:,.{0 if r[by] >= 100 else 2}f}" if by in r else f"over {r['over_s']}" for r in row[w]]
+        for w in ("before", "now")
+    )
     mb = ", ".join(str(max((r.get("mb", 0) for r in row[w]), default=0)) for w in ("before", "now"))
     ratio = "–" if row["ratio"] is None else f"{row['ratio']:.2f}"
     return f"| {name} | {', '.join(before)} | {', '.join(now)} | {ratio} | {row['goal']:g} | {mb} |"

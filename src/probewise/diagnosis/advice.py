@@ -30,7 +30,7 @@ from probewise.recordings.plan import Plan, Recording
 COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_READINGS])
 """Numbers of further readings that are tried."""
 
-_FREE = 1e-6  # prior precision of a rival's amounts, in changes of one noise sd: they are free
+_NEARLY_FLAT = 1e-6  # prior precision of a rival's amplitudes, in changes of one noise sd: the fit decides
 
 
 EffectEntry: TypeAlias = tuple[Effect, FloatArray]
@@ -67,7 +67,7 @@ def nats_against(slopes: Sequence[FloatArray], truth: Amounts, rival: Amounts, r
     products = before.T @ before + COUNTS[:, None, None] * (after.T @ after / len(after))
     if not np.isfinite(products).all():
         return np.full(len(COUNTS), np.nan)
-    precision = np.concatenate([np.ones(p), np.full(k, _FREE), np.ones(own.shape[1])])
+    precision = np.concatenate([np.ones(p), np.full(k, _NEARLY_FLAT), np.ones(own.shape[1])])
     fitted, along = products[:, :-1, :-1] + np.diag(precision), products[:, :-1, -1:]
     scale = np.sqrt(np.einsum("mii->mi", fitted))[:, :, None]  # against rounding
     among, along = fitted / (scale * scale.transpose(0, 2, 1)), along / scale

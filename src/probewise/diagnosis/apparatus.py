@@ -74,7 +74,7 @@ class Words:
 
     @property
     def before_in_words(self) -> str:
-        """As what the model before a repair predicts, beside `Repair.after_in_words`."""
+        """As what the model before a repair predicts, beside `Diagnosis.after_in_words`."""
         return f"as {self.unrepaired}"
 
     def as_sentence(self, text: str) -> str:

@@ -97,8 +97,8 @@ class BestRepair:
     noise: Names
     problem: Linearised
     improvement: Improvement
-    calibrated: Fit  # the null and
-    repaired: Fit  # that fit as they are under the noise found, which figures show
+    calibrated: Fit  # the null, refitted under the noise of the verdict; figures show it
+    repaired: Fit  # `fit` likewise
     out_of_vocabulary: Names = ()  # of the verdict `unknown`, its effects with a formula but no name in the vocabulary
 
     @classmethod
@@ -144,8 +144,8 @@ def judged_and_best_repair(
     """Choose the fit that belongs to a verdict; the null if nothing was found.
 
     Returns the verdict, withdrawn if the named effects predict held-out readings far worse; and the fit. A formula that
-    predicts them no better than the null is none. If nothing unknown does, its odds against nothing on the mean are
-    those of the prior, if the latter is credible.
+    does not predict them better than the null is dropped. If no correction by an unknown effect does either, and no
+    effect on the mean is credible, the unknown gets its prior odds against that.
     """
     null, noise, on_noise = test.null, test.noise, searched.prepared.noise_effect_names
     if judged.verdict == "unknown":

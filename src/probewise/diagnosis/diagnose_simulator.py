@@ -1,7 +1,7 @@
-"""Diagnosis of a user's simulator against a table: fit it, scale the effects to the fit, run the engine.
+"""Diagnosis of a user's simulator against a table: fit it, scale the effects to the fit, diagnose.
 
-The integration step is chosen for the residuals of the law without effects. The repaired law's are smaller, and its
-predictions may change by more than their noise where the step is halved: then all is done again at a finer step.
+The integration step is chosen for the residuals of the law without effects. A repair leaves smaller residuals, so its
+integration may need a finer step; then everything is repeated.
 """
 
 from __future__ import annotations

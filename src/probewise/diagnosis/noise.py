@@ -801,7 +801,7 @@ class NoiseModel:
         far: BoolArray,
         sd: FloatArray,
         rho: float,
-        step: float,
+        walk: float,
         share: float,
         times: float,
         lost_share: float,
@@ -822,7 +822,7 @@ class NoiseModel:
             times,
             log_extra,
             least=self._floor,
-            walk=step**2 * self._n_rows_since_previous if step else np.zeros(0),
+            walk=walk**2 * self._n_rows_since_previous if walk else np.zeros(0),
             before=before if rho else before[:0],
             censored=self._censored[: len(far) * self._censored.any()],
         )

@@ -16,12 +16,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Instrument, Pose, Reading
+from probewise.errors import require
 from probewise.experiment.journal import PATTERN, recording_of
 from probewise.inference.likelihoods import StudentT
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import Grid, choose, entropy_map
 from probewise.nested import EvidenceChange, KernelMove, NestedResult, diversify, run
-from probewise.scene import Shape
+from probewise.scene import AnyOf, Shape
 from probewise.sensor import FixedLevels
 from probewise.sensor.stages import SensorModel
 
@@ -49,7 +50,8 @@ def find_shape(
     arm
         The instrument, already entered.
     shape, model, likelihood
-        The possible shape with its prior, the sensor over it, and the likelihood of readings given predictions.
+        The possible shape with its prior (no set of shapes), the sensor over it, and the likelihood of readings given
+        predictions.
     grid
         Possible places of readings.
     bin_width
@@ -63,6 +65,7 @@ def find_shape(
     ------
     The readings so far, the posterior given them, and fifty shapes drawn from it, (50, n_params).
     """
+    require(not isinstance(shape, AnyOf), "shape", shape, "one shape; explore takes sets")
     places_mm, plan = grid.places_mm, grid.plan(PATTERN)
     reachable, orientation_rad = arm.reachable(places_mm), arm.orientation_rad(places_mm)
     plan = replace(plan, orientation_rad=orientation_rad)

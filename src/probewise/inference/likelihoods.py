@@ -1,4 +1,4 @@
-"""Likelihoods of readings (paper, sections "The Naive Likelihood" and "SSF Likelihood", eq. studentT and product).
+"""Likelihoods of readings (paper, sections "The Naive Likelihood" and "SSF Likelihood": Student-t and its product).
 
 `Naive` is the paper's sensor of two levels. The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal
 density has (2 pi sigma^2)^(-1/2) and a negative one.

@@ -1,4 +1,4 @@
-"""The choice of the next measurement (paper, the machine learning system, figures 3 and 8).
+"""The choice of the next measurement (paper, the machine learning system, figures 2 and 8).
 
 Samples of the posterior predict a reading at every place of a fine grid; a reading where the predictions differ most is
 the most informative. A utility of readings is a `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses;

@@ -23,7 +23,7 @@ def diversify(theta: FloatArray, problem: Samplable, *, rng: np.random.Generator
     Every step proposes one of three symmetric moves to each sample: a Gaussian with the samples' covariance, a
     difference of two samples (which can lead to another mode), or a change of one parameter on the scale of its prior.
     The step size is drawn over orders of magnitude. The proposals depend only on the samples as given, not on the
-    chains' states, so the posterior is left invariant.
+    chains' states, so that every chain has the posterior as its stationary distribution.
 
     `theta` are posterior samples, possibly repeated, (n_samples, n_params); `problem` has a prior with `log_prob`.
     Return the samples after `n_steps` each; the paper takes about 1000. Raises ParameterError or ShapeError if a sample

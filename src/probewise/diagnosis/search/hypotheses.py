@@ -54,8 +54,8 @@ from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
 # Nats that are expected between two hypotheses, below which readings do not tell them apart: the contract's odds of 20
-# to 1. As far behind the best, a noise model, SSF order or proposal does not say what to refit next; at a cost: a refit
-# can make what looked worse by three nats better by eight.
+# to 1. A noise model, SSF order or proposal that is as far behind the best does not say what to refit next. This may
+# miss hypotheses: a refit sometimes gains 8 nats over its screening.
 ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005

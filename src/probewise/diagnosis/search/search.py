@@ -69,13 +69,13 @@ from probewise.effects.noise import lattice_step
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
-# Nats behind the best so far: about a fit that one effect has bent screening is so far off, and within three alone
-# singles that screening did not favour were lost.
+# Nats behind the best so far: screening errs by as much near a fit distorted by one effect. Within three, single effects
+# that screening did not favour were lost.
 _REFITTED_WITHIN = 6.0
 _SINGLES = 6  # effects that are refitted alone; a bound on cost
 _BEAM = 8  # combinations that are refitted at each size above one
-# Shares of a limited budget of refits that may be spent once one effect, or two, were tried: what is missing twice is
-# worth as much as the last of many names for what is missing once.
+# Shares of a limited budget of refits that single effects, and then pairs, may use up: without a part kept for them,
+# pairs would never be refitted.
 _SHARES = (0.6, 0.9)
 # Nats behind the best: an SSF order so far back is not searched. An effect may look like another Gaussian, and be
 # explained better by its name at fewer of them.

@@ -15,6 +15,7 @@ import argparse
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -144,6 +145,7 @@ def measured(python: Path, command: list[str], at: Path, limit_s: int | None, cw
     """Run once; return seconds, peak memory and calls of the slow simulator, or only `over_s` beyond the limit."""
     limited = limit_s and partial(resource.setrlimit, resource.RLIMIT_CPU, (limit_s, limit_s))
     (at / "calls").write_bytes(b"")
+    shutil.rmtree(at / "out", ignore_errors=True)  # a folder takes the results of one verb
     began, how = time.monotonic(), {"cwd": cwd, "env": environment(python) | {"CALLS": str(at / "calls")}}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "preexec_fn": limited or None}
     run = subprocess.Popen([str(python), *command], **how, **quiet)
@@ -152,8 +154,10 @@ def measured(python: Path, command: list[str], at: Path, limit_s: int | None, cw
     if status and limit_s is not None and cpu_s > limit_s - 1:
         return {"over_s": limit_s}
     out = {"cpu_s": round(cpu_s, 2), "wall_s": round(time.monotonic() - began, 1), "mb": used.ru_maxrss // 1024}
+    if status:
+        raise SystemExit(f"{' '.join(map(str, command))} ends with {os.waitstatus_to_exitcode(status)}")
     calls = (at / "calls").stat().st_size
-    return out | ({"calls": calls} if calls else {}) | ({"status": status} if status else {})
+    return out | ({"calls": calls} if calls else {})
 
 
 def told(name: str, row: dict) -> str:

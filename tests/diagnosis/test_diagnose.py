@@ -223,6 +223,21 @@ def test_an_earlier_sensor_is_taken_as_the_prior():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("name", "size"), [("dark_level", 4.0), ("gain", 0.1)])
+def test_levels_that_have_changed_since_the_calibration_are_named_beside_its_sensor(name, size):
+    first = clean_diagnosis()
+    sensor = first.repaired.fitted_sensor(first.recording, rng=np.random.default_rng(0))
+    changed = recording("paper", getattr(hidden, name)(size), seed=6)
+    found = diagnose(changed, sensor=sensor, rng=np.random.default_rng(0))
+    assert found.combination == (name,)
+    effect = next(effect for effect in strict(found)["effects"] if effect["name"] == name)
+    (parameter,) = effect["parameters"]
+    assert parameter["mean"] == pytest.approx(size, abs=4 * parameter["sd"])
+    repaired = found.repaired.fitted_sensor(changed, rng=np.random.default_rng(0))
+    assert name in repaired.effects
+
+
+@pytest.mark.slow
 def test_a_rare_effect_is_named_and_its_repair_predicts():
     """The paper slips; the model that finds it moves the arm instead."""
     half_way_s = float(np.median(two_way_plan().time_s))

@@ -54,8 +54,13 @@ VOCABULARY: Mapping[str, LightEffect] = _by_name(
     noise.correlated_noise,
     noise.outliers,
     noise.dropouts,
+    reading.dark_level,
+    reading.gain,
 )
 """Every effect that the diagnosis considers, by name."""
+
+SINCE_CALIBRATION = (reading.dark_level, reading.gain)
+"""Changes of the levels since the calibration, constant in a recording: seen only beside a sensor that is known."""
 
 RARE_EFFECTS: Mapping[str, LightEffect] = _by_name(
     pose.arm_knock,
@@ -117,6 +122,7 @@ __all__ = [
     "OTHER_FORMS",
     "PROPOSAL",
     "RARE_EFFECTS",
+    "SINCE_CALIBRATION",
     "VOCABULARY",
     "Effect",
     "Estimated",

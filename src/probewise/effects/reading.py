@@ -63,6 +63,37 @@ def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
     )
 
 
+@light_effect(
+    "dark_level",
+    Stage.OFFSET,
+    "another dark level than at the calibration",
+    ("level",),
+    is_absorbed_by_ssf=lambda plan: True,
+)
+def dark_level(kind: LightEffect, of: Extent) -> Effect:
+    """Another dark level than at the calibration: reading + offset."""
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        way = "higher" if mean[0] > 0 else "lower"
+        return f"since the calibration every reading is {value_with_sd(abs(mean[0]), sd[0])} {way}: other light"
+
+    return kind.linear(of, {"offset": "reading"}, 0.01 * of.span, lambda value, theta, plan: value + theta[:, :1], says)
+
+
+@light_effect(
+    "gain", Stage.GAIN, "another gain than at the calibration", ("level",), is_absorbed_by_ssf=lambda plan: True
+)
+def gain(kind: LightEffect, of: Extent) -> Effect:
+    """Another gain than at the calibration: signal x (1 + frac)."""
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        changed = value_with_sd(abs(mean[0]), sd[0], factor=100)
+        way = "stronger" if mean[0] > 0 else "weaker"
+        return f"since the calibration the signal is {changed} % {way}: the lamp, its battery or the paper"
+
+    return kind.linear(of, {"frac": "1"}, 0.02, lambda value, theta, _: value * np.maximum(1 + theta[:, :1], 0.0), says)
+
+
 @light_effect("gain_drift", Stage.GAIN, "a gain that drifts", ("time",), counts="time")
 def gain_drift(kind: LightEffect, of: Extent) -> Effect:
     """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since the origin, 0 before it."""

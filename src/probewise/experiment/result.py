@@ -16,11 +16,11 @@ from probewise._kinds import require_kind
 from probewise._words import count_with_noun
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration import FittedSensor
-from probewise.effects import spoken_name
+from probewise.effects import SINCE_CALIBRATION, spoken_name
 from probewise.experiment.arm_error import ArmError
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import HypothesisKind, Posterior
-from probewise.experiment.rivals import SINCE_CALIBRATION, Pace
+from probewise.experiment.rivals import Pace
 from probewise.experiment.setup import Experiment, largest_sd_mm
 from probewise.experiment.simulated import HiddenShape
 from probewise.experiment.stopping import Judgement, probability_of_length_off

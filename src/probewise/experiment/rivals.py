@@ -21,6 +21,7 @@ from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.arm.instrument import Reading
 from probewise.effects import (
+    SINCE_CALIBRATION,
     VOCABULARY,
     Effect,
     Extent,
@@ -180,29 +181,6 @@ def gain_loss(kind: LightEffect, of: Extent) -> Effect:
     return replace(cast(Effect, gain_drift.build(kind, of)), apply=act, sentence=says)
 
 
-@light_effect("dark_level", Stage.OFFSET, "another dark level than at the calibration", ("level",))
-def dark_level(kind: LightEffect, of: Extent) -> Effect:
-    """Another dark level than at the calibration: reading + offset."""
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        way = "higher" if mean[0] > 0 else "lower"
-        return f"since the calibration every reading is {value_with_sd(abs(mean[0]), sd[0])} {way}: other light"
-
-    return kind.linear(of, {"offset": "reading"}, 0.01 * of.span, lambda value, theta, plan: value + theta[:, :1], says)
-
-
-@light_effect("gain", Stage.GAIN, "another gain than at the calibration", ("level",))
-def gain(kind: LightEffect, of: Extent) -> Effect:
-    """Another gain than at the calibration: signal x (1 + frac)."""
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        changed = value_with_sd(abs(mean[0]), sd[0], factor=100)
-        way = "stronger" if mean[0] > 0 else "weaker"
-        return f"since the calibration the signal is {changed} % {way}: the lamp, its battery or the paper"
-
-    return kind.linear(of, {"frac": "1"}, 0.02, lambda value, theta, _: value * np.maximum(1 + theta[:, :1], 0.0), says)
-
-
 @light_effect("position_scale", Stage.POSE, "a wrong scale of one axis", ("place", "slope"))
 def scale_of_x(kind: LightEffect, of: Extent) -> Effect:
     """Return a wrong scale of X alone, which no circle can imitate."""
@@ -226,9 +204,6 @@ def _scale_of_axis(kind: LightEffect, of: Extent, axis: str, other: str) -> Effe
 
     return kind.linear(of, {axis: "1"}, 0.01, act, says)
 
-
-SINCE_CALIBRATION = (dark_level, gain)
-"""Changes of the levels since the calibration, constant in a run."""
 
 ONLY_IN_RUNS = (*SINCE_CALIBRATION, scale_of_x, scale_of_y)
 """Effects that only a run without cards has as rivals, besides those in `ON_FIELD`."""

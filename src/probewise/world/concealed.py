@@ -151,6 +151,12 @@ def gain_drift(frac: float, tau_s: float) -> Act:
 
 
 @acts_at("gain")
+def gain(frac: float) -> Act:
+    """Scale the signal by 1 + `frac`, as since a calibration."""
+    return lambda values, rows: values * (1 + frac)
+
+
+@acts_at("gain")
 def battery_sag(per_volt: float, full_v: float = 8.3) -> Act:
     """LED brightness that follows the battery: the signal times 1 + `per_volt` (volts of `battery_mv` - `full_v`)."""
 
@@ -172,6 +178,12 @@ def ambient_gradient(per_mm_x: float, per_mm_y: float) -> Act:
 def ambient_step(amp: float, at_s: float) -> Act:
     """Switch on a lamp: adds `amp` to the readings after `at_s`."""
     return lambda values, rows: values + amp * (rows.time_s > at_s)
+
+
+@acts_at("offset")
+def dark_level(offset: float) -> Act:
+    """Raise every reading by `offset`, as since a calibration."""
+    return lambda values, rows: values + offset
 
 
 @acts_at("offset")

@@ -69,8 +69,8 @@ from probewise.effects.noise import lattice_step
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
-# Nats behind the best so far: screening errs by as much near a fit distorted by one effect. Within three, single effects
-# that screening did not favour were lost.
+# Nats behind the best so far: screening errs by as much near a fit that one effect distorts. Within three, single
+# effects that screening did not favour were lost.
 _REFITTED_WITHIN = 6.0
 _SINGLES = 6  # effects that are refitted alone; a bound on cost
 _BEAM = 8  # combinations that are refitted at each size above one

@@ -143,7 +143,7 @@ class SystemFit(ShowsItself):
             *(f"log evidence {evidence.in_words}" for evidence in (self.evidence, self.nested) if evidence is not None),
             f"noise sd of a reading {np.median(own.noise_sd):.4g} {unit}",
         ]
-        return "\n".join([*lines, own.parameter_table()])
+        return "\n".join([*lines, own.parameter_table(), *(f"note: {note}" for note in self.recording.notes)])
 
 
 @own_arithmetic

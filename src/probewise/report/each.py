@@ -33,8 +33,10 @@ class DeviceRow:
 
     @property
     def ails(self) -> str:
-        """What ails it, in words: the named effects, or the verdict."""
-        return hypothesis_in_words(self.name.split(" + ")) if self.name else self.verdict.replace("_", " ")
+        """What ails it, in words: the named effects; of another verdict that, and the most probable effects."""
+        words = hypothesis_in_words(self.name.split(" + ")) if self.name else ""
+        verdict = self.verdict.replace("_", " ")
+        return words if self.verdict in ("named", "noise") else f"{verdict}: perhaps {words}" if words else verdict
 
 
 def in_order(rows: Sequence[DeviceRow]) -> list[DeviceRow]:

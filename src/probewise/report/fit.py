@@ -18,14 +18,18 @@ from probewise.report.words import digits_of_range, typeset_numbers
 from probewise.systems import RunTable
 
 _MOST_INPUTS = 4
+_POOR = 1.5  # times the declared noise: of 24 readings or more the rms is so large by chance in one fit of 2,000
 
 
 def summary_sentence(fit: SystemFit) -> str:
     """Summarise a fit of a simulator in one sentence: number of readings, and rms of the residuals."""
     rms = f"{fit.rms:.3g} {fit.recording.plan.instrumentation.unit_after_number} (rms)"
+    declared, times = fit.fitted.simulator.noise.sd, ""
+    if isinstance(declared, float | int) and fit.rms > _POOR * declared:
+        times = f", {fit.rms / declared:.2g} times the declared noise: `diagnose` asks what is missing"
     return (
-        f"The simulator fits {fit.recording.usable.sum()} readings with residuals of {rms}"
-        f"{fit.recording.weighting_in_words}."
+        f"The best fit to {fit.recording.usable.sum()} readings leaves residuals of {rms}"
+        f"{fit.recording.weighting_in_words}{times}."
     )
 
 

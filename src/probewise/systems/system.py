@@ -97,7 +97,8 @@ class System:
         require(is_sd, 'noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}")
         settable = ", ".join(name for name in table.columns if name not in taken)
         for name in simulator.controls:
-            require(name in table.columns, "controls", name, f"a column that can be set: {settable}")
+            allowed = f"a column that the table has and that can be set: {settable or 'this table has none'}"
+            require(name in table.columns, "controls", name, allowed)
         allowed = "a column besides the reading, such as the time or the number of each row"
         require(columns_without_reading(simulator, table), "columns", list(table.columns), allowed)
         bare = cls(simulator, table.scan_names)

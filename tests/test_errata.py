@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from probewise.inference import StudentT
-from probewise.sensor.ssf import footprint_of
 
 
 def test_the_papers_exponents_give_data_to_the_minus_403():
@@ -45,12 +44,3 @@ def test_the_radius_range_that_25_bits_would_mean():
     """Counting cells of 1 mm and of 4 mm over the field."""
     assert pytest.approx(61.6, abs=0.1) == 2**25 / (1048 * 520)
     assert pytest.approx(3941, abs=1) == 4 * 2**25 / (1048 * 520 / 16)
-
-
-def test_a_b_c_are_half_the_inverse_covariance():
-    """Eq. for the SSF: exponent A dx^2 + B dy^2 + 2 C dx dy."""
-    theta = np.array([[1.0, 0.0, 0.0, 0.05, 0.1, 0.02]])
-    got = footprint_of(theta, 1)
-    covariance = 0.5 * np.linalg.inv([[0.05, 0.02], [0.02, 0.1]])
-    found = [np.ravel(x)[0] for x in (got.var_u, got.var_v, got.cov_uv)]
-    np.testing.assert_allclose(found, [covariance[0, 0], covariance[1, 1], covariance[0, 1]])

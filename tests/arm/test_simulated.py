@@ -5,17 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import (
-    Instrument,
-    Pose,
-    Reach,
-    Reading,
-    ReadingScale,
-    SimulatedArm,
-    Speed,
-    read_geometry,
-    shipped_geometry_path,
-)
+from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Speed, read_geometry, shipped_geometry_path
 from probewise.errors import ParameterError, ReachError, ShapeError
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 131), np.linspace(0, 520, 65)), axis=-1).reshape(-1, 2)
@@ -33,10 +23,6 @@ def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
     apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
     np.testing.assert_array_equal(ring.contains(GRID[apart]), shipped.contains(GRID[apart]))
     assert shipped.sentence().startswith(Reach().sentence())
-
-
-def test_a_longer_arm_reaches_everywhere():
-    assert Reach(nearest_mm=0.0, farthest_mm=900.0).contains(GRID).all()
 
 
 def test_places_off_the_field_are_out_of_reach():
@@ -97,14 +83,14 @@ def test_the_scale_can_be_finer_or_none():
 
 
 def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
-    arm: Instrument = SimulatedArm(flat(50.0))
+    arm = SimulatedArm(flat(50.0))
     home = arm.pose
     with arm as entered:
         assert entered is arm
         arm.measure(HERE)
     assert arm.pose == home
 
-    def fail() -> None:
+    def fail():
         with arm:
             arm.measure(HERE)
             raise KeyError

@@ -9,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run
 
 from probewise import __version__
 from probewise.calibration import predict, read_sensor
-from probewise.cli import VERBS, main
+from probewise.cli import VERBS
 from probewise.recordings import read_plan, read_plan_and_readings, read_prediction_columns
 from probewise.report import exploration
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, recording_file, tmp_path, capsys):

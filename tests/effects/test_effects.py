@@ -1,7 +1,5 @@
 """Every effect of the vocabulary keeps the contract of an effect; the priors are what they say."""
 
-from __future__ import annotations
-
 import dataclasses
 import pickle
 from dataclasses import replace
@@ -24,7 +22,7 @@ PLAN = with_jittered_times(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
 
 
-def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = None, every_s: float = 1.0) -> Plan:
+def plan_along(x_mm, y_mm, scan=None, every_s=1.0):
     """Readings at these places, one after the other."""
     n = len(x_mm)
     return Plan(
@@ -40,11 +38,11 @@ def plan_along(x_mm: np.ndarray, y_mm: np.ndarray, scan: np.ndarray | None = Non
     )
 
 
-def there_and_back() -> Plan:
+def there_and_back():
     return plan_along(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0]), np.zeros(6), np.repeat([0, 1], 3), every_s=10.0)
 
 
-def base() -> Chain:
+def base():
     return Chain(
         FixedMixture([1.0], [[0.5, 1.5]], [[[16.0, 1.0], [1.0, 9.0]]]), FixedLevels(10, 60), KnownScene(PLAN.patterns)
     )
@@ -292,7 +290,7 @@ def test_a_mounting_of_one_of_several_recordings_may_be_off_alone():
 FAR = Origin(time_s=1.7e9, x_mm=2e4, y_mm=-3e5)
 
 
-def moved_by(plan: Plan, time_s: float, x_mm: float, y_mm: float) -> Plan:
+def moved_by(plan, time_s, x_mm, y_mm):
     """The same plan with its patterns at another place, and on another clock."""
 
     def moved(pattern):
@@ -314,7 +312,7 @@ def moved_by(plan: Plan, time_s: float, x_mm: float, y_mm: float) -> Plan:
     )
 
 
-def over(plan: Plan) -> Chain:
+def over(plan):
     return replace(base(), scene=KnownScene(plan.patterns))
 
 

@@ -108,23 +108,6 @@ def test_a_set_of_shapes_takes_each_with_its_weight():
     assert share == pytest.approx({"circle": 0.5, "rectangle": 0.3, "hexagon": 0.2}, abs=0.02)
 
 
-def test_a_set_of_shapes_shares_the_place_and_names_the_rest():
-    own = "circle.radius_mm rectangle.width_mm rectangle.height_mm rectangle.angle_rad"
-    own += " hexagon.radius_mm hexagon.angle_rad"
-    assert SHAPES["any"].prior.names == ("shape", "x_mm", "y_mm", *own.split())
-
-
-def test_a_set_of_shapes_makes_the_region_of_the_shape_it_takes():
-    shape = SHAPES["any"]
-    theta = draws(shape, 50)
-    points = np.random.default_rng(1).uniform(0, 1, (300, 2)) * [1048, 520]
-    found, which = shape.region(theta).albedo(points), shape.shape_index(theta)
-    circles = Circle().region(theta[which == 0][:, [1, 2, 3]])
-    rectangles = Rectangle().region(theta[which == 1][:, [1, 2, 4, 5, 6]])
-    assert np.array_equal(found[which == 0], circles.albedo(points))
-    assert np.array_equal(found[which == 1], rectangles.albedo(points))
-
-
 @dataclass(frozen=True)
 class Bands:
     """A user's own shape: stripes whose phase is unknown."""

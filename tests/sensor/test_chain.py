@@ -116,19 +116,6 @@ def test_theta_of_another_width_is_refused(model):
         sensor.predict(draw(2)[:, :-1], plan_of())
 
 
-def test_one_gaussian_over_a_half_plane_reads_the_error_function():
-    """Paper, eq. (modelI) and (Ssf): covariance is half the inverse of [[A, C], [C, B]]."""
-    chain, plan = CHAINS["one_free"][0], plan_of(30, names=("boundary",))
-    found = chain.predict(np.array([[*ONE, 10.0, 50.0]]), plan)[0]
-    _, u, v, aa, bb, cc = ONE
-    cov = 0.5 * np.linalg.inv([[aa, cc], [cc, bb]])
-    for j, turn in enumerate(plan.orientation_rad):
-        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        mean_x = plan.x_mm[j] + (rotation @ [u, v])[0]
-        sd_x = np.sqrt((rotation @ cov @ rotation.T)[0, 0])
-        assert found[j] == pytest.approx(10 + 40 * ndtr(mean_x / sd_x), abs=1e-7)
-
-
 @settings(max_examples=20, deadline=None)
 @given(turn=st.floats(-7, 7), seed=st.integers(0, 1000))
 def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):

@@ -1,13 +1,10 @@
 """What a Gaussian footprint sees of every kind of region, by independent routes."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixtures import mean_albedo_under_gaussians
-from scipy.integrate import dblquad
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
@@ -49,19 +46,6 @@ def see(region, x, y, cov, **options):
 
 def covariance(sd_1, sd_2, rho):
     return np.array([[sd_1**2, rho * sd_1 * sd_2], [rho * sd_1 * sd_2, sd_2**2]])
-
-
-def over_rows(mean, cov, chords, low, high):
-    """Adaptive quadrature in the plane, x between the ends of each chord."""
-
-    (a, c), (_, b) = np.linalg.inv(cov).tolist()
-    height = 1 / (2 * math.pi * math.sqrt(np.linalg.det(cov)))
-
-    def density(x, y):
-        dx, dy = x - mean[0], y - mean[1]
-        return height * math.exp(-0.5 * (a * dx * dx + b * dy * dy) - c * dx * dy)
-
-    return dblquad(density, low, high, lambda y: chords(y)[0], lambda y: chords(y)[1], epsabs=1e-9, epsrel=1e-9)[0]
 
 
 def over_a_disc(mean, cov, center, radius):
@@ -131,14 +115,6 @@ def test_a_quadrant_is_the_bivariate_normal(rho, corner):
             upper = -flip * np.array(corner)
             wanted = multivariate_normal([0.0, 0.0], cov * np.outer(flip, flip), abseps=1e-11, releps=1e-11).cdf(upper)
             assert see(region, 0.0, 0.0, cov) == pytest.approx(wanted, abs=1e-8)
-
-
-def test_a_polygon_agrees_with_adaptive_quadrature_in_the_plane():
-    """A triangle by scipy.integrate.dblquad, 1e-8."""
-    cov = covariance(4.0, 3.0, -0.4)
-    triangle = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]]]))
-    wanted = over_rows([2.0, 3.0], cov, lambda y: (0.0, 10.0 * (1 - y / 8.0)), 0.0, 8.0)
-    assert see(triangle, 2.0, 3.0, cov) == pytest.approx(wanted, abs=1e-8)
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (5.0, 2.0), (10.0, 0.0), (1.0, 99.0)])

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
+from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Stripes, Uniform
 from probewise.world import Blob, Oval, Spot, albedo_at, gaussian_spot, ridge_spot, seen_white_fraction, tailed_spot
 
 BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.15)
@@ -77,24 +77,6 @@ def test_a_disc_under_a_round_spot_is_the_rayleigh_integral():
 def test_a_plain_surface_shows_its_albedo(spot):
     x, y, turn = poses()
     np.testing.assert_allclose(seen_white_fraction(Uniform(0.3), SPOTS[spot](0.25), x, y, turn), 0.3, rtol=1e-12)
-
-
-def test_a_ramp_shows_the_albedo_at_the_spots_middle():
-    spot = tailed_spot()
-    mean, _ = spot.moments()
-    x, y, turn = poses()
-    u = x + np.cos(turn) * mean[0] - np.sin(turn) * mean[1]
-    np.testing.assert_allclose(seen_white_fraction(Ramp(0.0, 0.02), spot, x, y, turn), 0.02 * u, atol=1e-12)
-
-
-def test_turning_spot_and_surface_together_changes_nothing():
-    spot = ridge_spot()
-    x, y, turn = poses()
-    by = 0.9
-    c, s = math.cos(by), math.sin(by)
-    one = seen_white_fraction(HalfPlane(0.2, 1.0), spot, x, y, turn)
-    two = seen_white_fraction(HalfPlane(0.2 + by, 1.0), spot, c * x - s * y, s * x + c * y, turn + by)
-    assert np.abs(one - two).max() < 5e-4
 
 
 def test_a_photograph_of_a_polygon_looks_like_the_polygon():

@@ -169,24 +169,6 @@ def test_an_answer_that_cannot_be_true_is_asked_for_again(link, script):
         link.ask(read, check=is_bright)
 
 
-def test_an_interrupted_question_does_not_leave_its_answer_to_the_next(link, script):
-    """Ctrl-C between question and answer; then the motors are stopped, and must not take it for theirs."""
-
-    def interrupted(size, timeout_s):
-        if not timeout_s:  # a look before the question is sent
-            return b""
-        del script.read
-        raise KeyboardInterrupt
-
-    script.expect(LIGHT, (0.06, DARK))
-    script.read = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        link.ask(read)
-    script.expect(*FENCE)
-    script.expect(LIGHT, (0.06, BRIGHT))
-    assert link.ask(read).normalized == 565
-
-
 def test_the_radio_is_given_time_to_turn_round(link, script):
     """60 ms a question, at least, and 30 ms after its answer; without an answer 15 ms."""
     for _ in range(3):

@@ -279,17 +279,6 @@ def turns_asked(asked):
     return [round(math.degrees(request.turned_rad)) for request in asked if request.turned_rad is not None]
 
 
-def test_a_sensor_that_the_rows_taken_before_may_have_left_turned_is_turned_back():
-    asked = []
-    angles = [0.0, math.pi / 3, 0.0, 0.0]
-    taken(Own(), asked, plan(orientation_rad=angles), first=2)
-    assert turns_asked(asked) == [0]
-    with as_instrument(Own()) as arm:  # all rows of the first plan were taken in an earlier session
-        for first in (4, 0):
-            list(carry_out(arm, plan(orientation_rad=angles), origin_mm=(0.0, 0.0), ask=asked.append, first=first))
-    assert turns_asked(asked) == [0, 0, 60, 0]
-
-
 @pytest.mark.parametrize(
     ("own", "changes", "angles"),
     [

@@ -122,17 +122,6 @@ def test_orders_run_elsewhere_give_the_same_result(recording):
     np.testing.assert_array_equal(here.sensor.samples, there.sensor.samples)
 
 
-def test_the_papers_priors_are_uniform_within_the_usual_bounds(recording):
-    """A quarter of each unit interval is a quarter of the range of a, u, v and the levels."""
-    usual, paper = default_prior(recording, 1), paper_prior(recording, 1)
-    ends = np.array([[0.0] * 8, [1.0] * 8])
-    lower, upper = paper.from_unit_cube(ends)
-    quarter = paper.from_unit_cube(np.full((1, 8), 0.25))[0]
-    flat = [0, 1, 2, 6, 7]
-    np.testing.assert_allclose(quarter[flat], (0.75 * lower + 0.25 * upper)[flat])
-    np.testing.assert_allclose([lower[1:5], upper[1:5]], usual.from_unit_cube(ends)[:, 1:5])
-
-
 def test_the_papers_prior_is_flat_over_the_matrices_that_rejection_leaves(recording):
     """Uniform A, B and C, drawn in a box, kept where abs(C) < 0.98 sqrt(A B): same volume, quantiles, density."""
     paper = paper_prior(recording, 1)

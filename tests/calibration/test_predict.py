@@ -11,7 +11,7 @@ from probewise.effects import Origin
 from probewise.errors import DoubtfulResultWarning, FileError, ShapeError
 from probewise.recordings import Disc, Instrumentation, Plan, Recording, paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, DiscreteSSF, FixedLevels, FreeLevels, FreeMixture
+from probewise.sensor import Chain, FreeLevels, FreeMixture
 
 
 def _chain(plan):
@@ -123,15 +123,6 @@ def test_a_sensor_file_of_before_counts_from_0(make_sensor):
     for damaged in (3, {"backlash": {"time_s": 3.0}}):
         with pytest.raises(FileError):
             FittedSensor.from_json(json.dumps(document | {"origins": damaged}))
-
-
-def test_the_mean_field_and_the_parameters_predict_alike(sensor):
-    """Discrete route by the mean field against closed forms by the samples: 1e-3 of the span."""
-    for plan in (paper_plan(), _disc_plan()):
-        discrete = Chain(DiscreteSSF(sensor.field), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
-        by_field = discrete.predict(np.empty((1, 0)), plan)[0]
-        by_samples = _chain(plan).predict(sensor.samples * [1, 1, 1, 1, 1, 1, 0, 0] + [0, 0, 0, 0, 0, 0, 0, 1], plan)
-        assert np.abs(by_field - by_samples.mean(axis=0)).max() < 1e-3
 
 
 def test_another_unit_is_warned_of(sensor):

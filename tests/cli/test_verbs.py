@@ -32,18 +32,6 @@ def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, 
 
 
 @pytest.mark.slow
-def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run("calibrate", recording_file, "--out", out, "--orders", 1, "--live", 16, "--seed", 1) == 0
-    names = {p.name for p in out.iterdir()}
-    assert {"sensor.json", "report.html", "readings.png", "ssf_by_order.png", "predicted.png"} <= names
-    assert {name for name in names if name.startswith(".")} == {".results.lock"}
-    mean = read_sensor(out / "sensor.json").mean()
-    assert mean["I_max"] == pytest.approx(60.0, abs=1.0)
-    assert "seed 1" in capsys.readouterr().out
-
-
-@pytest.mark.slow
 def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quick_frames):
     """The page loads itself anew until the run is over; it is opened once."""
     pages, opened = [], []

@@ -177,18 +177,6 @@ def test_a_scan_at_rest_has_no_line_whatever_the_last_digit_of_its_places():
     assert distinct_scan_lines(plan_along(np.full(60, 3.0), y_mm)) == ()
 
 
-def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():
-    """In the cube's coordinates the distance from the line changes no reading, and the height keeps up with it."""
-    glint = VOCABULARY["glint"].for_extent(EXTENT).variants()[0]
-    u = np.repeat([[0.8, 0.55, 0.5, 0.6]], 5, axis=0)
-    u[:, 2] = (0.02, 0.3, 0.5, 0.7, 0.98)
-    theta = glint.prior.from_unit_cube(u)
-    assert np.ptp(theta[:, 2]) > 2 * theta[0, 3]
-    on_line = PLAN.take(PLAN.y_mm == 0)
-    readings = glint.apply(np.zeros((5, len(on_line))), theta, on_line)
-    np.testing.assert_allclose(readings, np.repeat(readings[:1], 5, axis=0), atol=1e-12)
-
-
 def test_a_heavy_tail_is_exact_at_both_ends():
     prior = HeavyTailedPrior(0.5)
     u = np.array([1e-9, 1e-3, 0.2, 0.5, 0.8, 0.999, 1 - 1e-9])
@@ -478,13 +466,6 @@ def test_frequencies_lie_close_enough_to_find_any():
     frequencies = flicker.bank()[:, 0, 1]
     assert flicker.prior.from_unit_cube(np.array([[0.5, 1.0, 0.5]]))[0, 1] == pytest.approx(0.5 / 1.2)
     assert np.diff(frequencies).max() * np.ptp(paper_plan().time_s) <= 0.51
-
-
-def test_a_soft_saturation_is_below_its_limit_and_nothing_far_below():
-    values = np.array([[10.0, 49.0, 50.0, 51.0, 80.0]])
-    soft = VOCABULARY["saturation"]().apply(values, np.array([[50.0, 4.0]]), there_and_back())
-    assert (soft < np.minimum(values, 50.0)).all()
-    assert soft[0, 0] == pytest.approx(10.0, abs=1e-3)
 
 
 def test_a_missing_voltage_of_the_battery_is_that_of_the_readings_around_it():

@@ -79,15 +79,6 @@ def test_noise_that_grows_with_the_light_does_so():
     np.testing.assert_allclose(level.sd[0, [0, 100]], [SD, SD * np.sqrt(5)], rtol=1e-3)
 
 
-def test_the_step_of_a_lattice_is_found():
-    rng = np.random.default_rng(2)
-    values = rng.normal(30, 8, 300)
-    assert lattice_step(0.37 * np.round(values / 0.37)) == pytest.approx(0.37)
-    assert lattice_step(np.round(values, 3)) == pytest.approx(0.001)
-    assert lattice_step(values) == 0.0
-    assert lattice_step(np.array([1.0, 1.0, 2.0])) == 0.0
-
-
 @pytest.mark.parametrize("digits", [2, 3, 6])
 def test_a_lattice_shows_through_printing(digits):
     """Readings rounded to a step that is no round number, then printed: found to a few of its stated errors."""

@@ -8,7 +8,7 @@ import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
-from probewise.emulator import Faults, VirtualLine, read_geometry, set_up_bench, shipped_geometry_path
+from probewise.emulator import VirtualLine, read_geometry, set_up_bench, shipped_geometry_path
 from probewise.errors import FileError
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
@@ -114,12 +114,3 @@ def test_a_stop_that_is_not_there_is_told_of(clock):
         lego.home()
     bench.radio.brick.advance()
     assert not base.speed_deg_s
-
-
-def test_home_is_found_on_a_bad_line_too(clock):
-    bench = lost(clock, base=25.0, shoulder=20.0)
-    bench.radio.faults = Faults(deaf=0.03, silence=0.03, fragment=0.3)
-    with connected(bench, clock, with_stops("base", "shoulder", "elbow")) as lego:
-        lego.home()
-    assert sum(bench.radio.mishaps.values()) > 5
-    np.testing.assert_allclose([math.degrees(j.angle_rad) for j in bench.arm.joints], [-90, 90, -20], atol=HOME_DEG)

@@ -15,7 +15,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
-from probewise.scene import Circle, Ellipse, HypothesisScene, KnownScene, disc_region
+from probewise.scene import Circle, Ellipse, HypothesisScene, KnownScene
 from probewise.sensor import (
     ACCURATE_NODES,
     FAST_NODES,
@@ -26,7 +26,6 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     NaiveSensor,
-    SceneView,
     Stage,
     footprint_of,
     mean_ssf_field,
@@ -180,8 +179,6 @@ class Doer:
         return self.does(value, theta)
 
 
-SHIFT = Doer("shift", Stage.POSE, lambda poses, t: replace(poses, x_mm=poses.x_mm + t))
-TURN = Doer("turn", Stage.POSE, lambda poses, t: replace(poses, orientation_rad=poses.orientation_rad + t))
 SPREAD = Doer("spread", Stage.FOOTPRINT, lambda f, t: replace(f, var_u=f.var_u + t[:, :, None] ** 2))
 CURVE = Doer("curve", Stage.RESPONSE, lambda u, t: u**t)
 GAIN = Doer("gain", Stage.GAIN, lambda signal, t: signal * (1 + t))
@@ -203,72 +200,6 @@ def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
         columns = np.array([[sizes[effect.name] for effect in chain.effects]])
         found = chain.predict(np.concatenate([theta, np.repeat(columns, 4, axis=0)], axis=1), plan)
         assert found == pytest.approx(wanted, abs=1e-9)
-
-
-def test_effects_before_the_footprint_act_a_hypothesis_each():
-    """Shifting and turning the pose of each hypothesis equals predicting from a moved plan, and so does shifting it."""
-    base = CHAINS["two_free"][0]
-    plan, theta = plan_of(), thetas(3, 2)
-    moves = np.array([[0.0, 0.0], [2.0, 0.5], [-1.0, 3.0]])
-    found = base.with_effects(TURN, SHIFT).predict(np.concatenate([theta, moves], axis=1), plan)
-    for i, (shift, turn) in enumerate(moves):
-        moved = replace(plan, x_mm=plan.x_mm + shift, orientation_rad=plan.orientation_rad + turn)
-        assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
-    found = base.with_effects(SHIFT).predict(np.concatenate([theta, moves[:, :1]], axis=1), plan)
-    for i, shift in enumerate(moves[:, 0]):
-        moved = replace(plan, x_mm=plan.x_mm + shift)
-        assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
-
-
-def test_an_effect_on_the_scene_may_give_each_hypothesis_its_own():
-    def grow(view, t):
-        disc = disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])
-        return SceneView({**view.regions, "disc": disc})
-
-    base, plan, theta = CHAINS["one_free"][0], plan_of(), thetas(2, 1)
-    found = base.with_effects(Doer("grow", Stage.SCENE, grow)).predict(
-        np.concatenate([theta, [[0.0], [3.0]]], axis=1), plan
-    )
-    larger = Chain(base.ssf, base.levels, KnownScene({**PATTERNS, "disc": kinds.Disc((3.0, 1.0), 11.0)}))
-    assert found[0] == pytest.approx(base.predict(theta, plan)[0], abs=1e-7)
-    assert found[1] == pytest.approx(larger.predict(theta, plan)[1], abs=1e-7)
-
-
-def test_a_footprint_that_varies_along_the_plan_equals_reading_by_reading():
-    widths = np.linspace(0, 6, 24)
-
-    def widen(footprint, t):
-        return replace(footprint, var_u=footprint.var_u + t[:, :, None] * widths[None, :, None])
-
-    base, plan, theta = CHAINS["two_free"][0], plan_of(), thetas(2, 2)
-    found = base.with_effects(Doer("widen", Stage.FOOTPRINT, widen)).predict(
-        np.concatenate([theta, [[1.0], [2.0]]], axis=1), plan
-    )
-    for j in range(24):
-        one = base.with_effects(SPREAD)
-        sizes = np.sqrt(widths[j] * np.array([[1.0], [2.0]]))
-        alone = one.predict(np.concatenate([theta, sizes], axis=1), plan.take(np.array([j])))
-        assert found[:, j] == pytest.approx(alone[:, 0], abs=1e-7)
-
-
-def test_a_known_width_with_a_place_of_each_hypothesis_equals_one_by_one():
-    """Only some of the footprint's arrays depend on the hypothesis; so do only some of the patterns."""
-
-    def move(footprint, t):
-        return replace(footprint, u_mm=footprint.u_mm + t[:, :, None])
-
-    def grow(view, t):
-        return SceneView({**view.regions, "disc": disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])})
-
-    plan = plan_of()
-    chain = Chain(fixed_mixture(TWO), FixedLevels(10, 50), KnownScene(PATTERNS))
-    for effect in (Doer("move", Stage.FOOTPRINT, move), Doer("grow", Stage.SCENE, grow)):
-        model = chain.with_effects(effect)
-        theta = np.array([[0.0], [1.5], [3.0]])
-        together = model.predict(theta, plan)
-        for i in range(3):
-            assert model.predict(theta[i : i + 1], plan)[0] == pytest.approx(together[i], abs=1e-8)
-        assert together[0] == pytest.approx(chain.predict(np.zeros((1, 0)), plan)[0], abs=1e-8)
 
 
 def test_effects_that_cannot_be_are_refused():

@@ -12,11 +12,8 @@ from probewise.errors import SlowWarning
 from probewise.recordings import patterns as kinds
 from probewise.scene import (
     EllipseRegion,
-    HalfPlaneRegion,
     PolygonRegion,
     QuadrantRegion,
-    RegionsOfMixedKinds,
-    UniformRegion,
     disc_region,
     region_of,
 )
@@ -178,35 +175,6 @@ def test_hypotheses_readings_and_gaussians_together_equal_one_by_one(pattern):
     for i, j, k in np.ndindex(3, 4, 2):
         alone = see(region, x[i, j, k], y[i, j, k], covariance(sd_1[i, 0, k], sd_2[i, 0, k], rho[i, 0, k]))
         assert together[i, j, k] == pytest.approx(alone, abs=1e-9)
-
-
-def test_a_batch_of_regions_equals_one_by_one():
-    rng = np.random.default_rng(3)
-    centers, angles = rng.normal(size=(6, 2)) * 5, rng.uniform(0, 6, 6)
-    corners = np.array([[-6.0, -4.0], [6.0, -4.0], [6.0, 4.0], [-6.0, 4.0]])
-    makers = [
-        lambda i: UniformRegion(angles[i] / 6),
-        lambda i: HalfPlaneRegion(angles[i], centers[i, 0]),
-        lambda i: QuadrantRegion(centers[i], np.sign(centers)[i]),
-        lambda i: disc_region(centers[i], 3 + angles[i]),
-        lambda i: EllipseRegion(centers[i], 4 + np.abs(centers)[i], angles[i]),
-        lambda i: PolygonRegion.from_vertices(centers[i][:, None] + corners),
-    ]
-    x, y = rng.normal(size=(2, 1, 5, 1)) * 6
-    cov = [np.reshape(value, (1, 1, 1)) for value in (16.0, 9.0, 5.0)]
-    parts = []
-    for make in makers:
-        whole = mean_albedo_under_gaussians(make(slice(None)), x, y, *cov)
-        parts.append(whole)
-        for i in range(6):
-            assert np.allclose(whole[i], mean_albedo_under_gaussians(make(slice(i, i + 1)), x, y, *cov)[0], atol=1e-10)
-    which = np.array([3, 0, 1, 3, 2, 0])
-    mixed = RegionsOfMixedKinds(
-        which, tuple(make(np.flatnonzero(which == k)) if (which == k).any() else None for k, make in enumerate(makers))
-    )
-    found = mean_albedo_under_gaussians(mixed, x, y, *cov)
-    for i, k in enumerate(which):
-        assert np.allclose(found[i], parts[k][i], atol=1e-10)
 
 
 @settings(max_examples=40, deadline=None)

@@ -56,20 +56,6 @@ def test_a_whole_turn_takes_no_time():
         assert duration_s(arm, turned, origin_mm=ORIGIN) == duration_s(arm, plan, origin_mm=ORIGIN)
 
 
-def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told):
-    plan = thinned(paper_plan())
-    readings = told.take(plan)
-    # A motor stops at a whole count, and the reading keeps the place that this count means.
-    told_mm = np.array([(r.pose.x_mm, r.pose.y_mm) for r in readings])
-    away_mm = np.abs(told_mm - np.stack([plan.x_mm, plan.y_mm], axis=-1))
-    assert 0.01 < away_mm.max() < 0.5
-    np.testing.assert_array_equal(recording_of_readings(plan, readings).plan.x_mm, told_mm[:, 0])
-    off = np.array([r.pose.orientation_rad for r in readings]) - plan.orientation_rad
-    off = np.degrees(np.angle(np.exp(1j * off)))
-    # The arm is 320 mm away: over 50 mm to either side its sensor turns by atan(50 / 320).
-    assert abs(off).max() == pytest.approx(math.degrees(math.atan2(50, 320)), abs=0.1)
-
-
 def test_it_goes_on_behind_the_rows_that_were_taken(told):
     plan = thinned(paper_plan())
     first = told.take(plan, first=len(plan) - 3)

@@ -77,23 +77,6 @@ def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole):
     assert (space.leave(swapped)[1] == -np.inf).all()
 
 
-def test_the_whole_of_gaussians_nearby_has_their_mean_and_covariance():
-    """Far less is tapered there than a hundredth; the moments of a mixture by another route."""
-    theta = np.array([[0.05, 1.0, 0.5, 0.05, 0.06, 0.01, 0.01, 2.0, 0.0, 0.08, 0.05, 0.0, 10.0, 60.0]])
-    g = theta[0, :-2].reshape(2, 6)
-    light = g[:, 0] / np.sqrt(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
-    share = light / light.sum()
-    mean = share @ g[:, 1:3]
-    whole = np.zeros((2, 2))
-    for s, (_, u, v, a, b, c) in zip(share, g, strict=True):
-        off = np.array([u, v]) - mean
-        whole += s * (0.5 * np.linalg.inv([[a, c], [c, b]]) + np.outer(off, off))
-    x = coordinates(prior(2, by_mass=True), whole=True).enter(theta)[0]
-    np.testing.assert_allclose(x[1:3], mean, atol=0.01)
-    np.testing.assert_allclose(x[3:5], np.log(np.diag(whole)), atol=0.01)
-    assert x[5] == pytest.approx(np.arctanh(whole[0, 1] / np.sqrt(whole[0, 0] * whole[1, 1])), abs=0.01)
-
-
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_without_labels_parameters_come_back_but_for_the_light_of_all(n):
     """Readings depend on ratios of light alone, so that the sum of its logs may differ; labels change no density."""

@@ -191,16 +191,6 @@ def test_an_audit_takes_the_noise_of_the_sensor_that_it_is_given(sensor, recordi
     assert "noise 0.6" in audit_plan(plan, sensor=sensor, effects=FEW).assumed
 
 
-@pytest.mark.slow
-def test_the_reports_package_shows_what_people_use_and_loads_it_when_asked():
-    assert dir(probewise.report) == probewise.report.__all__
-    code = "import probewise; print(probewise.report.plots.png.__name__, 'heart' in dir(probewise.report))"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.split() == ["png", "False"]
-    with pytest.raises(AttributeError, match="has no attribute 'heart'"):
-        _ = probewise.report.heart
-
-
 def test_the_verbs_take_a_table_and_a_simulator_too(tmp_path, sensor):
     """A file or a Simulator, one table or several; the same as the functions of `diagnosis` and `systems` give."""
     file, rng = tmp_path / "line.py", np.random.default_rng(1)

@@ -85,17 +85,3 @@ def test_an_instrument_of_ones_own_is_investigated_and_closed(few, tmp_path):
     assert closed.read_text() == "closed"
     assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
     assert "the world concealed" not in (out / "report.html").read_text()
-
-
-@pytest.mark.slow
-def test_the_emulated_arm_is_investigated_with_nobody_there(tmp_path):
-    out = tmp_path / "out"
-    assert run("investigate", "--arm", "emulator", "--plan", "paper", "--rounds", 1, "--quiet", "--out", out) == 0
-    assert len(read_recording(out / "recording.csv")) == len(paper_plan())
-    assert json.loads((out / "diagnosis.json").read_text())["verdict"] in (
-        "clean",
-        "named",
-        "unknown",
-        "cannot_tell",
-        "noise",
-    )

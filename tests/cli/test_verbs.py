@@ -2,7 +2,6 @@
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -50,21 +49,6 @@ def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quic
     assert "all 2 readings that it may take are taken" in pages[-1]
     assert all("possible faults after each reading" in page for page in pages)
     assert opened == [(out / "live.html").as_uri()]
-
-
-def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_path, monkeypatch, capsys):
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(exploration, "robot_view_png", stop)
-    out = tmp_path / "out"
-    assert run("explore", "--sensor", sensor_file, "--out", out, "--quiet") == 130
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    again = shlex.join(["probewise", "explore", "--sensor", str(sensor_file), "--out", str(out), "--quiet", "--resume"])
-    assert said.endswith(f"journal.jsonl keeps 1 reading; go on with: {again}\n")
-    assert len((out / "journal.jsonl").read_text().splitlines()) == 2
-    assert not (out / "report.html").exists()
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,6 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mixtures import fixed_mixture
 from scipy.special import ndtr
 
@@ -113,24 +111,6 @@ def test_theta_of_another_width_is_refused(model):
     sensor, draw = model
     with pytest.raises(ShapeError, match="theta has shape"):
         sensor.predict(draw(2)[:, :-1], plan_of())
-
-
-@settings(max_examples=20, deadline=None)
-@given(turn=st.floats(-7, 7), seed=st.integers(0, 1000))
-def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):
-    c, s = np.cos(turn), np.sin(turn)
-    rotation = np.array([[c, -s], [s, c]])
-    plan = plan_of(12, seed=seed, names=("boundary", "disc"))
-    turned_patterns = {
-        "boundary": kinds.HalfPlane(turn, 0.0),
-        "disc": kinds.Disc(tuple(rotation @ PATTERNS["disc"].center_mm), 8.0),
-    }
-    x, y = rotation @ np.stack([plan.x_mm, plan.y_mm])
-    turned = replace(plan, x_mm=x, y_mm=y, orientation_rad=plan.orientation_rad + turn, patterns=turned_patterns)
-    still = Chain(FreeMixture(2), FreeLevels(), KnownScene(plan.patterns))
-    moved = Chain(FreeMixture(2), FreeLevels(), KnownScene(turned_patterns))
-    theta = thetas(3, 2)
-    assert moved.predict(theta, turned) == pytest.approx(still.predict(theta, plan), abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -79,16 +79,3 @@ def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(name, monkeypat
     alone = built.predict(theta, PLAN)
     np.testing.assert_allclose(together, alone, atol=1e-6)
     assert np.abs(np.diff(together, axis=0)).max(axis=1).min() > 0.01
-
-
-def test_a_skirt_about_the_centre_of_many_gaussians_follows_their_amounts(monkeypatch):
-    """No free form: the common centre moves with the amounts, and what lies about it is seen once for each."""
-    halo = VOCABULARY["halo"].for_extent(Extent(10.0, 60.0, PLAN))
-    built = Chain(FreeMixture(9), FreeLevels(), KnownScene(PLAN.patterns), [halo])
-    shapes = np.tile(ONE, (12, 9))
-    shapes[:, 1::6] += np.linspace(-4.0, 4.0, 9)
-    shapes[:, 0] *= np.linspace(0.2, 5.0, 12)
-    theta = np.concatenate([shapes, np.tile([10.0, 60.0, 0.2, 9.0], (12, 1))], axis=1)
-    together = built.predict(theta, PLAN)
-    monkeypatch.setattr(chain_module, "_MANY", 10)
-    np.testing.assert_allclose(together, built.predict(theta, PLAN), atol=1e-6)

@@ -131,6 +131,24 @@ def test_an_instrument_is_closed_once_whatever_ends_it(error):
     assert own.closed == 1
 
 
+def test_one_that_is_a_context_manager_is_entered_and_left_as_such():
+    log = []
+
+    class Guarded(Own):
+        def __enter__(self):
+            log.append("in")
+            return self
+
+        def __exit__(self, kind, error, trace):
+            log.append(kind)
+
+    own = Guarded()
+    with pytest.raises(ValueError, match="x"), as_instrument(own):
+        raise ValueError("x")
+    assert log == ["in", ValueError]
+    assert own.closed == 0
+
+
 def test_what_gave_the_instrument_on_entering_is_kept_until_the_end_and_then_left():
     """A function with `yield`, once forgotten, would run to its end and switch off before the first reading."""
     log = []

@@ -68,25 +68,16 @@ def test_what_the_api_pages_lead_with_is_public():
         assert set(names) <= set(importlib.import_module(package).__all__), package
 
 
-DESTINATIONS = {
-    "calibrate": {"orders": "orders", "n_live": "live"},
-    "explore": {
-        "shape": "shape",
-        "truth": "truth",
-        "model": "model",
-        "utility": "utility",
-        "learn_sensor": "learn_sensor",
-        "batch": "batch",
-        "max_readings": "max_readings",
-    },
-    "audit": {"sensor": "sensor"},
-    "diagnose": {"sensor": "sensor", "thorough": "thorough"},
-}
+OPTIONS = [
+    ("calibrate", "orders", "orders"),
+    ("calibrate", "n_live", "live"),
+    *(("explore", n, n) for n in ["shape", "truth", "model", "utility", "learn_sensor", "batch", "max_readings"]),
+    *((verb, "sensor", "sensor") for verb in ("audit", "diagnose")),
+    ("diagnose", "thorough", "thorough"),
+]
 
 
-@pytest.mark.parametrize(
-    ("verb", "parameter", "option"), [(v, p, o) for v, names in DESTINATIONS.items() for p, o in names.items()]
-)
+@pytest.mark.parametrize(("verb", "parameter", "option"), OPTIONS)
 def test_the_command_line_and_python_have_the_same_defaults(verb, parameter, option):
     parser = argparse.ArgumentParser()
     importlib.import_module(f"probewise.cli.{verb}").add_arguments(parser)

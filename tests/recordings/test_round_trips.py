@@ -136,17 +136,7 @@ def test_round_angles_are_written_round():
 
 
 def plan_of(n, **changes):
-    base = Plan(
-        x_mm=np.arange(float(n)),
-        y_mm=np.zeros(n),
-        orientation_rad=np.zeros(n),
-        time_s=np.arange(float(n)),
-        scan=np.zeros(n, dtype=int),
-        scan_names=("a",),
-        pattern=np.zeros(n, dtype=int),
-        pattern_names=("white",),
-        patterns={"white": Uniform(1.0)},
-    )
+    base = Plan.from_arrays(x_mm=np.arange(n), y_mm=0, scan=["a"] * n, patterns={"white": Uniform(1.0)}, unit="LEGO")
     return replace(base, **changes)
 
 

@@ -12,6 +12,13 @@ from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ss
 MIXTURE = FixedMixture([1.0], [[0.7, 1.3]], [[[20.0, 6.0], [6.0, 30.0]]])
 
 
+def poses_about(n_points, seed=2):
+    rng = np.random.default_rng(seed)
+    return Poses(
+        rng.uniform(-15, 15, (1, n_points)), rng.uniform(-15, 15, (1, n_points)), rng.uniform(0, 6, (1, n_points))
+    )
+
+
 def pixels(pixel_mm, shift_mm=0.0):
     u = np.arange(-33, 33.01, pixel_mm) + shift_mm
     return mean_ssf_field(MIXTURE.footprint(np.zeros((1, 0))), u_mm=u, v_mm=u)
@@ -30,9 +37,17 @@ def test_pixels_err_over_an_edge_as_the_page_says(sd_mm, pixel_mm, error):
     assert worst < 0.0202 * (pixel_mm / sd_mm) ** 2 * 1.01
 
 
-def test_poses_and_regions_of_different_numbers_of_hypotheses_are_refused():
+def test_many_hypotheses_and_poses_equal_one_by_one():
     rng = np.random.default_rng(0)
+    discs = disc_region(rng.normal(size=(3, 2)), np.array([5.0, 9.0, 14.0]))
     field = pixels(2.0)
     poses = Poses(rng.normal(size=(3, 4)) * 9, rng.normal(size=(1, 4)) * 9, np.zeros((1, 1)))
+    together = mean_albedo_by_pixels(discs, field, poses)
+    for i in range(3):
+        one = disc_region(discs.center_mm[i : i + 1], discs.semi_axes_mm[i : i + 1, 0])
+        alone = mean_albedo_by_pixels(one, field, Poses(poses.x_mm[i : i + 1], poses.y_mm, poses.orientation_rad))
+        assert np.allclose(together[i], alone[0])
+    shared = mean_albedo_by_pixels(discs, field, poses_about(4))
+    assert shared.shape == (3, 4)
     with pytest.raises(ShapeError, match="poses of 3 hypotheses, 2 regions"):
         mean_albedo_by_pixels(disc_region(np.zeros((2, 2)), np.array([5.0, 9.0])), field, poses)

@@ -80,6 +80,19 @@ def test_the_ruler_measures_what_survives_the_refit(of, sizer, plan):
     assert np.linalg.norm(rest) / 0.5 == pytest.approx(12, rel=0.02)
 
 
+def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
+    one, other = known.ambient_gradient(0.1, 0.0), known.gain_drift(0.1, 60.0)
+    clean = sizer.clean_recording.readings
+    design = np.stack([np.ones(len(plan)), clean], axis=-1)
+    rests = [
+        sizer.recording_with_effects(e).readings
+        - design @ np.linalg.lstsq(design, sizer.recording_with_effects(e).readings, rcond=None)[0]
+        for e in (one, other)
+    ]
+    expected = rests[0] @ rests[1] / np.linalg.norm(rests[0]) / np.linalg.norm(rests[1])
+    assert sizer.cosine(one, other) == pytest.approx(expected, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     "effect",
     [known.correlated_noise(0.5), known.signal_dependent_noise(3.0), known.outliers(0.04, 8.0)],

@@ -6,14 +6,6 @@ import numpy as np
 import pytest
 
 from probewise.inference import StudentT
-from probewise.sensor.ssf import footprint_of
-
-
-def test_the_papers_exponents_give_data_to_the_minus_403():
-    """Table 1: four sets of 101 readings and one of 4, each to the power (N_i - 1)/2 of a square."""
-    sets = [101] * 4 + [4]
-    assert sum(n - 1 for n in sets) == 403
-    assert sum(sets) == 408
 
 
 def test_a_proper_sigma_prior_counts_every_reading():
@@ -26,31 +18,12 @@ def test_a_proper_sigma_prior_counts_every_reading():
     assert one - ten == pytest.approx(408 * math.log(10), rel=1e-9)
 
 
-def test_the_odds_of_the_table():
-    """Table 1: N = 1, 2, 3 at -665.5, -674.9, -671.9."""
-    assert math.exp(-665.5 + 674.9) == pytest.approx(12088, rel=1e-3)
-    assert math.exp(9) == pytest.approx(8103, rel=1e-3)
-    assert math.exp(-665.5 + 671.9) == pytest.approx(602, rel=1e-3)
-
-
-def test_bits_to_know_a_circle_to_four_millimetres():
-    """Differential entropies in bits: uniform prior, normal posterior of sd 4 mm."""
-    prior = math.log2(1048 * 520 * 130)
-    posterior = 3 * math.log2(4 * math.sqrt(2 * math.pi * math.e))
-    assert (prior, posterior) == (pytest.approx(26.1, abs=0.05), pytest.approx(12.1, abs=0.05))
-    assert prior - posterior == pytest.approx(13.9, abs=0.05)
-
-
-def test_the_radius_range_that_25_bits_would_mean():
-    """Counting cells of 1 mm and of 4 mm over the field."""
+def test_the_arithmetic_of_the_page():
+    """Exponents and odds of Table 1; bits to know a circle to 4 mm, by entropies and by cells of 1 mm and of 4 mm."""
+    assert (sum(n - 1 for n in (101, 101, 101, 101, 4)), sum((101, 101, 101, 101, 4))) == (403, 408)
+    odds = [math.exp(-665.5 + 674.9), math.exp(9), math.exp(-665.5 + 671.9)]
+    assert odds == pytest.approx([12088, 8103, 602], rel=1e-3)
+    prior, posterior = math.log2(1048 * 520 * 130), 3 * math.log2(4 * math.sqrt(2 * math.pi * math.e))
+    assert [prior, posterior, prior - posterior] == pytest.approx([26.1, 12.1, 13.9], abs=0.05)
     assert pytest.approx(61.6, abs=0.1) == 2**25 / (1048 * 520)
     assert pytest.approx(3941, abs=1) == 4 * 2**25 / (1048 * 520 / 16)
-
-
-def test_a_b_c_are_half_the_inverse_covariance():
-    """Eq. for the SSF: exponent A dx^2 + B dy^2 + 2 C dx dy."""
-    theta = np.array([[1.0, 0.0, 0.0, 0.05, 0.1, 0.02]])
-    got = footprint_of(theta, 1)
-    covariance = 0.5 * np.linalg.inv([[0.05, 0.02], [0.02, 0.1]])
-    found = [np.ravel(x)[0] for x in (got.var_u, got.var_v, got.cov_uv)]
-    np.testing.assert_allclose(found, [covariance[0, 0], covariance[1, 1], covariance[0, 1]])

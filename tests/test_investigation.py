@@ -161,13 +161,8 @@ def test_an_instrument_at_another_height_than_its_sensors_calibration_goes_on_to
     assert abs(repaired.median()["u_1"]) < 0.1
 
 
-def first_scans(n):
-    plan = paper_plan()
-    return plan.take(plan.scan < n)
-
-
 def test_scans_are_taken_whole_or_not_at_all():
-    plan = first_scans(2)
+    plan = scans(0, 1)
     n_first = int((plan.scan == 0).sum())
     cut = Budget(len(plan) - 1).affordable_scans(plan, 0.0)
     assert len(cut) == n_first
@@ -175,7 +170,7 @@ def test_scans_are_taken_whole_or_not_at_all():
 
 
 def test_minutes_count_from_the_end_of_the_last_round():
-    plan = first_scans(1)
+    plan = scans(0)
     minutes = float(plan.time_s.max() + 600.0) / 60
     assert Budget(minutes=minutes + 0.01).affordable_scans(plan, -600.0) is plan
     assert Budget(minutes=minutes - 0.01).affordable_scans(plan, -600.0) is None
@@ -186,11 +181,6 @@ TAKE = SimulatedRecorder(true_world("paper"), seed=3)
 
 class Cut(Exception):
     pass
-
-
-def few_rows():
-    plan = paper_plan()
-    return plan.take(plan.scan < 1)
 
 
 def cut_after(n):
@@ -206,12 +196,12 @@ def cut_after(n):
 @pytest.mark.slow
 def test_a_round_that_was_cut_is_the_round_that_was_not(tmp_path, monkeypatch):
     monkeypatch.setattr("probewise.investigation._KEPT_AGAIN_S", 0.0)
-    whole = RoundsFolder(tmp_path / "whole", {"seed": 1}, resume=False).record_round(1, few_rows(), "", take=TAKE)
+    whole = RoundsFolder(tmp_path / "whole", {"seed": 1}, resume=False).record_round(1, scans(0), "", take=TAKE)
     with pytest.raises(Cut):
-        RoundsFolder(tmp_path / "cut", {"seed": 1}, resume=False).record_round(1, few_rows(), "", take=cut_after(5))
+        RoundsFolder(tmp_path / "cut", {"seed": 1}, resume=False).record_round(1, scans(0), "", take=cut_after(5))
     folder = RoundsFolder(tmp_path / "cut", {"seed": 1}, resume=True)
     assert folder.n_readings == 5
-    resumed = folder.record_round(1, few_rows(), "", take=TAKE)
+    resumed = folder.record_round(1, scans(0), "", take=TAKE)
     assert (tmp_path / "cut" / "1.csv").read_bytes() == (tmp_path / "whole" / "1.csv").read_bytes()
     np.testing.assert_array_equal(resumed.readings, whole.readings)
 
@@ -219,14 +209,14 @@ def test_a_round_that_was_cut_is_the_round_that_was_not(tmp_path, monkeypatch):
 def test_an_instrument_that_fails_soon_loses_no_reading(tmp_path):
     folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
     with pytest.raises(Cut):
-        folder.record_round(1, few_rows(), "", take=cut_after(5))
+        folder.record_round(1, scans(0), "", take=cut_after(5))
     assert folder.n_readings == 5
 
 
 def test_a_plan_that_was_written_decides(tmp_path):
     folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
-    first = folder.record_round(1, few_rows(), "", take=TAKE)
-    other = few_rows().take(np.arange(3))
+    first = folder.record_round(1, scans(0), "", take=TAKE)
+    other = scans(0).take(np.arange(3))
     np.testing.assert_array_equal(folder.record_round(1, other, "", take=TAKE).readings, first.readings)
 
 
@@ -234,7 +224,7 @@ def test_two_investigations_do_not_mix(tmp_path):
     begin = partial(RoundsFolder, tmp_path / "rounds")
     with pytest.raises(FileError, match="omit --resume to begin a new one"):
         begin({"seed": 1}, resume=True)
-    begin({"seed": 1}, resume=False).record_round(1, few_rows(), "", take=TAKE)
+    begin({"seed": 1}, resume=False).record_round(1, scans(0), "", take=TAKE)
     with pytest.raises(FileError, match="--resume to continue it"):
         begin({"seed": 1}, resume=False)
     with pytest.raises(FileError, match="seed 1"):
@@ -246,7 +236,7 @@ def test_two_investigations_do_not_mix(tmp_path):
 
 def test_each_round_has_noise_of_its_own():
     take = SimulatedRecorder(true_world("paper"), seed=3)
-    one, other = ([r.value for r in take(number, few_rows(), "", ())] for number in (1, 2))
+    one, other = ([r.value for r in take(number, scans(0), "", ())] for number in (1, 2))
     assert one != other
 
 

@@ -1,6 +1,7 @@
 """What a newcomer gets wrong first is said in words, where it is made: never a KeyError or a TypeError from below."""
 
 import warnings
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -108,16 +109,28 @@ def found():
         return run(Bell(), rng=np.random.default_rng(1), n_live=20, stop=RemainingEvidence(5.0))
 
 
+calibrate, explore, diagnose, sampled, fitted, predicted, investigated = (
+    partial(verb, rng=RNG)
+    for verb in (
+        probewise.calibrate,
+        probewise.explore,
+        diagnosis.diagnose,
+        run,
+        fit_simulator,
+        predict_system,
+        investigate,
+    )
+)
 A_RECORDING = "allowed: a Recording: read_recording"
 A_SENSOR = "allowed: a FittedSensor: read_sensor"
 
 MISTAKES = {
     # randomness
-    "a seed to calibrate": (lambda: probewise.calibrate(RECORDING, rng=0), r"rng is 0; .*default_rng\(0\)"),
+    "a seed to calibrate": (lambda: calibrate(RECORDING, rng=0), r"rng is 0; .*default_rng\(0\)"),
     # calibrate
-    "a path": (lambda: probewise.calibrate("mine.csv", rng=RNG), f"recording is 'mine.csv'; {A_RECORDING}"),
-    "an unknown pattern": (lambda: probewise.calibrate(UNDESCRIBED, rng=RNG), "'edge' is named but not described"),
-    "one order": (lambda: probewise.calibrate(RECORDING, orders=2, rng=RNG), "orders is 2; allowed: one or more whole"),
+    "a path": (lambda: calibrate("mine.csv"), f"recording is 'mine.csv'; {A_RECORDING}"),
+    "an unknown pattern": (lambda: calibrate(UNDESCRIBED), "'edge' is named but not described"),
+    "one order": (lambda: calibrate(RECORDING, orders=2), "orders is 2; allowed: one or more whole"),
     # predict
     "swapped": (lambda: probewise.predict(PLAN, SENSOR), "sensor is .*order predict"),
     "readings twice": (
@@ -129,32 +142,22 @@ MISTAKES = {
         lambda: probewise.audit(PLAN).effects_with_detectability("invisibel"),
         "detectability is 'invisibel'; .*; did you mean invisible",
     ),
-    # diagnose
     # explore
-    "a path to explore": (lambda: probewise.explore("s.json", rng=RNG), f"sensor is 's.json'; {A_SENSOR}"),
-    "an unknown shape": (
-        lambda: probewise.explore(SENSOR, shape="heart", rng=RNG),
-        "shape is 'heart'; allowed: one of",
-    ),
-    "a class of shapes": (lambda: probewise.explore(SENSOR, shape=Circle, rng=RNG), r"a value of it is Circle\("),
-    "levels for nobody": (lambda: probewise.explore(SENSOR, levels=RECORDING, rng=RNG), "levels is .*; allowed: None"),
-    "an unknown utility": (lambda: probewise.explore(SENSOR, utility="bits", rng=RNG), "utility is 'bits'; allowed"),
-    "a port as arm": (
-        lambda: probewise.explore(SENSOR, arm="nxt:COM5", rng=RNG),
-        "arm is 'nxt:COM5'; allowed: an Inst",
-    ),
+    "a path to explore": (lambda: explore("s.json"), f"sensor is 's.json'; {A_SENSOR}"),
+    "an unknown shape": (lambda: explore(SENSOR, shape="heart"), "shape is 'heart'; allowed: one of"),
+    "a class of shapes": (lambda: explore(SENSOR, shape=Circle), r"a value of it is Circle\("),
+    "levels for nobody": (lambda: explore(SENSOR, levels=RECORDING), "levels is .*; allowed: None"),
+    "an unknown utility": (lambda: explore(SENSOR, utility="bits"), "utility is 'bits'; allowed"),
+    "a port as arm": (lambda: explore(SENSOR, arm="nxt:COM5"), "arm is 'nxt:COM5'; allowed: an Inst"),
     "swapped experiment": (lambda: Experiment(MODEL, CIRCLE, GaussianKnown(1), 0.7), "shape is .*; allowed: a shape"),
     # nested sampling
-    "a function as problem": (
-        lambda: run(lambda theta: 0.0, rng=RNG),
-        "allowed: a problem with a prior and a log_likel",
-    ),
+    "a function as problem": (lambda: sampled(lambda theta: 0.0), "allowed: a problem with a prior and a log_likel"),
     "a scalar likelihood": (
-        lambda: run(Bell(lambda theta: -0.5 * float((theta**2).sum())), rng=RNG),
+        lambda: sampled(Bell(lambda theta: -0.5 * float((theta**2).sum()))),
         r"returned shape \(\); allowed: \(300,\), one number per hypothesis: theta is a batch of shape \(300, 2\)",
     ),
-    "a bar of nested sampling": (lambda: run(Bell(), rng=RNG, progress=True), "progress is True; allowed: a function"),
-    "a number as stopping rule": (lambda: run(Bell(), rng=RNG, stop=0.1), r"stop is 0.1; .*RemainingEvidence\(dlogz"),
+    "a bar of nested sampling": (lambda: sampled(Bell(), progress=True), "progress is True; allowed: a function"),
+    "a number as stopping rule": (lambda: sampled(Bell(), stop=0.1), r"stop is 0.1; .*RemainingEvidence\(dlogz"),
     "an interval by name": (lambda: found().interval("x"), "mass is 'x'; .*columns of the result are x 0, y 1"),
     # priors
     "bounds for a distribution": (
@@ -177,16 +180,10 @@ MISTAKES = {
         "what light returned is None; allowed: a number",
     ),
     # instruments of one's own
-    "an arm that cannot measure": (
-        lambda: probewise.explore(SENSOR, arm=Bell(), rng=RNG),
-        r"object with measure\(pose",
-    ),
-    "a Calibration to explore": (
-        lambda: probewise.explore(CALIBRATION, rng=RNG),
-        "take its .sensor, this is the OfOne",
-    ),
+    "an arm that cannot measure": (lambda: explore(SENSOR, arm=Bell()), r"object with measure\(pose"),
+    "a Calibration to explore": (lambda: explore(CALIBRATION), "take its .sensor, this is the OfOne"),
     "a truth by wrong names": (
-        lambda: probewise.explore(SENSOR, truth={"x_mm": 500, "radius_mm": 90}, rng=RNG),
+        lambda: explore(SENSOR, truth={"x_mm": 500, "radius_mm": 90}),
         "truth is .*; allowed: one number for each of x_mm, y_mm, radius_mm",
     ),
     # files
@@ -209,8 +206,8 @@ MISTAKES = {
         lambda: diagnose_system(TABLE, OVEN, rng=RNG),
         r"simulator is .*; allowed: a Simulator\(",
     ),
-    "a table of no row": (lambda: fit_simulator(OVEN, {"t_s": [], "temp_c": []}, rng=RNG), "table is 'without a row'"),
-    "a simulator for its fit": (lambda: predict_system(OVEN, TABLE, rng=RNG), "fitted is .*; allowed: a FittedSystem"),
+    "a table of no row": (lambda: fitted(OVEN, {"t_s": [], "temp_c": []}), "table is 'without a row'"),
+    "a simulator for its fit": (lambda: predicted(OVEN, TABLE), "fitted is .*; allowed: a FittedSystem"),
     "a file for a function": (
         lambda: simulator(simulate="oven.py"),
         r"simulate is 'oven.py'; .*read_simulator\('FILE.py'\)",
@@ -222,15 +219,15 @@ MISTAKES = {
     ),
     # models and effects of one's own
     "a function for a null": (
-        lambda: diagnosis.diagnose(RECORDING, null=lambda p, plan: 0, rng=RNG),
+        lambda: diagnose(RECORDING, null=lambda p, plan: 0),
         r"null is .*; allowed: a null model: SensorAndShape",
     ),
     "an effect by another name": (
-        lambda: diagnosis.diagnose(RECORDING, effects={"lagg": VOCABULARY["lag"]}, rng=RNG),
+        lambda: diagnose(RECORDING, effects={"lagg": VOCABULARY["lag"]}),
         "effects is 'lagg'; allowed: 'lag', the name of that effect",
     ),
     "a class for an effect": (
-        lambda: diagnosis.diagnose(RECORDING, effects={"own": Effect}, rng=RNG),
+        lambda: diagnose(RECORDING, effects={"own": Effect}),
         r"effects\['own'\] is .*; allowed: a function decorated with probewise.effects.light_effect",
     ),
     "a likelihood of one number": (
@@ -240,17 +237,14 @@ MISTAKES = {
         r"log_prob of OneNumber returned shape \(\); allowed: \(2,\), one number per hypothesis",
     ),
     # investigations
-    "a number for a budget": (
-        lambda: investigate(record, PLAN, budget=300, rng=RNG),
-        r"budget is 300; allowed: a Budget\(",
-    ),
+    "a number for a budget": (lambda: investigated(record, PLAN, budget=300), r"budget is 300; allowed: a Budget\("),
     # the verbs
     "a bar of another kind": (
-        lambda: probewise.calibrate(RECORDING, rng=RNG, progress=lambda done: None),
+        lambda: calibrate(RECORDING, progress=lambda done: None),
         r"progress is .*; allowed: True, False, or a function progress\(stage, done, total, note\)",
     ),
     "a folder that cannot be": (
-        lambda: probewise.explore(SENSOR, journal="/proc/nowhere/run.jsonl", rng=RNG, progress=False),
+        lambda: explore(SENSOR, journal="/proc/nowhere/run.jsonl", progress=False),
         "/proc/nowhere: cannot be made",
     ),
     # drawings

@@ -43,17 +43,6 @@ def test_counts_that_no_converter_gives_are_refused(raw):
         normalized_from_counts(raw)
 
 
-def test_a_reading_that_is_not_valid_yet_is_left_out(brick, paper_brick):
-    """For a while after a change of type the brick shows the old value; here it is 1000 counts."""
-    light = brick.light_sensor(1)
-    light.set_led()
-    assert light.read() == 500
-    assert paper_brick.input[:2] == [5, 0]
-    light.set_led(False)
-    assert light.read() == 500
-    assert paper_brick.input[:2] == [6, 0]
-
-
 def test_a_flash_gives_a_reading_and_leaves_the_led_off_even_where_the_reading_fails(brick, paper_brick, clock):
     light = brick.light_sensor(1)
     assert [light.flash() for _ in range(2)] == [500, 500]

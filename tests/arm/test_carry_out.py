@@ -20,7 +20,7 @@ from probewise.arm import (
 )
 from probewise.arm.carry_out import duration_s
 from probewise.errors import ParameterError, ReachError
-from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
+from probewise.recordings import paper_plan
 
 GEOMETRY = read_geometry(shipped_geometry_path())
 ORIGIN = (524.0, 260.0)
@@ -48,36 +48,12 @@ def thinned(plan, step=20):
     return plan.take(np.r_[0 : len(plan) - 4 : step, len(plan) - 4 : len(plan)])
 
 
-def test_the_papers_plan_asks_for_four_turns_and_five_patterns(told):
-    plan = thinned(paper_plan())
-    readings = told.take(plan)
-    assert len(readings) == len(plan)
-    patterns = [text.split("'")[1] for text in told.asked if text.startswith("lay sheet")]
-    assert patterns == ["boundary", "quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d"]
-    turns = [text.split(" degrees")[0].split()[-1] for text in told.asked if text.startswith("turn")]
-    assert turns == ["90", "180", "270", "0"]
-
-
 def test_a_whole_turn_takes_no_time():
     plan = thinned(paper_plan())
     turned = dataclasses.replace(plan, orientation_rad=plan.orientation_rad + math.tau * (np.arange(len(plan)) % 2))
     arm = SimulatedArm(lambda pose, time_s, height_mm: 10.0)
     with arm:
         assert duration_s(arm, turned, origin_mm=ORIGIN) == duration_s(arm, plan, origin_mm=ORIGIN)
-
-
-def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told):
-    plan = thinned(paper_plan())
-    readings = told.take(plan)
-    # A motor stops at a whole count, and the reading keeps the place that this count means.
-    told_mm = np.array([(r.pose.x_mm, r.pose.y_mm) for r in readings])
-    away_mm = np.abs(told_mm - np.stack([plan.x_mm, plan.y_mm], axis=-1))
-    assert 0.01 < away_mm.max() < 0.5
-    np.testing.assert_array_equal(recording_of_readings(plan, readings).plan.x_mm, told_mm[:, 0])
-    off = np.array([r.pose.orientation_rad for r in readings]) - plan.orientation_rad
-    off = np.degrees(np.angle(np.exp(1j * off)))
-    # The arm is 320 mm away: over 50 mm to either side its sensor turns by atan(50 / 320).
-    assert abs(off).max() == pytest.approx(math.degrees(math.atan2(50, 320)), abs=0.1)
 
 
 def test_it_goes_on_behind_the_rows_that_were_taken(told):
@@ -107,24 +83,6 @@ def test_what_the_arm_has_not_is_refused(told, name, value):
     column[3] = value
     with pytest.raises(ParameterError, match=f"the plan's {name} is {value}"):
         told.take(dataclasses.replace(plan, covariates={name: column}))
-
-
-def test_a_recording_says_what_was_read_and_comes_back_from_its_file(tmp_path):
-    plan = thinned(two_way_plan(), 60)
-    readings = [
-        Reading(
-            20.0 + k, Pose(plan.x_mm[k], plan.y_mm[k], 0.01 * k), 2.5 * k, {"battery_mv": 7400.0 - k, "height_mm": 14.0}
-        )
-        for k in range(5)
-    ]
-    write_recording(recording_of_readings(plan, readings), tmp_path / "r.csv")
-    back = read_recording(tmp_path / "r.csv")
-    np.testing.assert_array_equal(back.readings, [20, 21, 22, 23, 24])
-    np.testing.assert_array_equal(back.plan.time_s, 2.5 * np.arange(5))
-    np.testing.assert_array_equal(back.plan.orientation_rad, 0.01 * np.arange(5))
-    np.testing.assert_array_equal(back.plan.covariates["battery_mv"], 7400.0 - np.arange(5))
-    np.testing.assert_array_equal(back.plan.x_mm, plan.x_mm[:5])
-    assert [back.plan.pattern_names[k] for k in back.plan.pattern] == [plan.pattern_names[k] for k in plan.pattern[:5]]
 
 
 def test_what_a_plan_commands_stays_in_rows_that_are_read_after_a_resumption():

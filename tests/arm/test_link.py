@@ -169,24 +169,6 @@ def test_an_answer_that_cannot_be_true_is_asked_for_again(link, script):
         link.ask(read, check=is_bright)
 
 
-def test_an_interrupted_question_does_not_leave_its_answer_to_the_next(link, script):
-    """Ctrl-C between question and answer; then the motors are stopped, and must not take it for theirs."""
-
-    def interrupted(size, timeout_s):
-        if not timeout_s:  # a look before the question is sent
-            return b""
-        del script.read
-        raise KeyboardInterrupt
-
-    script.expect(LIGHT, (0.06, DARK))
-    script.read = interrupted
-    with pytest.raises(KeyboardInterrupt):
-        link.ask(read)
-    script.expect(*FENCE)
-    script.expect(LIGHT, (0.06, BRIGHT))
-    assert link.ask(read).normalized == 565
-
-
 def test_the_radio_is_given_time_to_turn_round(link, script):
     """60 ms a question, at least, and 30 ms after its answer; without an answer 15 ms."""
     for _ in range(3):
@@ -205,39 +187,25 @@ def test_the_radio_is_given_time_to_turn_round(link, script):
 
 def test_a_long_run_keeps_the_brick_awake(link, script, clock):
     """Every minute, though only questions are asked, which do not restart the brick's sleep timer."""
-    for _ in range(4):
+    for asleep in (False, False, True):
         clock.sleep(20.0)
-        if clock.now_s > 160:
+        if asleep:
             script.expect(ASLEEP, (0.06, AWAKE))
-            script.expect(LIGHT, (0.06, BRIGHT))
-            link.ask(read)
-            break
         script.expect(LIGHT, (0.06, BRIGHT))
         link.ask(read)
-    else:
-        pytest.fail("the brick was left to fall asleep")
 
 
-def test_a_brick_that_sleeps_soon_is_told_more_often(script, clock):
-    """A limit of 30 s, which no menu has: every 10 s."""
+@pytest.mark.parametrize(("limit", "waits_s"), [("30 75 00 00", (9.0, 1.1)), ("00 00 00 00", (59.0, 1.1))])
+def test_a_brick_is_kept_awake_as_often_as_its_limit_needs(script, clock, limit, waits_s):
+    """With one of 30 s, which no menu has, every 10 s; one that never sleeps is asked every minute."""
     link = Link(script, clock=clock)
     script.expect(*FENCE)
     for _ in range(2):
-        script.expect(ASLEEP, (0.06, "07 00 02 0D 00 30 75 00 00"))
+        script.expect(ASLEEP, (0.06, f"07 00 02 0D 00 {limit}"))
         link.keep_awake()
-        clock.sleep(9.0)
+        clock.sleep(waits_s[0])
         link.keep_awake()
-        clock.sleep(1.1)
-    script.finish()
-
-
-def test_a_brick_that_never_sleeps_is_asked_no_more_often(script, clock):
-    link = Link(script, clock=clock)
-    script.expect(*FENCE)
-    script.expect(ASLEEP, (0.06, "07 00 02 0D 00 00 00 00 00"))
-    link.keep_awake()
-    clock.sleep(59.0)
-    link.keep_awake()
+        clock.sleep(waits_s[1])
     script.finish()
 
 

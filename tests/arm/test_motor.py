@@ -80,16 +80,6 @@ def test_a_move_whose_answer_does_not_come_is_never_made_twice(motor, paper_bric
         assert paper_brick.motors[0].position <= highest + 1
 
 
-@pytest.mark.parametrize("which", [0, 1, 2, 3])
-def test_a_telegram_that_gets_lost_while_the_target_is_sought_does_no_harm(clock, paper_brick, which):
-    paper_brick.motors[0].target = -700
-    motor = Motor(Link(paper_brick, clock=clock), 0, clock=clock)
-    motor.counts()
-    paper_brick.lose = {len(paper_brick.commands) + 1 + which: "command"}
-    assert abs(motor.move_to(200, 1) - 200) <= 1
-    assert not paper_brick.lose
-
-
 def test_a_reset_makes_the_place_zero_and_the_target_is_still_known(motor, paper_brick):
     motor.move_to(500, 1)
     motor.reset_counter()

@@ -11,6 +11,7 @@ from probewise.errors import FileError, LinkError, ParameterError, ReachError, S
 from probewise.recordings import HalfPlane, Plan, Quadrant, Uniform, read_recording, write_recording
 
 PLACES = np.array([[0.0, 0.0], [30.0, 40.0]])
+HERE = Pose(1.0, 2.0)
 
 
 class Own:
@@ -59,7 +60,6 @@ def test_what_is_known_of_a_reading_takes_the_place_of_what_was_asked_for_and_th
     assert math.isnan(reading.covariates["lux"])
 
 
-HERE = Pose(1.0, 2.0)
 BAD = {
     "nothing": (None, "what measure returned is None; allowed: a finite number, or a dict"),
     "a text": ("41", "what measure returned is '41'; allowed: a finite number"),
@@ -111,17 +111,15 @@ def test_one_value_stands_for_all_places():
         ({"reachable": lambda p: [True]}, "reachable", r"reachable returned shape \(1,\); allowed: \(2,\)"),
         ({"reachable": lambda p: ["yes", "no"]}, "reachable", "what reachable returned is .*; allowed: True or False"),
         ({"orientation_rad": lambda p: None}, "orientation_rad", "what orientation_rad returned is None"),
+        *(
+            ({"travel_s": lambda start, p, s=s: s}, "travel_s", "travel_s returned")
+            for s in (None, -1.0, math.nan, "soon", [1.0, 2.0, 3.0])
+        ),
     ],
 )
 def test_what_it_says_of_places_is_checked(more, ask, message):
     with pytest.raises((ParameterError, ShapeError), match=message):
-        getattr(entered(Own(**more)), ask)(PLACES)
-
-
-@pytest.mark.parametrize("seconds", [None, -1.0, math.nan, "soon", [1.0, 2.0, 3.0]])
-def test_what_it_says_of_time_is_checked(seconds):
-    with pytest.raises((ParameterError, ShapeError), match="travel_s returned"):
-        entered(Own(travel_s=lambda start, places: seconds)).travel_s(Pose(0.0, 0.0), PLACES)
+        getattr(entered(Own(**more)), ask)(*[HERE] * (ask == "travel_s"), PLACES)
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
@@ -297,17 +295,6 @@ def test_a_plan_is_carried_out_with_a_person_who_lays_patterns_and_turns_the_sen
 
 def turns_asked(asked):
     return [round(math.degrees(request.turned_rad)) for request in asked if request.turned_rad is not None]
-
-
-def test_a_sensor_that_the_rows_taken_before_may_have_left_turned_is_turned_back():
-    asked = []
-    angles = [0.0, math.pi / 3, 0.0, 0.0]
-    taken(Own(), asked, plan(orientation_rad=angles), first=2)
-    assert turns_asked(asked) == [0]
-    with as_instrument(Own()) as arm:  # all rows of the first plan were taken in an earlier session
-        for first in (4, 0):
-            list(carry_out(arm, plan(orientation_rad=angles), origin_mm=(0.0, 0.0), ask=asked.append, first=first))
-    assert turns_asked(asked) == [0, 0, 60, 0]
 
 
 @pytest.mark.parametrize(

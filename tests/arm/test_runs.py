@@ -113,16 +113,6 @@ def then(first, after):
     return both
 
 
-def test_a_recording_goes_on_only_with_its_own_plan(bricks, plan_file, tmp_path, capsys):
-    bricks[0] = 6  # of these two look at the sheet
-    out = tmp_path / "rec.csv"
-    run(capsys, "arm", "record", plan_file, "--out", out, "--arm", "nxt:x")
-    status, said = run(capsys, "arm", "record", "paper", "--out", out, "--arm", "nxt:x", "--resume")
-    assert status == 2
-    assert "readings of another plan" in said
-    assert len(read_recording(out)) == 3
-
-
 class Terminal(io.StringIO):
     """A terminal at which somebody has typed."""
 

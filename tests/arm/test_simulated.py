@@ -5,17 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import (
-    Instrument,
-    Pose,
-    Reach,
-    Reading,
-    ReadingScale,
-    SimulatedArm,
-    Speed,
-    read_geometry,
-    shipped_geometry_path,
-)
+from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Speed, read_geometry, shipped_geometry_path
 from probewise.errors import ParameterError, ReachError, ShapeError
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1048, 131), np.linspace(0, 520, 65)), axis=-1).reshape(-1, 2)
@@ -33,10 +23,6 @@ def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
     apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
     np.testing.assert_array_equal(ring.contains(GRID[apart]), shipped.contains(GRID[apart]))
     assert shipped.sentence().startswith(Reach().sentence())
-
-
-def test_a_longer_arm_reaches_everywhere():
-    assert Reach(nearest_mm=0.0, farthest_mm=900.0).contains(GRID).all()
 
 
 def test_places_off_the_field_are_out_of_reach():
@@ -79,32 +65,38 @@ def test_the_sensor_is_lowered_to_14_mm_and_told_when_and_where():
     assert reading.covariates == {"height_mm": 14.0}
 
 
+FINER, ENDS = ReadingScale(step=0.25), ReadingScale(step=None)
+
+
 @pytest.mark.parametrize(
-    ("value", "expected"), [(33.4, 33), (33.6, 34), (0.2, 1), (-4, 1), (120.0, 100), (np.inf, 100)]
+    ("value", "scale", "expected"),
+    [
+        *((value, {}, read) for value, read in ((33.4, 33), (33.6, 34), (0.2, 1), (-4, 1), (120, 100), (np.inf, 100))),
+        (33.37, {"scale": FINER}, 33.25),
+        (133.37, {"scale": ENDS}, 100),
+        (133.37, {"scale": None}, 133.37),
+    ],
 )
-def test_readings_are_whole_lego_units_from_1_to_100(value, expected):
+def test_readings_are_whole_lego_units_from_1_to_100_or_of_another_scale(value, scale, expected):
     """Paper, "Robotic Arm Test Bed": a scale of 1 to 100."""
-    assert SimulatedArm(flat(value)).measure(HERE).value == expected
+    assert SimulatedArm(flat(value), **scale).measure(HERE).value == expected
 
 
-def test_the_scale_can_be_finer_or_none():
-    assert SimulatedArm(flat(33.37), scale=ReadingScale(step=0.25)).measure(HERE).value == 33.25
-    assert SimulatedArm(flat(133.37), scale=ReadingScale(step=None)).measure(HERE).value == 100
-    assert SimulatedArm(flat(133.37), scale=None).measure(HERE).value == 133.37
+def test_a_scale_ends_at_a_whole_step_or_at_its_end_and_what_is_missing_stays_so():
     assert math.isnan(SimulatedArm(flat(math.nan)).measure(HERE).value)
     assert ReadingScale(0.0, 10.0, 3.0).clip_and_round(10.0) == 9.0
     assert ReadingScale(0.0, 11.0, 3.0).clip_and_round(11.0) == 11.0
 
 
 def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
-    arm: Instrument = SimulatedArm(flat(50.0))
+    arm = SimulatedArm(flat(50.0))
     home = arm.pose
     with arm as entered:
         assert entered is arm
         arm.measure(HERE)
     assert arm.pose == home
 
-    def fail() -> None:
+    def fail():
         with arm:
             arm.measure(HERE)
             raise KeyError

@@ -56,14 +56,6 @@ def test_check_of_a_simulated_arm_is_refused_before_anything_is_drawn(tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
-def test_an_arm_that_reaches_no_place_of_its_field_is_no_arm(tmp_path, capsys):
-    path = tmp_path / "far.toml"
-    path.write_text(shipped_geometry_path().read_text().replace("y_mm = 580", "y_mm = 5800"))
-    refused = said(capsys, "arm", "check", "--geometry", path, status=2)
-    assert "nowhere on the field" in refused.err
-    assert refused.out == ""
-
-
 @pytest.mark.parametrize(
     ("option", "words"),
     [

@@ -1,12 +1,7 @@
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from probewise._arrays import FloatArray
-from probewise.calibration import Calibration, FittedSensor, calibrate, choose_pixel_mm, posterior_mean_ssf_field
+from probewise.calibration import FittedSensor, calibrate, choose_pixel_mm, posterior_mean_ssf_field
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_parameter_names
@@ -15,9 +10,7 @@ TRUTH = np.array([1.0, 0.5, 1.5, 0.03, 0.08, -0.005, 11.0, 58.0])
 NOISE_SD = 0.5
 
 
-def _sensor(
-    n_samples: int = 500, *, spread: float = 1.0, effects: tuple[str, ...] = (), extra: dict[str, float] | None = None
-) -> FittedSensor:
+def _sensor(n_samples=500, *, spread=1.0, effects=(), extra=None):
     """A sensor whose posterior is Gaussian about TRUTH; `extra` gives constant columns of effects."""
     rng = np.random.default_rng(11)
     sd = spread * np.array([0.0, 0.03, 0.03, 0.001, 0.002, 0.0005, 0.05, 0.05])
@@ -36,27 +29,27 @@ def _sensor(
 
 
 @pytest.fixture(scope="session")
-def sensor() -> FittedSensor:
+def sensor():
     return _sensor()
 
 
 @pytest.fixture(scope="session")
-def make_sensor() -> Callable[..., FittedSensor]:
+def make_sensor():
     return _sensor
 
 
 @pytest.fixture(scope="session")
-def truth() -> FloatArray:
+def truth():
     return TRUTH
 
 
 @pytest.fixture(scope="session")
-def noise_sd() -> float:
+def noise_sd():
     return NOISE_SD
 
 
 @pytest.fixture(scope="session")
-def recording() -> Recording:
+def recording():
     """Every third reading of the paper's four edge scans, by TRUTH with Gaussian noise."""
     plan = paper_plan().take(np.arange(0, 404, 3))
     clean = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns)).predict(TRUTH[None], plan)[0]
@@ -64,5 +57,5 @@ def recording() -> Recording:
 
 
 @pytest.fixture(scope="session")
-def calibration(recording: Recording) -> Calibration:
+def calibration(recording):
     return calibrate(recording, orders=(1,), n_live=50, rng=np.random.default_rng(13))

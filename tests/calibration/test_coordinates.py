@@ -1,7 +1,5 @@
 """Sampling coordinates: moments instead of A, B and C, Gaussians sorted by mass; or the whole's, or without labels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -10,11 +8,10 @@ import pytest
 from probewise.calibration import SSFPrior
 from probewise.calibration.about_peaks import LightContrasts
 from probewise.calibration.coordinates import WholeFootprintCoordinates
-from probewise.calibration.priors import MomentCoordinates
 from probewise.priors import LogUniform, Uniform
 
 
-def prior(n_gaussians: int, *, by_mass: bool) -> SSFPrior:
+def prior(n_gaussians, *, by_mass):
     return SSFPrior(
         n_gaussians,
         offset_mm=Uniform(-10, 10),
@@ -28,7 +25,7 @@ def prior(n_gaussians: int, *, by_mass: bool) -> SSFPrior:
 CASES = pytest.mark.parametrize(("n_gaussians", "by_mass"), [(1, False), (1, True), (2, False), (3, True)])
 
 
-def coordinates(belief: SSFPrior, *, whole: bool) -> MomentCoordinates | WholeFootprintCoordinates:
+def coordinates(belief, *, whole):
     return WholeFootprintCoordinates(belief, (1.0, 0.5), 20.0) if whole else belief.coordinates
 
 
@@ -37,7 +34,7 @@ WHOLE = pytest.mark.parametrize("whole", [False, True])
 
 @CASES
 @WHOLE
-def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int, by_mass: bool, whole: bool) -> None:
+def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians, by_mass, whole):
     belief = prior(n_gaussians, by_mass=by_mass)
     space = coordinates(belief, whole=whole)
     theta = belief.from_unit_cube(np.random.default_rng(2).random((50, len(belief.names))))
@@ -55,9 +52,7 @@ def test_coordinates_lead_back_to_the_gaussians_sorted_by_mass(n_gaussians: int,
 
 @CASES
 @WHOLE
-def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(
-    n_gaussians: int, by_mass: bool, whole: bool
-) -> None:
+def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(n_gaussians, by_mass, whole):
     """The Jacobian by central differences; N! for the labellings that became one."""
     belief = prior(n_gaussians, by_mass=by_mass)
     space = coordinates(belief, whole=whole)
@@ -71,7 +66,7 @@ def test_the_density_is_the_priors_times_the_volume_that_coordinates_stretch(
 
 
 @WHOLE
-def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole: bool) -> None:
+def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole):
     belief = prior(3, by_mass=True)
     space = coordinates(belief, whole=whole)
     x = space.enter(belief.from_unit_cube(np.random.default_rng(7).random((20, 20))))
@@ -82,25 +77,8 @@ def test_what_is_not_sorted_by_mass_is_outside_the_prior(whole: bool) -> None:
     assert (space.leave(swapped)[1] == -np.inf).all()
 
 
-def test_the_whole_of_gaussians_nearby_has_their_mean_and_covariance() -> None:
-    """Far less is tapered there than a hundredth; the moments of a mixture by another route."""
-    theta = np.array([[0.05, 1.0, 0.5, 0.05, 0.06, 0.01, 0.01, 2.0, 0.0, 0.08, 0.05, 0.0, 10.0, 60.0]])
-    g = theta[0, :-2].reshape(2, 6)
-    light = g[:, 0] / np.sqrt(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
-    share = light / light.sum()
-    mean = share @ g[:, 1:3]
-    whole = np.zeros((2, 2))
-    for s, (_, u, v, a, b, c) in zip(share, g, strict=True):
-        off = np.array([u, v]) - mean
-        whole += s * (0.5 * np.linalg.inv([[a, c], [c, b]]) + np.outer(off, off))
-    x = coordinates(prior(2, by_mass=True), whole=True).enter(theta)[0]
-    np.testing.assert_allclose(x[1:3], mean, atol=0.01)
-    np.testing.assert_allclose(x[3:5], np.log(np.diag(whole)), atol=0.01)
-    assert x[5] == pytest.approx(np.arctanh(whole[0, 1] / np.sqrt(whole[0, 0] * whole[1, 1])), abs=0.01)
-
-
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_without_labels_parameters_come_back_but_for_the_light_of_all(n: int) -> None:
+def test_without_labels_parameters_come_back_but_for_the_light_of_all(n):
     """Readings depend on ratios of light alone, so that the sum of its logs may differ; labels change no density."""
     belief = prior(n, by_mass=True)
     space = LightContrasts(belief)

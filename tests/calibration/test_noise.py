@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -7,7 +5,7 @@ from probewise.calibration import draw_sd, noise_by_scan
 
 
 @pytest.mark.parametrize(("q", "n"), [(25.0, 100), (0.8, 3), (1e-9, 4), (400.0, 2)])
-def test_drawn_sds_follow_the_posterior_on_a_grid(q: float, n: int) -> None:
+def test_drawn_sds_follow_the_posterior_on_a_grid(q, n):
     """The posterior sd^(-1-n) exp(-Q / 2 sd^2) between the bounds, tabulated."""
     floor, ceiling = 0.05, 5.0
     residuals = np.full((20_000, n), np.sqrt(q / n))
@@ -23,7 +21,7 @@ def test_drawn_sds_follow_the_posterior_on_a_grid(q: float, n: int) -> None:
     assert drawn.max() <= ceiling
 
 
-def test_residuals_beyond_both_bounds_stay_at_the_bound() -> None:
+def test_residuals_beyond_both_bounds_stay_at_the_bound():
     rng = np.random.default_rng(6)
     low = draw_sd(np.zeros((3, 5000)), sd_floor=1.0, sd_ceiling=10.0, rng=rng)
     high = draw_sd(np.full((3, 5000), 1e6), sd_floor=1.0, sd_ceiling=10.0, rng=rng)
@@ -31,7 +29,7 @@ def test_residuals_beyond_both_bounds_stay_at_the_bound() -> None:
     np.testing.assert_allclose(high, 10.0, rtol=1e-2)
 
 
-def test_every_scan_reports_its_own_noise() -> None:
+def test_every_scan_reports_its_own_noise():
     rng = np.random.default_rng(7)
     scan = np.repeat([0, 1, 2], [200, 200, 0])
     residuals = rng.normal(0, 1, (30, 400)) * np.where(scan == 0, 0.5, 2.0)

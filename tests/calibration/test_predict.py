@@ -1,29 +1,24 @@
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from probewise._arrays import FloatArray
 from probewise.calibration import FittedSensor, predict, read_sensor, write_sensor
 from probewise.effects import Origin
 from probewise.errors import DoubtfulResultWarning, FileError, ShapeError
-from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Recording, paper_plan
+from probewise.recordings import Disc, Instrumentation, Plan, Recording, paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, DiscreteSSF, FixedLevels, FreeLevels, FreeMixture
+from probewise.sensor import Chain, FreeLevels, FreeMixture
 
 
-def _chain(plan: Plan) -> Chain:
+def _chain(plan):
     return Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
 
 
-def _disc_plan() -> Plan:
+def _disc_plan():
     """A pattern, angles and scans that no calibration had."""
     x = np.linspace(-30, 30, 21)
     patterns = {"disc": Disc((0.0, 0.0), 15.0)}
@@ -31,7 +26,7 @@ def _disc_plan() -> Plan:
 
 
 @pytest.mark.parametrize("plan", [paper_plan(), _disc_plan()])
-def test_mean_and_sd_are_those_of_simulated_new_readings(sensor: FittedSensor, plan: Plan) -> None:
+def test_mean_and_sd_are_those_of_simulated_new_readings(sensor, plan):
     """By brute force: a prediction for every sample, noise added to each."""
     rng = np.random.default_rng(14)
     each = _chain(plan).predict(sensor.samples, plan)
@@ -48,7 +43,7 @@ def test_mean_and_sd_are_those_of_simulated_new_readings(sensor: FittedSensor, p
     assert np.isnan(found.log_density).all()
 
 
-def test_the_log_density_is_the_mixture_over_the_samples(sensor: FittedSensor, truth: FloatArray) -> None:
+def test_the_log_density_is_the_mixture_over_the_samples(sensor, truth):
     plan = _disc_plan()
     readings = _chain(plan).predict(truth[None], plan)[0] + 1.0
     each = _chain(plan).predict(sensor.samples, plan)
@@ -56,13 +51,13 @@ def test_the_log_density_is_the_mixture_over_the_samples(sensor: FittedSensor, t
     np.testing.assert_allclose(predict(sensor, plan, readings).log_density, expected, rtol=1e-9)
 
 
-def test_a_declared_step_gives_masses_of_cells_that_sum_to_one(sensor: FittedSensor) -> None:
+def test_a_declared_step_gives_masses_of_cells_that_sum_to_one(sensor):
     plan = replace(_disc_plan(), instrumentation=Instrumentation(step=1.0)).take(np.array([10]))
     total = sum(math.exp(float(predict(sensor, plan, [float(k)]).log_density[0])) for k in range(0, 101))
     assert total == pytest.approx(1.0, abs=1e-9)
 
 
-def test_a_plan_that_declares_no_step_has_that_of_the_sensor(sensor: FittedSensor) -> None:
+def test_a_plan_that_declares_no_step_has_that_of_the_sensor(sensor):
     """Its own comes first: readings may be logged more coarsely than the sensor rounds them."""
     stepped = replace(sensor, instrumentation=replace(sensor.instrumentation, step=1.0))
     bare = _disc_plan()
@@ -76,7 +71,7 @@ def test_a_plan_that_declares_no_step_has_that_of_the_sensor(sensor: FittedSenso
     assert np.abs(coarse - found.log_density).max() > 1e-3
 
 
-def test_missing_readings_and_those_out_of_range_have_no_density_but_a_prediction(sensor: FittedSensor) -> None:
+def test_missing_readings_and_those_out_of_range_have_no_density_but_a_prediction(sensor):
     plan = replace(_disc_plan(), instrumentation=Instrumentation(min=0.0, max=100.0))
     readings = np.full(21, 30.0)
     readings[[3, 4]] = np.nan, 120.0
@@ -86,24 +81,7 @@ def test_missing_readings_and_those_out_of_range_have_no_density_but_a_predictio
     assert (found.sd > 0).all()
 
 
-def test_blocks_of_samples_and_repeated_rows_change_nothing(
-    sensor: FittedSensor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plan = _disc_plan()
-    twice = plan.take(np.concatenate([np.arange(21), np.arange(21)]))
-    readings = np.linspace(10, 60, 42)
-    whole = predict(sensor, twice, readings)
-    monkeypatch.setattr("probewise.calibration.prediction._BLOCK", 1000)
-    blocks = predict(sensor, twice, readings)
-    np.testing.assert_allclose(blocks.mean, whole.mean, rtol=1e-12)
-    np.testing.assert_allclose(blocks.sd, whole.sd, rtol=1e-9)
-    np.testing.assert_allclose(blocks.log_density, whole.log_density, rtol=1e-9)
-    np.testing.assert_allclose(whole.mean[:21], whole.mean[21:])
-
-
-def test_effects_carry_over_but_those_of_single_scans_do_not(
-    sensor: FittedSensor, make_sensor: Callable[..., FittedSensor]
-) -> None:
+def test_effects_carry_over_but_those_of_single_scans_do_not(sensor, make_sensor):
     """Gear play of 2 mm shifts a one-way scan by 1 mm."""
     extra = {"scan_misplacement.offset_mm": 5.0, "backlash.width_mm": 2.0}
     plan = paper_plan().take(np.arange(101))
@@ -112,9 +90,7 @@ def test_effects_carry_over_but_those_of_single_scans_do_not(
     np.testing.assert_allclose(found.mean, predict(sensor, shifted).mean, rtol=1e-12)
 
 
-def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
-    make_sensor: Callable[..., FittedSensor], tmp_path: Path
-) -> None:
+def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(make_sensor, tmp_path):
     """A sensor of times in seconds since 1970, from its file, predicts as one of the same times from 0."""
     columns = {"gain_drift.frac": 0.2, "gain_drift.tau_s": 30.0, "position_scale.x": 0.05, "position_scale.y": 0.0}
     from_0 = make_sensor(effects=("gain_drift", "position_scale"), extra=columns)
@@ -124,7 +100,6 @@ def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
     assert back.origins == since_1970.origins
     plan = paper_plan().take(np.arange(101))
     edge = plan.patterns["boundary"]
-    assert isinstance(edge, HalfPlane)
     far = replace(
         plan,
         time_s=plan.time_s + 1.7e9,
@@ -136,7 +111,7 @@ def test_effects_count_from_the_time_of_the_recording_that_was_diagnosed(
         predict(back, replace(far, time_s=plan.time_s))
 
 
-def test_a_sensor_file_of_before_counts_from_0(make_sensor: Callable[..., FittedSensor]) -> None:
+def test_a_sensor_file_of_before_counts_from_0(make_sensor):
     drifting = make_sensor(effects=("offset_drift",), extra={"offset_drift.per_hour": 2.0})
     document = json.loads(replace(drifting, origins={"offset_drift": Origin(time_s=3.0)}).to_json())
     document.pop("origins")
@@ -150,22 +125,13 @@ def test_a_sensor_file_of_before_counts_from_0(make_sensor: Callable[..., Fitted
             FittedSensor.from_json(json.dumps(document | {"origins": damaged}))
 
 
-def test_the_mean_field_and_the_parameters_predict_alike(sensor: FittedSensor) -> None:
-    """Discrete route by the mean field against closed forms by the samples: 1e-3 of the span."""
-    for plan in (paper_plan(), _disc_plan()):
-        discrete = Chain(DiscreteSSF(sensor.field), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
-        by_field = discrete.predict(np.empty((1, 0)), plan)[0]
-        by_samples = _chain(plan).predict(sensor.samples * [1, 1, 1, 1, 1, 1, 0, 0] + [0, 0, 0, 0, 0, 0, 0, 1], plan)
-        assert np.abs(by_field - by_samples.mean(axis=0)).max() < 1e-3
-
-
-def test_another_unit_is_warned_of(sensor: FittedSensor) -> None:
+def test_another_unit_is_warned_of(sensor):
     plan = replace(_disc_plan(), instrumentation=Instrumentation(unit="mW"))
     with pytest.warns(DoubtfulResultWarning, match="'mW'"):
         predict(sensor, plan)
 
 
-def test_heights_without_one_in_the_description_are_warned_of(sensor: FittedSensor) -> None:
+def test_heights_without_one_in_the_description_are_warned_of(sensor):
     calibrated = replace(sensor, instrumentation=replace(sensor.instrumentation, height_mm=14.0))
     raised = replace(_disc_plan(), covariates={"height_mm": np.full(21, 28.0)})
     with pytest.warns(DoubtfulResultWarning, match="gives no height_mm of the sensor: predicted as at the height of"):
@@ -176,7 +142,7 @@ def test_heights_without_one_in_the_description_are_warned_of(sensor: FittedSens
     assert np.ptp(lower.mean) < 0.5 * np.ptp(predict(calibrated, _disc_plan()).mean)
 
 
-def test_a_plan_that_declares_another_height_is_predicted_at_it(sensor: FittedSensor) -> None:
+def test_a_plan_that_declares_another_height_is_predicted_at_it(sensor):
     """As a plan of the calibration's height that commands it; rows that command one of their own keep it."""
     calibrated = replace(sensor, instrumentation=replace(sensor.instrumentation, height_mm=14.0))
     at_14, at_28 = (replace(_disc_plan(), instrumentation=Instrumentation(height_mm=h)) for h in (14.0, 28.0))
@@ -192,7 +158,7 @@ def test_a_plan_that_declares_another_height_is_predicted_at_it(sensor: FittedSe
     np.testing.assert_array_equal(predict(sensor, at_28).mean, predict(sensor, at_14).mean)  # calibrated at no height
 
 
-def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_sensor: Callable[..., FittedSensor]) -> None:
+def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_sensor):
     plain = make_sensor()
     columns = np.append(plain.samples, np.full((len(plain.samples), 1), 0.05), axis=1)
     names = (*plain.names, "battery_sag.per_volt")
@@ -203,7 +169,7 @@ def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_senso
         predict(sags, replace(plan, covariates={}))
 
 
-def test_a_plan_without_rows_predicts_nothing_and_readings_that_do_not_match_are_refused(sensor: FittedSensor) -> None:
+def test_a_plan_without_rows_predicts_nothing_and_readings_that_do_not_match_are_refused(sensor):
     with pytest.raises(ShapeError, match="one per row"):
         predict(sensor, _disc_plan(), np.zeros(3))
     plan = _disc_plan().take(np.array([], dtype=int))

@@ -1,34 +1,29 @@
 """The quick way: climbs to peaks, draws about them, a density near the posterior to start from, and the search."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
 
-from probewise._arrays import FloatArray
-from probewise.calibration import Calibration, OrderPosterior, calibrate, default_prior, quick
+from probewise.calibration import calibrate, default_prior, quick
 from probewise.calibration.about_peaks import LightContrasts, _MixtureAboutPeaks, _StudentTDensity
 from probewise.calibration.coordinates import WholeFootprintCoordinates
 from probewise.calibration.paper import ProblemsByOrder, search_prior_of_order
 from probewise.calibration.peaks import climb, starts_of_climbs
 from probewise.calibration.quick import _NearPosterior, fit_orders_quickly
 from probewise.nested import Weighted
-from probewise.recordings import Recording, paper_plan
+from probewise.recordings import paper_plan
 from probewise.world import Blob, World, gaussian_spot
 
 
 @pytest.fixture(scope="module")
-def two_lobes() -> Recording:
+def two_lobes():
     """A sensor of two spots of equal light, 8 mm apart."""
     spot = gaussian_spot([Blob(0.5, (3.5, 2.0), (2.5, 3.0)), Blob(0.5, (-3.5, -2.0), (2.5, 3.0))])
     return World(spot, noise_sd=0.4).simulate(paper_plan(), rng=np.random.default_rng(8))
 
 
-def climbed(recording: Recording, order: int, seed: int) -> tuple[FloatArray, FloatArray]:
+def climbed(recording, order, seed):
     """Climb from the starts of each order up to `order`; return ends and ln L of the last."""
     problems, rng = ProblemsByOrder(recording, default_prior), np.random.default_rng(seed)
     ends = np.empty((0, 8))
@@ -38,21 +33,21 @@ def climbed(recording: Recording, order: int, seed: int) -> tuple[FloatArray, Fl
     return ends, high
 
 
-def test_the_peak_of_one_gaussian_is_no_lower_than_the_truth(recording: Recording, truth: FloatArray) -> None:
+def test_the_peak_of_one_gaussian_is_no_lower_than_the_truth(recording, truth):
     problem = ProblemsByOrder(recording, default_prior).problem(1)
     ends, high = climbed(recording, 1, 9)
     assert high[0] >= problem.log_likelihood(truth[None])[0]
     assert high[0] == pytest.approx(problem.log_likelihood(ends[:1])[0])
 
 
-def test_two_lobes_are_climbed(two_lobes: Recording) -> None:
+def test_two_lobes_are_climbed(two_lobes):
     assert climbed(two_lobes, 2, 13)[1][0] > climbed(two_lobes, 1, 13)[1][0] + 50
     centres = climbed(two_lobes, 2, 13)[0][0, [1, 2, 7, 8]].reshape(2, 2)
     np.testing.assert_allclose(np.abs(centres), [[3.5, 2.0], [3.5, 2.0]], atol=0.4)
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_the_prior_integrates_to_one_by_draws_about_a_peak(recording: Recording, n: int) -> None:
+def test_the_prior_integrates_to_one_by_draws_about_a_peak(recording, n):
     """Draws of a Student-t that is fitted to the prior weigh one on average; five errors."""
     prior, rng = default_prior(recording, n), np.random.default_rng(3)
     space = LightContrasts(prior)
@@ -64,7 +59,7 @@ def test_the_prior_integrates_to_one_by_draws_about_a_peak(recording: Recording,
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_the_prior_integrates_to_one_by_draws_near_a_posterior(recording: Recording, n: int) -> None:
+def test_the_prior_integrates_to_one_by_draws_near_a_posterior(recording, n):
     """Place, size and levels are as wide as the prior's. Five errors.
 
     Of two Gaussians, draws count where the second has less than a twentieth of the light, a known share of the prior:
@@ -84,11 +79,11 @@ def test_the_prior_integrates_to_one_by_draws_near_a_posterior(recording: Record
 
 
 @pytest.fixture
-def with_evidences(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float]], None]:
+def with_evidences(monkeypatch):
     """Return a function that gives each order its evidence, by draws and by nested sampling."""
 
-    def give(log_z: dict[int, float]) -> None:
-        def drawn(problem: Any, *_: Any, **__: Any) -> tuple[Weighted, Callable[[FloatArray], FloatArray]]:
+    def give(log_z):
+        def drawn(problem, *_, **__):
             n = problem.prior.n_gaussians
             made = Weighted(
                 problem.prior.names,
@@ -109,9 +104,7 @@ def with_evidences(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[int, float
     return give
 
 
-def test_orders_are_fitted_until_the_evidence_has_clearly_fallen(
-    recording: Recording, with_evidences: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_orders_are_fitted_until_the_evidence_has_clearly_fallen(recording, with_evidences, monkeypatch):
     """A fall by 2 is not clear with an error of 1; one by 4 is."""
     monkeypatch.setattr(quick, "_missed_part_in_words", lambda *_: "")
     with_evidences({1: -100.0, 2: -102.0, 3: -104.0, 4: -90.0})
@@ -121,13 +114,11 @@ def test_orders_are_fitted_until_the_evidence_has_clearly_fallen(
     assert any("order 4 not tried" in note for note in found.sensor.notes)
 
 
-def test_the_order_that_missed_a_peak_and_those_above_are_searched(
-    calibration: Calibration, recording: Recording, with_evidences: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_order_that_missed_a_peak_and_those_above_are_searched(calibration, recording, with_evidences, monkeypatch):
     """Of three the second is chosen; the first stays as it is."""
-    searched: list[int] = []
+    searched = []
 
-    def search(n: int, _: np.random.Generator) -> OrderPosterior:
+    def search(n, _):
         searched.append(n)
         return calibration.chosen.found
 
@@ -141,7 +132,7 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     assert all(f"order {n} was searched in full, since the quick way missed" in found[n].notes[-1] for n in (2, 3))
 
 
-def test_few_readings_are_searched_in_full(recording: Recording) -> None:
+def test_few_readings_are_searched_in_full(recording):
     problems = ProblemsByOrder(recording.take(np.arange(60)), default_prior)
     search = partial(search_prior_of_order, problems, n_live=50)
     assert fit_orders_quickly(problems, (1,), search=search, rng=np.random.default_rng(1)) == (

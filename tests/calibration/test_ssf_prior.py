@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -9,21 +7,17 @@ import pytest
 from probewise.calibration import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Uniform
-from probewise.recordings import HalfPlane, Plan, Recording, paper_plan
+from probewise.recordings import HalfPlane, Recording, paper_plan
 
 
-def _recording(plan: Plan, readings: np.ndarray) -> Recording:
-    return Recording(plan, readings)
-
-
-def _edge_recording(scale_mm: float = 1.0) -> Recording:
+def _edge_recording(scale_mm=1.0):
     plan = paper_plan()
     plan = replace(plan, x_mm=plan.x_mm * scale_mm)
-    return _recording(plan, 10 + 50 / (1 + np.exp(-plan.x_mm / scale_mm / 4)))
+    return Recording(plan, 10 + 50 / (1 + np.exp(-plan.x_mm / scale_mm / 4)))
 
 
 @pytest.mark.parametrize("unit_mass_mm2", [None, 1 / 3])
-def test_the_density_integrates_to_one_over_a_single_gaussian(unit_mass_mm2: float | None) -> None:
+def test_the_density_integrates_to_one_over_a_single_gaussian(unit_mass_mm2):
     """Importance sampling from a wider box, an independent route to the normalisation."""
     prior = SSFPrior(1, Uniform(-2, 2), LogUniform(0.1, 3), Uniform(0, 1), Uniform(4, 5), unit_mass_mm2=unit_mass_mm2)
     rng = np.random.default_rng(1)
@@ -35,27 +29,15 @@ def test_the_density_integrates_to_one_over_a_single_gaussian(unit_mass_mm2: flo
     assert abs(weight.mean() - 1) < 5 * weight.std() / math.sqrt(n)
 
 
-def test_every_draw_is_positive_definite_and_inside_the_support() -> None:
-    prior = default_prior(_edge_recording(), 3)
-    theta = prior.from_unit_cube(np.random.default_rng(2).random((2000, 20)))
-    for n in range(3):
-        a, b, c = theta[:, 6 * n + 3], theta[:, 6 * n + 4], theta[:, 6 * n + 5]
-        assert (a * b - c * c > 0).all()
-    assert np.isfinite(prior.log_prob(theta)).all()
-    assert prior.log_prob(theta + 1e6).max() == -np.inf
-
-
 @pytest.mark.parametrize(("column", "value"), [(3, 0.0), (3, -0.1), (4, 0.0), (5, 1e3)])
-def test_a_gaussian_that_is_not_positive_definite_has_no_density_and_warns_of_nothing(
-    column: int, value: float
-) -> None:
+def test_a_gaussian_that_is_not_positive_definite_has_no_density_and_warns_of_nothing(column, value):
     prior = default_prior(_edge_recording(), 2)
     theta = prior.from_unit_cube(np.random.default_rng(5).random((50, 14)))
     theta[:, column] = value
     assert (prior.log_prob(theta) == -np.inf).all()
 
 
-def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span() -> None:
+def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span():
     g = scan_geometry(_edge_recording())
     assert (g.step_mm, g.span_mm, g.albedo_low, g.albedo_high, g.inverted) == (1.0, 100.0, 0.0, 1.0, False)
     prior = default_prior(_edge_recording(), 1)
@@ -66,7 +48,7 @@ def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span()
 
 
 @pytest.mark.parametrize("lost", ["every other row", "all but one end", "two scans of longer steps"])
-def test_rows_without_a_reading_say_nothing_of_what_the_scans_resolve(lost: str) -> None:
+def test_rows_without_a_reading_say_nothing_of_what_the_scans_resolve(lost):
     """The same as of a recording in which they are not."""
     whole = _edge_recording()
     x_mm, scan = whole.plan.x_mm, whole.plan.scan
@@ -76,27 +58,23 @@ def test_rows_without_a_reading_say_nothing_of_what_the_scans_resolve(lost: str)
         "two scans of longer steps": scan < 2,
     }[lost]
     plan = replace(whole.plan, x_mm=np.where(scan < 2, x_mm, 3 * x_mm))
-    with_gaps = _recording(plan, np.where(used, whole.readings, np.nan))
-    without = _recording(plan.take(np.flatnonzero(used)), whole.readings[used])
+    with_gaps = Recording(plan, np.where(used, whole.readings, np.nan))
+    without = Recording(plan.take(np.flatnonzero(used)), whole.readings[used])
     assert scan_geometry(with_gaps) == scan_geometry(without)
 
 
-def test_levels_are_scaled_from_grey_patterns_to_black_and_white() -> None:
+def test_levels_are_scaled_from_grey_patterns_to_black_and_white():
     plan = paper_plan()
     grey = dict.fromkeys(plan.pattern_names, HalfPlane(0.0, 0.0, inside=0.8, outside=0.3))
     plan = replace(plan, patterns=grey)
-    prior = default_prior(_recording(plan, np.where(plan.x_mm > 0, 90.0, 40.0)), 1)
-    assert isinstance(prior.i_min, Uniform)
-    assert isinstance(prior.i_max, Uniform)
+    prior = default_prior(Recording(plan, np.where(plan.x_mm > 0, 90.0, 40.0)), 1)
     assert (prior.i_min.low + prior.i_min.high) / 2 == pytest.approx(10.0)
     assert (prior.i_max.low + prior.i_max.high) / 2 == pytest.approx(110.0)
 
 
-def test_a_sensor_that_reads_high_on_black_gets_levels_the_other_way_round() -> None:
+def test_a_sensor_that_reads_high_on_black_gets_levels_the_other_way_round():
     plan = paper_plan()
-    prior = default_prior(_recording(plan, np.where(plan.x_mm > 0, 10.0, 60.0)), 1)
-    assert isinstance(prior.i_min, Uniform)
-    assert isinstance(prior.i_max, Uniform)
+    prior = default_prior(Recording(plan, np.where(plan.x_mm > 0, 10.0, 60.0)), 1)
     assert prior.i_min.low < 60 < prior.i_min.high
     assert prior.i_max.low < 10 < prior.i_max.high
 
@@ -111,14 +89,14 @@ def test_a_sensor_that_reads_high_on_black_gets_levels_the_other_way_round() -> 
         (slice(0, 20), lambda r: np.linspace(10, 11, 20), "both sides"),
     ],
 )
-def test_a_recording_without_contrast_is_refused(rows: object, change: object, message: str) -> None:
+def test_a_recording_without_contrast_is_refused(rows, change, message):
     whole = _edge_recording()
     plan = whole.plan.take(np.arange(len(whole))[rows])
     with pytest.raises(ParameterError, match=message):
-        default_prior(_recording(plan, change(np.zeros(len(plan)))), 1)
+        default_prior(Recording(plan, change(np.zeros(len(plan)))), 1)
 
 
-def test_edges_in_one_direction_leave_the_axis_across_them_unseen() -> None:
+def test_edges_in_one_direction_leave_the_axis_across_them_unseen():
     """Scans at 0 and 180 degrees see x' only, those at 90 and 270 degrees y' only."""
     whole = _edge_recording()
     assert blind_axis_rad(whole) is None
@@ -128,7 +106,7 @@ def test_edges_in_one_direction_leave_the_axis_across_them_unseen() -> None:
     assert blind_axis_rad(whole.take(np.r_[0:101, 404:405])) is None
 
 
-def test_the_light_that_a_gaussian_holds_does_not_depend_on_its_width() -> None:
+def test_the_light_that_a_gaussian_holds_does_not_depend_on_its_width():
     """Mass is a pi / sqrt(A B - C^2); uniform for the default prior, whatever the shape."""
     prior = default_prior(_edge_recording(), 1)
     theta = prior.from_unit_cube(np.random.default_rng(5).random((20_000, 8)))

@@ -23,7 +23,7 @@ def signals_are_heard():
         signal.signal(number, handler)
 
 
-def small_recording() -> Recording:
+def small_recording():
     """Every fourth reading of the paper's plan, by the chain itself with noise of sd 0.6."""
     plan = paper_plan()
     plan = plan.take(np.arange(0, len(plan), 4))

@@ -3,14 +3,10 @@
 import json
 
 import pytest
+from command import run
 
-from probewise.cli import main
 from probewise.effects import VOCABULARY
 from probewise.recordings import read_plan
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 def no_constant(name):

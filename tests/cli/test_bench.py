@@ -1,14 +1,11 @@
 """`arm scan` and `arm record` with arms of arithmetic: patterns lie down and the sensor is turned by nobody."""
 
-import dataclasses
-
 import numpy as np
 import pytest
+from command import run
 
-from probewise.arm import ReadingScale, RequestToPerson
 from probewise.calibration import predict, read_sensor
-from probewise.cli import main
-from probewise.cli._bench import SimulatedBench, shifted_pattern, world_and_instrumentation
+from probewise.cli._bench import shifted_pattern, world_and_instrumentation
 from probewise.errors import ParameterError
 from probewise.recordings import (
     Disc,
@@ -37,10 +34,6 @@ PATTERNS = [
 ]
 
 
-def run(*arguments):
-    return main([str(a) for a in arguments])
-
-
 @pytest.mark.parametrize("pattern", PATTERNS, ids=lambda pattern: type(pattern).__name__)
 def test_a_pattern_that_was_moved_reads_at_its_new_place_as_it_did_at_its_old(pattern):
     world, _ = world_and_instrumentation(None)
@@ -56,17 +49,6 @@ def test_a_ramp_stays_where_it_is():
     assert shifted_pattern(Ramp(0.0, 0.1), (0.0, 0.0)) == Ramp(0.0, 0.1)
     with pytest.raises(ParameterError, match="0,0 with a ramp"):
         shifted_pattern(Ramp(0.0, 0.1), ORIGIN)
-
-
-def test_a_bench_does_what_a_person_would_be_asked_for():
-    world = dataclasses.replace(world_and_instrumentation(None)[0], noise_sd=0.0)
-    bench = SimulatedBench(world, "uniform:1", scale=ReadingScale(), seed=1)
-    with bench.open_simulated_arm(None) as arm:
-        place = type(arm.pose)(*ORIGIN)
-        white = arm.measure(place).value
-        bench.carry_out_request({"dark": Uniform(0.0)}, ORIGIN, RequestToPerson("put it there", pattern="dark"))
-        assert arm.measure(place).value < white
-    assert bench.open_simulated_arm(None, start_s=70.0).time_s == 70.0
 
 
 def test_what_the_simulated_arm_records_is_what_its_sensor_predicts(sensor_file, tmp_path):

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from probewise._signals import Stopped
 from probewise._writing import Drawings, NotDrawnError
-from probewise.cli import _demo, main
+from probewise.cli import main
 from probewise.proof import concealed_study
 from probewise.report.html import figure
 from probewise.systems import run_table_csv
@@ -41,7 +41,6 @@ COMMANDS = {
         *(*DIAGNOSIS, "recording.csv", "recording.json", "rounds/settings.json"),
         *(f"rounds/{name}" for name in ("1.csv", "1.json", "1_plan.csv", "1_plan.json")),
     ),
-    "demo": ("sensor.json", "answers.json", "report.html", *(f"diagnosis/{name}" for name in DIAGNOSIS)),
 }
 
 
@@ -55,12 +54,9 @@ class InThisProcess(Executor):
 
 
 @pytest.fixture
-def short_demo(monkeypatch):
-    """A demo of few readings, and a study of few concealed effects."""
-    for module in ("_executor", "_demo"):
-        monkeypatch.setattr(f"probewise.cli.{module}.worker_pool", lambda n: InThisProcess())
-    for name, n in (("N_LIVE", 80), ("N_LIVE_ROBOT", 40), ("MAX_READINGS", 3), ("MAX_READINGS_DOUBT", 2)):
-        monkeypatch.setattr(_demo, name, n)
+def short_study(monkeypatch):
+    """A study of few concealed effects."""
+    monkeypatch.setattr("probewise.cli._executor.worker_pool", lambda n: InThisProcess())
     few = partial(concealed_study.concealed_study, effects=("backlash", "saturation"))
     monkeypatch.setattr(concealed_study, "concealed_study", few)
 
@@ -68,16 +64,9 @@ def short_demo(monkeypatch):
 QUICK = ("audit data.csv", "explore", "study --circles")
 
 
-def marks_of(words):
-    if words == "demo":
-        return [pytest.mark.slow, pytest.mark.single_case]
-    return [] if words.startswith(QUICK) else pytest.mark.slow
-
-
-@pytest.mark.usefixtures("short_demo")
+@pytest.mark.usefixtures("short_study")
 @pytest.mark.parametrize(
-    "command",
-    [pytest.param(words, marks=marks_of(words)) for words in COMMANDS],
+    "command", [pytest.param(words, marks=[] if words.startswith(QUICK) else pytest.mark.slow) for words in COMMANDS]
 )
 def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_1(
     command, recording_file, sensor_file, tmp_path, monkeypatch, capsys

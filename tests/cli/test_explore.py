@@ -1,6 +1,5 @@
 """What `probewise explore` says of the choices it offers."""
 
-import contextlib
 import csv
 import json
 import math
@@ -143,22 +142,6 @@ def test_the_bar_says_where_the_arm_moves_before_it_does():
     reading = telling.measure(Pose(500.0, 200.0))
     assert telling.reachable(np.array([[500.0, 200.0], [0.0, 0.0]])).tolist() == [True, False]
     assert told == [Pose(500.0, 200.0), reading]
-
-
-@pytest.mark.slow
-def test_a_run_tells_of_each_move_and_of_what_is_known(sensor_file, tmp_path, monkeypatch, quick_frames):
-    told = []
-
-    @contextlib.contextmanager
-    def shown(*, quiet):
-        yield lambda stage, done=0, total=0, note="": told.append(note)
-
-    monkeypatch.setattr("probewise.cli._explore.progress_shown", shown)
-    arguments = ["explore", "--sensor", sensor_file, "--out", tmp_path / "out", "--max-readings", 2, "--quiet"]
-    assert main([str(a) for a in arguments]) == 0
-    moves = [note for note in told if "moving to (" in note]
-    assert [note.partition(",")[0] for note in moves] == ["reading 1 of at most 2", "reading 2 of at most 2"]
-    assert "; widest sd" in moves[1]
 
 
 @pytest.mark.slow

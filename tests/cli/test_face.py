@@ -68,25 +68,16 @@ def test_what_the_api_pages_lead_with_is_public():
         assert set(names) <= set(importlib.import_module(package).__all__), package
 
 
-DESTINATIONS = {
-    "calibrate": {"orders": "orders", "n_live": "live"},
-    "explore": {
-        "shape": "shape",
-        "truth": "truth",
-        "model": "model",
-        "utility": "utility",
-        "learn_sensor": "learn_sensor",
-        "batch": "batch",
-        "max_readings": "max_readings",
-    },
-    "audit": {"sensor": "sensor"},
-    "diagnose": {"sensor": "sensor", "thorough": "thorough"},
-}
+OPTIONS = [
+    ("calibrate", "orders", "orders"),
+    ("calibrate", "n_live", "live"),
+    *(("explore", n, n) for n in ["shape", "truth", "model", "utility", "learn_sensor", "batch", "max_readings"]),
+    *((verb, "sensor", "sensor") for verb in ("audit", "diagnose")),
+    ("diagnose", "thorough", "thorough"),
+]
 
 
-@pytest.mark.parametrize(
-    ("verb", "parameter", "option"), [(v, p, o) for v, names in DESTINATIONS.items() for p, o in names.items()]
-)
+@pytest.mark.parametrize(("verb", "parameter", "option"), OPTIONS)
 def test_the_command_line_and_python_have_the_same_defaults(verb, parameter, option):
     parser = argparse.ArgumentParser()
     importlib.import_module(f"probewise.cli.{verb}").add_arguments(parser)
@@ -189,16 +180,6 @@ def test_a_truth_that_cannot_be_is_named(sensor, truth, message):
 def test_an_audit_takes_the_noise_of_the_sensor_that_it_is_given(sensor, recording):
     plan = recording.plan.take(np.arange(20))
     assert "noise 0.6" in audit_plan(plan, sensor=sensor, effects=FEW).assumed
-
-
-@pytest.mark.slow
-def test_the_reports_package_shows_what_people_use_and_loads_it_when_asked():
-    assert dir(probewise.report) == probewise.report.__all__
-    code = "import probewise; print(probewise.report.plots.png.__name__, 'heart' in dir(probewise.report))"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.split() == ["png", "False"]
-    with pytest.raises(AttributeError, match="has no attribute 'heart'"):
-        _ = probewise.report.heart
 
 
 def test_the_verbs_take_a_table_and_a_simulator_too(tmp_path, sensor):

@@ -110,48 +110,38 @@ def test_nothing_outside_a_hostile_folder_changes_and_the_way_out_is_said(build,
     assert not (out / "report.html").is_symlink()
 
 
-@pytest.mark.parametrize(
-    ("verb", "name"),
-    [
-        *(
-            ("explore", name)
-            for name in ("journal.jsonl", ".journal.jsonl.lock", "live.html", "frames", "frames/1.png")
-        ),
-        *(("investigate", name) for name in ("rounds", "rounds/1.csv")),
-        *(("study", name) for name in ("trials.jsonl", ".trials.jsonl.lock")),
-        *(("challenge", name) for name in ("cases.jsonl", ".cases.jsonl.lock")),
-    ],
-)
-def test_a_link_where_a_run_would_write_is_refused_before_it_begins(verb, name, sensor_file, tmp_path, capsys):
+LINKS = {
+    "explore": ("journal.jsonl", ".journal.jsonl.lock", "live.html", "frames", "frames/1.png"),
+    "investigate": ("rounds", "rounds/1.csv"),
+    "study": ("trials.jsonl", ".trials.jsonl.lock"),
+    "challenge": ("cases.jsonl", ".cases.jsonl.lock"),
+}
+PIPES = {"explore": ("journal.jsonl", "frames/2.png"), "investigate": ("rounds/1.csv",), "study": ("trials.jsonl",)}
+IN_THE_WAY = [
+    *((verb, name, None, "is a symbolic link") for verb, names in LINKS.items() for name in names),
+    *((verb, name, "--resume", "is a device or a pipe") for verb, names in PIPES.items() for name in names),
+]
+
+
+@pytest.mark.parametrize(("verb", "name", "resume", "says"), IN_THE_WAY)
+def test_a_link_or_a_pipe_where_a_run_would_write_is_refused_before_it_begins(
+    verb, name, resume, says, sensor_file, tmp_path, capsys
+):
     out = tmp_path / "out"
     (out / name).parent.mkdir(parents=True)
     (tmp_path / "victim").write_text("precious")
-    (out / name).symlink_to(tmp_path / "victim")
+    if resume:
+        os.mkfifo(out / name)
+    else:
+        (out / name).symlink_to(tmp_path / "victim")
     words = {"explore": ["--sensor", str(sensor_file)], "investigate": ["--plan", "paper", "--rounds", "1"]}
-    assert main([verb, *words.get(verb, []), "--quiet", "--out", str(out)]) == 2
+    more = [resume] if resume and verb in words else []
+    assert main([verb, *words.get(verb, []), *more, "--quiet", "--out", str(out)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert f"{out / name}: " in said
-    assert "is a symbolic link" in said
+    assert says in said
     assert (tmp_path / "victim").read_text() == "precious"
-
-
-@pytest.mark.parametrize(
-    ("verb", "name"),
-    [
-        ("explore", "journal.jsonl"),
-        ("explore", "frames/2.png"),
-        ("investigate", "rounds/1.csv"),
-        ("study", "trials.jsonl"),
-    ],
-)
-def test_a_pipe_where_a_run_would_read_or_write_is_not_waited_for(verb, name, sensor_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    (out / name).parent.mkdir(parents=True)
-    os.mkfifo(out / name)
-    words = {"explore": ["--sensor", str(sensor_file), "--resume"], "investigate": ["--plan", "paper", "--resume"]}
-    assert main([verb, *words.get(verb, []), "--quiet", "--out", str(out)]) == 2
-    assert f"{out / name}: is a device or a pipe" in capsys.readouterr().err
 
 
 def predict(sensor_file, recording_file, out):

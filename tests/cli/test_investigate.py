@@ -3,13 +3,9 @@
 import json
 
 import pytest
+from command import run
 
-from probewise.cli import main
 from probewise.recordings import paper_plan, read_recording, write_plan
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 @pytest.fixture
@@ -44,30 +40,6 @@ def test_one_round_leaves_a_diagnosis_and_all_it_was_made_of(few, tmp_path, caps
     page = (out / "report.html").read_text()
     assert "How it came to that" in page
     assert "http://" not in page
-
-
-@pytest.mark.slow
-def test_a_first_plan_in_the_folder_of_the_results_is_not_lost(few, tmp_path, capsys):
-    plan = few.rename(tmp_path / "recording.csv")
-    few.with_suffix(".json").rename(tmp_path / "recording.json")
-    before = plan.read_bytes()
-    options = ("--truth", "nothing", "--rounds", 1, "--seed", 1)
-    assert run("investigate", "--plan", plan, *options, "--out", tmp_path) == 0
-    assert (tmp_path / "recording_kept.csv").read_bytes() == before
-    assert "recording_kept.csv" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
-    out = tmp_path / "out"
-    options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--quiet", "--out", out)
-    assert run("investigate", *options, "--seed", 1) == 0
-    before = (out / "rounds" / "1.csv").read_bytes()
-    assert run("investigate", *options, "--seed", 1) == 2
-    assert "--resume to continue it" in capsys.readouterr().err
-    assert run("investigate", *options, "--seed", 2, "--resume") == 2
-    assert "seed '1'" in capsys.readouterr().err
-    assert (out / "rounds" / "1.csv").read_bytes() == before
 
 
 @pytest.mark.slow
@@ -113,17 +85,3 @@ def test_an_instrument_of_ones_own_is_investigated_and_closed(few, tmp_path):
     assert closed.read_text() == "closed"
     assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
     assert "the world concealed" not in (out / "report.html").read_text()
-
-
-@pytest.mark.slow
-def test_the_emulated_arm_is_investigated_with_nobody_there(tmp_path):
-    out = tmp_path / "out"
-    assert run("investigate", "--arm", "emulator", "--plan", "paper", "--rounds", 1, "--quiet", "--out", out) == 0
-    assert len(read_recording(out / "recording.csv")) == len(paper_plan())
-    assert json.loads((out / "diagnosis.json").read_text())["verdict"] in (
-        "clean",
-        "named",
-        "unknown",
-        "cannot_tell",
-        "noise",
-    )

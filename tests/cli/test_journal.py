@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from command import run
 from mixtures import fixed_mixture
 
 from probewise.calibration import read_sensor, write_sensor
-from probewise.cli import main
 from probewise.cli._journal import find_journal_sensor_file
 from probewise.errors import FileError
 from probewise.experiment import experiment_for, sensor_entry
@@ -17,10 +17,6 @@ from probewise.scene import Circle, Field, KnownScene
 from probewise.sensor import Chain, FixedLevels
 
 CENTRE_MM, RADIUS_MM = (520.0, 240.0), 80.0
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 def poses(n=26):
@@ -85,8 +81,10 @@ def refused(capsys, *arguments):
     return captured.err
 
 
-def test_a_journal_needs_the_sensor_of_its_run(journal_file, tmp_path, capsys):
+def test_a_journal_needs_the_sensor_of_its_run_and_comes_alone(journal_file, sensor_file, tmp_path, capsys):
     assert "--sensor" in refused(capsys, "diagnose", journal_file, "--out", tmp_path / "out")
+    arguments = ("diagnose", journal_file, journal_file, "--sensor", sensor_file, "--out", tmp_path / "out")
+    assert "one at a time" in refused(capsys, *arguments)
     assert not (tmp_path / "out").exists()
 
 
@@ -109,11 +107,6 @@ def test_a_journal_finds_its_sensor_where_results_took_its_place(named, journal_
     place.with_name("sensor_kept_2.json").unlink()
     with pytest.raises(FileError, match="is another by now"):
         find_journal_sensor_file(journal_file)
-
-
-def test_two_unknown_shapes_at_once_are_refused(journal_file, sensor_file, tmp_path, capsys):
-    arguments = ("diagnose", journal_file, journal_file, "--sensor", sensor_file, "--out", tmp_path / "out")
-    assert "one at a time" in refused(capsys, *arguments)
 
 
 @pytest.mark.parametrize("harm", ["empty", "no reading", "other shape", "no field", "no options"])

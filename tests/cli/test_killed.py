@@ -1,52 +1,22 @@
-"""`explore` and `investigate` killed at any moment: with --resume they end with what one never killed would have."""
+"""`explore` killed at any moment: with --resume it ends with what one never killed would have."""
 
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from probewise import investigation
 from probewise.cli import main
-from probewise.recordings import fingerprint, paper_plan, write_plan
 
 
 def command(sensor_file, out, *more):
-    where = (
-        "--sensor",
-        sensor_file,
-        "--truth",
-        "500,250,90",
-        "--out",
-        out,
-        "--seed",
-        3,
-        "--quiet",
-        "--max-readings",
-        4,
-    )
-    return [str(word) for word in ("explore", *where, *more)]
-
-
-@pytest.fixture
-def thin_plan(tmp_path):
-    """Every third reading of the paper's plan: enough for backlash of 1 mm to be aliased, then named."""
-    plan, path = paper_plan(), tmp_path / "thin.csv"
-    write_plan(plan.take(np.arange(0, len(plan), 3)), path)
-    return path
-
-
-def investigating(plan, out, *more):
-    options = ("--truth", "backlash:1", "--seed", 4, "--rounds", 2, "--readings", 30, "--quiet")
-    return [str(word) for word in ("investigate", "--plan", plan, "--out", out, *options, *more)]
+    where = ("--sensor", sensor_file, "--truth", "500,250,90", "--out", out, "--seed", 3, "--quiet")
+    return [str(word) for word in ("explore", *where, "--max-readings", 4, *more)]
 
 
 def contents(out):
@@ -98,61 +68,12 @@ def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
 
 
 @pytest.mark.slow
-@pytest.mark.single_case
-def test_an_investigation_goes_on_from_whatever_stands_on_the_disk(thin_plan, tmp_path, monkeypatch):
-    """Before and after any file is put in place, and after its only round; no diagnosis is computed twice."""
-    made, standing, whole = {}, [], tmp_path / "whole"
-    compute, replace = investigation.diagnose, os.replace
-
-    def diagnosed_once(recordings, *, rng, **options):
-        key = (*map(fingerprint, recordings), str(rng.bit_generator.state))
-        if key not in made:
-            made[key] = compute(recordings, rng=rng, **options)
-        return made[key]
-
-    def replace_and_remember(source, target):
-        for act in (lambda: None, lambda: replace(source, target)):
-            act()
-            shutil.copytree(whole, tmp_path / "standing" / str(len(standing)))
-            standing.append(target)
-
-    monkeypatch.setattr(investigation, "diagnose", diagnosed_once)
-    monkeypatch.setattr("probewise.investigation._KEPT_AGAIN_S", 0.0)
-    with monkeypatch.context() as during:
-        during.setattr(os, "replace", replace_and_remember)
-        assert main(investigating(thin_plan, whole)) == 0
-    assert len(made) == 2
-    shorter = tmp_path / "shorter"
-    assert main(investigating(thin_plan, shorter, "--rounds", 1)) == 0
-    assert main(investigating(thin_plan, shorter, "--resume")) == 0
-    assert contents(shorter) == contents(whole)
-    chance = np.random.default_rng(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
-    of_round = {n: [k for k, target in enumerate(standing) if Path(target).name == f"{n}.csv"] for n in (1, 2)}
-    results = [k for k, target in enumerate(standing) if Path(target).parent.name != "rounds"]
-    moments = [0, 1, *(int(chance.choice(some)) for some in (*of_round.values(), results, results))]
-    for k in moments:
-        out = tmp_path / "standing" / str(k)
-        more = ["--resume"] if (out / "rounds" / "settings.json").exists() else []
-        assert main(investigating(thin_plan, out, *more)) == 0
-        assert contents(out) == contents(whole), standing[k]
-    assert len(made) == 2
-
-
-BEGUN = {"explore": "journal.jsonl", "investigate": "rounds/settings.json"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", ["explore", pytest.param("investigate", marks=pytest.mark.single_case)])
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
-def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(verb, sensor_file, thin_plan, tmp_path):
+def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(sensor_file, tmp_path):
     """As processes, with all pictures; killed twice in all, and no run more often than that."""
-
-    def words(out, *more):
-        return command(sensor_file, out, *more) if verb == "explore" else investigating(thin_plan, out, *more)
-
     began_s = time.monotonic()
     run = [sys.executable, "-m", "probewise"]
-    subprocess.run([*run, *words(tmp_path / "whole")], check=True)
+    subprocess.run([*run, *command(sensor_file, tmp_path / "whole")], check=True)
     whole_s, whole = time.monotonic() - began_s, contents(tmp_path / "whole")
     chance = random.Random(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
     n_killed = 0
@@ -160,8 +81,8 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(verb, sensor_fi
         out = tmp_path / str(k)
         status = None
         while status != 0:
-            more = ["--resume"] if (out / BEGUN[verb]).exists() else []
-            process = subprocess.Popen([*run, *words(out, *more)])
+            more = ["--resume"] if (out / "journal.jsonl").exists() else []
+            process = subprocess.Popen([*run, *command(sensor_file, out, *more)])
             killer = threading.Timer(chance.uniform(0.1, 0.9) * whole_s, process.kill)
             if n_killed < 2:
                 killer.start()

@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 import pytest
+from command import run
 
 from probewise.calibration import read_sensor, write_sensor
-from probewise.cli import main
 from probewise.experiment import read_journal
 from probewise.recordings import Instrumentation, Plan, Quadrant, read_recording, write_plan
 
@@ -28,10 +28,6 @@ class Arm:
         with open(LOG, "a") as log:
             log.write("closed\\n")
 """
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 @pytest.fixture
@@ -144,18 +140,14 @@ def test_a_plan_is_recorded_in_the_instruments_own_unit_and_goes_on_when_it_was_
     assert closed() == 2
 
 
-def test_a_scan_shows_what_readings_bring(arm_file, capsys):
-    assert run("arm", "scan", "500,260", "600,260", "--readings", "2", "--arm", arm_file()) == 0
-    header, *rows = capsys.readouterr().out.splitlines()
-    assert header == "x_mm,y_mm,orientation_deg,time_s,reading,temperature_c"
-    assert [row.split(",")[4:] for row in rows] == [["140", "21"], ["840", "22"]]
-
-
-def test_a_scan_shows_where_readings_were_taken(arm_file, capsys):
-    true = 'return {"value": 1.0, "x_mm": pose.x_mm + 0.25, "y_mm": pose.y_mm - 0.5, "orientation_rad": math.pi / 2}'
+def test_a_scan_shows_where_readings_were_taken_and_what_they_bring(arm_file, capsys):
+    true = """return {"value": 140.0, "x_mm": pose.x_mm + 0.25, "y_mm": pose.y_mm - 0.5, "orientation_rad": math.pi / 2,
+            "temperature_c": 20.0 + self.n}"""
     assert run("arm", "scan", "500,260", "600,260", "--readings", "2", "--arm", arm_file(true)) == 0
-    rows = capsys.readouterr().out.splitlines()[1:]
-    assert [row.split(",")[:3] for row in rows] == [["500.250", "259.500", "90.000"], ["600.250", "259.500", "90.000"]]
+    header, *rows = (line.split(",") for line in capsys.readouterr().out.splitlines())
+    assert header == ["x_mm", "y_mm", "orientation_deg", "time_s", "reading", "temperature_c"]
+    assert [row[:3] for row in rows] == [["500.250", "259.500", "90.000"], ["600.250", "259.500", "90.000"]]
+    assert [row[4:] for row in rows] == [["140", "21"], ["140", "22"]]
 
 
 @pytest.mark.parametrize(

@@ -4,16 +4,13 @@ The driver ends every move of the base in the same direction. As long as its app
 turned by half of the play that is not known, wherever it came from: to the arm that is another circle.
 """
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
-from probewise.cli import main
 from probewise.cli._bench import open_emulated_arm_and_bench
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
@@ -66,26 +63,3 @@ def test_more_play_than_the_approach_takes_up_depends_on_the_direction(tmp_path)
     off, from_below = turned_deg(4.5, tmp_path / "true.toml")
     assert off[from_below].max() < -1.8
     assert (off[~from_below] > off[from_below].max() + 0.3).all()
-
-
-@pytest.mark.single_case
-@pytest.mark.slow
-@pytest.mark.usefixtures("quick_frames")
-def test_play_that_is_not_known_is_another_circle_to_the_robot_which_says_so(sensor_file, tmp_path):
-    """The circle is found in the arm's own frame: by its posterior, an error as large has a chance of 1e-4."""
-    play_deg, out = 2.0, tmp_path / "out"
-    arm = f"emulator:{built_with(play_deg, tmp_path / 'true.toml')}"
-    circle = np.array([498.6, 262.3, 91.9])
-    options = ("--truth", ",".join(map(str, circle)), "--seed", 1, "--quiet")
-    assert main([str(w) for w in ("explore", "--sensor", sensor_file, "--arm", arm, "--out", out, *options)]) == 0
-    result = json.loads((out / "result.json").read_text())
-    assert result["known"]
-    assert "clean" in result["left_out"]["credible_set"]
-    assert "an offset of the arm" in result["left_out"]["sentence"]
-    turn = np.radians((play_deg - KNOWN_DEG) / 2)
-    turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    own = np.append(turned @ (circle[:2] - BASE_MM) + BASE_MM, circle[2])
-    weight, *columns = np.loadtxt(out / "samples.csv", delimiter=",", skiprows=1, ndmin=2).T
-    samples = np.array(columns)
-    mean = np.average(samples, axis=1, weights=weight)
-    assert (mean - own) @ np.linalg.solve(np.cov(samples, aweights=weight), mean - own) < chi2(3).isf(1e-4)

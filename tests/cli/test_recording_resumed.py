@@ -5,9 +5,9 @@ import math
 
 import numpy as np
 import pytest
+from command import run
 
 from probewise.arm import shipped_geometry_path
-from probewise.cli import main
 from probewise.recordings import HalfPlane, Image, Plan, Quadrant, Uniform, read_plan, read_recording, write_plan
 
 EDGE = HalfPlane(0.0, 0.0)
@@ -23,10 +23,6 @@ class Arm:
 MISSING = """from probewise.arm import Reading
         if self.n == 3: raise OSError("unplugged")
         return Reading(float("nan"), pose, float(self.n))"""
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 def plan(**changes):

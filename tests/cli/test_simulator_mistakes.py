@@ -163,6 +163,10 @@ def test_a_table_given_twice_is_refused(capsys, tmp_path):
     [
         (cell(5, "temp_c", "warm"), "more.csv: reading 'temp_c' in row 5 is warm; allowed: a number in each row"),
         (cell(5, "t_s", "1"), "more.csv: column 't_s' in row 5 is 1.0; allowed: 10 or more"),
+        (
+            run_table_csv(runs()).replace("temp_c", "temp"),
+            "more.csv: no column 'temp_c'; allowed: the reading, as in data.csv; the header has 'run', 't_s'",
+        ),
     ],
 )
 def test_a_mistake_in_a_further_table_is_told_with_its_file_and_row(capsys, tmp_path, text, said):
@@ -216,19 +220,3 @@ def _table(x, y):
     from probewise.systems import RunTable
 
     return RunTable({"x": x, "y": y})
-
-
-@pytest.mark.slow
-def test_a_reading_that_is_not_available_is_left_out(tmp_path):
-    """The rest are met exactly, to the last digit: no matrix is singular, nothing is divided by what is not there."""
-    file, table, out = tmp_path / "heater.py", tmp_path / "runs.csv", tmp_path / "out"
-    file.write_text(FILE)
-    table.write_text(cell(5, "temp_c", "n/a"))
-    assert main(["diagnose", str(table), "--simulator", str(file), "--out", str(out), "--quiet"]) == 0
-
-
-def test_a_second_table_whose_reading_is_misspelt_is_refused(capsys, tmp_path):
-    more = tmp_path / "more.csv"
-    more.write_text(run_table_csv(runs()).replace("temp_c", "temp"))
-    said = refused(capsys, tmp_path, FILE, more=[str(more)])
-    assert "more.csv: no column 'temp_c'; allowed: the reading, as in data.csv; the header has 'run', 't_s'" in said

@@ -41,10 +41,6 @@ def test_a_fit_finds_what_the_readings_were_made_with(fit):
     assert found["tau_s"][0] < 15.0 < found["tau_s"][1]
     assert found["gain"][0] < 3.0 < found["gain"][1]
     assert (fit / "report.html").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_samples_of_a_fit_are_a_column_a_parameter(fit):
     with (fit / "samples.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) >= 500

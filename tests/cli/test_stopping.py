@@ -87,37 +87,25 @@ def test_an_error_without_a_signal_stays_what_it_is():
         raise LinkError("dead")
 
 
-def test_deferred_lines_are_finished_first():
-    done = []
+@pytest.mark.parametrize("repeated", [False, True])
+def test_deferred_lines_are_finished_first_unless_the_signal_is_repeated(repeated, monkeypatch):
+    now_s, done = [0.0], []
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
 
     def lines():
         with stoppable():
-            with defer_signals(), defer_signals():
+            with defer_signals(), contextlib.nullcontext() if repeated else defer_signals():
                 signal.raise_signal(signal.SIGTERM)
+                done.append("still here")
+                if repeated:
+                    now_s[0] += 2 * SAME_S
+                    signal.raise_signal(signal.SIGTERM)
                 done.append("finished")
             done.append("gone on")
 
     with pytest.raises(Stopped):
         lines()
-    assert done == ["finished"]
-
-
-def test_a_repeated_signal_cuts_deferred_lines_short(monkeypatch):
-    now_s = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    done = []
-
-    def lines():
-        with stoppable(), defer_signals():
-            signal.raise_signal(signal.SIGTERM)
-            now_s[0] += 2 * SAME_S
-            done.append("still here")
-            signal.raise_signal(signal.SIGTERM)
-            done.append("gone on")
-
-    with pytest.raises(Stopped):
-        lines()
-    assert done == ["still here"]
+    assert done == (["still here"] if repeated else ["still here", "finished"])
 
 
 class Struck(Exception):

@@ -2,23 +2,19 @@
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run
 
 from probewise import __version__
 from probewise.calibration import predict, read_sensor
-from probewise.cli import VERBS, main
+from probewise.cli import VERBS
 from probewise.recordings import read_plan, read_plan_and_readings, read_prediction_columns
 from probewise.report import exploration
-
-
-def run(*arguments):
-    return main([str(a) for a in arguments])
 
 
 def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, recording_file, tmp_path, capsys):
@@ -32,18 +28,6 @@ def test_predictions_come_back_from_the_file_as_they_were_computed(sensor_file, 
     np.testing.assert_array_equal(log_density, direct.log_density)
     np.testing.assert_array_equal(read_plan(recording_file).x_mm, plan.x_mm)
     assert "chi-square" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_calibrating_writes_a_sensor_model_a_report_and_figures(recording_file, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run("calibrate", recording_file, "--out", out, "--orders", 1, "--live", 16, "--seed", 1) == 0
-    names = {p.name for p in out.iterdir()}
-    assert {"sensor.json", "report.html", "readings.png", "ssf_by_order.png", "predicted.png"} <= names
-    assert {name for name in names if name.startswith(".")} == {".results.lock"}
-    mean = read_sensor(out / "sensor.json").mean()
-    assert mean["I_max"] == pytest.approx(60.0, abs=1.0)
-    assert "seed 1" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -65,21 +49,6 @@ def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quic
     assert "all 2 readings that it may take are taken" in pages[-1]
     assert all("possible faults after each reading" in page for page in pages)
     assert opened == [(out / "live.html").as_uri()]
-
-
-def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_path, monkeypatch, capsys):
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(exploration, "robot_view_png", stop)
-    out = tmp_path / "out"
-    assert run("explore", "--sensor", sensor_file, "--out", out, "--quiet") == 130
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    again = shlex.join(["probewise", "explore", "--sensor", str(sensor_file), "--out", str(out), "--quiet", "--resume"])
-    assert said.endswith(f"journal.jsonl keeps 1 reading; go on with: {again}\n")
-    assert len((out / "journal.jsonl").read_text().splitlines()) == 2
-    assert not (out / "report.html").exists()
 
 
 @pytest.mark.parametrize(

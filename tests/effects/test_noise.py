@@ -1,7 +1,5 @@
 """Effects on the noise: what they do to single readings, and the statistics that show them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +18,7 @@ from probewise.effects.noise import (
 from probewise.effects.noise_distribution import log_density
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters
+from probewise.sensor import Chain, FixedLevels, FixedMixture
 
 SD = 0.6
 N = 408
@@ -37,12 +35,12 @@ NOISES = {
 }
 
 
-def level_of(name: str) -> NoiseParameters:
+def level_of(name):
     effect, values = NOISES[name]
     return CHAIN.with_effects(effect).noise_parameters(np.array([values]), PLAN, np.full((1, 1), SD))
 
 
-def draw_readings(level: NoiseParameters, predicted: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
+def draw_readings(level, predicted, *, rng):
     """Draw readings of one scan, (n_samples, n_points): AR(1) noise, outliers, lost readings, then rounding."""
     noise = rng.standard_normal(predicted.shape)
     for k in range(1, noise.shape[1]):
@@ -79,15 +77,6 @@ def test_draws_follow_the_density(name):
 def test_noise_that_grows_with_the_light_does_so():
     level = level_of("signal_dependent_noise")
     np.testing.assert_allclose(level.sd[0, [0, 100]], [SD, SD * np.sqrt(5)], rtol=1e-3)
-
-
-def test_the_step_of_a_lattice_is_found():
-    rng = np.random.default_rng(2)
-    values = rng.normal(30, 8, 300)
-    assert lattice_step(0.37 * np.round(values / 0.37)) == pytest.approx(0.37)
-    assert lattice_step(np.round(values, 3)) == pytest.approx(0.001)
-    assert lattice_step(values) == 0.0
-    assert lattice_step(np.array([1.0, 1.0, 2.0])) == 0.0
 
 
 @pytest.mark.parametrize("digits", [2, 3, 6])

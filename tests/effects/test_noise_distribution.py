@@ -1,7 +1,5 @@
 """Densities of readings, rounded or at an end of the range, against quadrature."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -20,14 +18,14 @@ from probewise.effects.noise_distribution import (
 from probewise.sensor.stages import NoiseParameters
 
 
-def test_the_gaussian_density_is_that_of_scipy() -> None:
+def test_the_gaussian_density_is_that_of_scipy():
     readings, mean, sd = np.array([1.0, 2.0]), np.array([[0.5, 2.5], [1.0, 2.0]]), np.array([[0.3], [2.0]])
     np.testing.assert_allclose(log_gaussian_density(readings, mean, sd), stats.norm.logpdf(readings, mean, sd))
 
 
 @pytest.mark.parametrize("z", [-30.0, -3.0, -0.1, 0.0, 0.2, 4.0, 25.0])
 @pytest.mark.parametrize("step", [0.1, 1.0, 7.0])
-def test_the_cell_density_is_the_mean_of_the_density_over_the_cell(z: float, step: float) -> None:
+def test_the_cell_density_is_the_mean_of_the_density_over_the_cell(z, step):
     """By quadrature, in units that keep the integrand near one."""
     sd = 0.8
     got = log_rounding_cell_density(np.array([z * sd]), np.array([0.0]), np.array([sd]), step)[0]
@@ -39,7 +37,7 @@ def test_the_cell_density_is_the_mean_of_the_density_over_the_cell(z: float, ste
     assert got == pytest.approx(top + math.log(mass / step), rel=1e-8, abs=1e-8)
 
 
-def test_a_reading_far_beyond_every_prediction_keeps_a_finite_density() -> None:
+def test_a_reading_far_beyond_every_prediction_keeps_a_finite_density():
     out = log_rounding_cell_density(np.array([1e6, -1e6]), np.zeros(2), np.full(2, 1e-3), 1.0)
     assert np.isfinite(out).all()
     assert out[0] == pytest.approx(out[1])

@@ -1,8 +1,5 @@
 """Effects of the light on its way, against pixels, in any order on the footprint."""
 
-from __future__ import annotations
-
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -10,12 +7,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from probewise.effects import EFFECTS, Extent, Known
-from probewise.effects.optics import RegionWithGradient, RegionWithPatch
-from probewise.priors import Product
-from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform, paper_plan
-from probewise.scene import KnownScene, edge_distance
-from probewise.scene.regions import HalfPlaneRegion, PolygonRegion, QuadrantRegion, StripesRegion, disc_region
+from probewise.effects import EFFECTS, Extent
+from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform
+from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, Stage
 
 I_MIN, I_MAX, H0 = 10.0, 60.0, 12.0
@@ -32,7 +26,7 @@ PATTERNS = {
 }
 
 
-def plan() -> Plan:
+def plan():
     """Four scans of four readings: forth, back, along Y, and forth, turned by 0, 130, 0 and 250 degrees."""
     line = np.array([-6.0, -1.0, 3.0, 7.0])
     still = np.full(4, 1.0)
@@ -56,7 +50,7 @@ SIGN = np.repeat([1.0, -1.0, 1.0, 1.0], 4)  # of the move, along Y in scan c
 ALONG = np.repeat([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]], 4, axis=0)
 
 
-def inside(name: str, x, y):
+def inside(name, x, y):
     """Albedo of the patterns, written out."""
     if name == "edge":
         return (x > 1.0).astype(float)
@@ -67,7 +61,7 @@ def inside(name: str, x, y):
     return np.full_like(x, 0.6)
 
 
-def distance(name: str, x: float, y: float) -> float:
+def distance(name, x, y):
     """Distance to the nearest edge, written out."""
     if name == "edge":
         return abs(x - 1.0)
@@ -96,14 +90,14 @@ class Rival:
     def readings(self):
         return self.finish(np.array([self.reading(k) for k in range(16)]))
 
-    def reading(self, k: int) -> float:
+    def reading(self, k):
         name = NAMES[PLAN.pattern[k]]
         x, y = self.place(k, PLAN.x_mm[k], PLAN.y_mm[k])
         angle = PLAN.orientation_rad[k] + np.radians(self.turn_deg(k))
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         ratio = self.height(k) / H0
 
-        def see(mean, cov) -> float:
+        def see(mean, cov):
             center = np.array([x, y]) + turn @ mean
             cov = turn @ cov @ turn.T
             reach = 6.5 * np.sqrt(np.diag(cov).max())
@@ -125,7 +119,7 @@ class Rival:
 X, Y, T = PLAN.x_mm, PLAN.y_mm, PLAN.time_s
 
 
-def in_scan(number: int) -> Callable:
+def in_scan(number):
     return lambda k: float(PLAN.scan[k] == number)
 
 
@@ -227,11 +221,11 @@ CASES = {
 }
 
 
-def chain(*effects) -> Chain:
+def chain(*effects):
     return Chain(FixedMixture(WEIGHTS, MEANS, COVS), FixedLevels(I_MIN, I_MAX), KnownScene(PATTERNS), effects)
 
 
-def effect_of(name: str):
+def effect_of(name):
     found = EFFECTS[name].for_extent(Extent(I_MIN, I_MAX, PLAN)) or EFFECTS[name]()
     return next((variant for variant in found.variants() if variant.scans == ("b",)), found)
 
@@ -306,81 +300,3 @@ def test_effects_of_scene_footprint_and_pose_stack_as_physics_does():
     model = chain(*(effect_of(name) for name in reversed(sizes)))
     theta = np.array([[x for effect in model.effects for x in sizes[effect.name]]])
     np.testing.assert_allclose(model.predict(theta, PLAN)[0], rival.readings(), atol=1e-4 * 50)
-
-
-OUTLINED = {
-    "half_plane": HalfPlaneRegion([0.5], [1.0]),
-    "quadrant": QuadrantRegion([[1.0, -2.0]], [[-1.0, 1.0]]),
-    "stripes": StripesRegion([0.3], [7.0], [0.35], [1.0]),
-    "disc": disc_region([[3.0, 1.0]], [6.0]),
-    "polygon": PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [8.0, 2.0], [3.0, 9.0]]])),
-}
-
-
-@pytest.mark.parametrize("name", OUTLINED)
-def test_the_distance_is_that_to_where_the_albedo_changes(name):
-    """Walk out in all directions until the albedo is another: the shortest walk, to within its steps."""
-    region = OUTLINED[name]
-    places = np.random.default_rng(1).uniform(-7, 7, (5, 2))
-    found = edge_distance(region, places[None, :, 0], places[None, :, 1])[0]
-    angles = np.linspace(0, 2 * np.pi, 361)
-    radii = np.arange(0, 15, 0.02)
-    for place, distance in zip(places, found, strict=True):
-        rays = place + radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        albedo = region.albedo(rays.reshape(-1, 2)).reshape(len(radii), -1)
-        changed = np.flatnonzero((albedo != albedo[0, 0]).any(axis=1))
-        assert distance == pytest.approx(radii[changed[0]], abs=0.1)
-    changed_surface = RegionWithGradient(RegionWithPatch(region, np.ones((1, 4))), np.zeros((1, 2)))
-    np.testing.assert_array_equal(edge_distance(changed_surface, places[None, :, 0], places[None, :, 1])[0], found)
-
-
-SIZES = {
-    "edge_blur": (2.0,),
-    "halo": (0.05, 20.0),
-    "height_gradient": (0.002,),
-    "height_offset": (0.5,),
-    "reflection": (0.04, 8.0, 3.0),
-    "slow_sinking": (0.2,),
-}
-FOOTPRINT_PLAN = paper_plan()
-MIXTURE = FixedMixture(np.ones(1), np.array([[1.0, 1.5]]), np.array([[[16.0, 0.0], [0.0, 9.0]]]))
-
-
-def known(name):
-    effect = EFFECTS[name].for_extent(Extent(10.0, 60.0, FOOTPRINT_PLAN)).variants()[0]
-    return Known(effect, SIZES[name])
-
-
-def test_the_sizes_are_those_of_all_effects_on_the_footprint():
-    assert {name for name, kind in EFFECTS.items() if kind.stage == Stage.FOOTPRINT} == set(SIZES)
-
-
-@dataclass(frozen=True)
-class InTurn:
-    """Effects of known parameters, one after the other, as one effect."""
-
-    effects: tuple[Known, ...]
-
-    name = "in_turn"
-    stage = Stage.FOOTPRINT
-    prior = Product({})
-
-    def apply(self, value, theta, plan):
-        for effect in self.effects:
-            value = effect.apply(value, theta, plan)
-        return value
-
-
-def readings(*effects):
-    return Chain(MIXTURE, FixedLevels(10.0, 60.0), KnownScene(FOOTPRINT_PLAN.patterns), effects).predict(
-        np.empty((1, 0)), FOOTPRINT_PLAN
-    )
-
-
-@pytest.mark.parametrize(("first", "second"), list(itertools.combinations(sorted(SIZES), 2)))
-def test_another_order_changes_readings_by_a_fraction_of_the_noise(first, second):
-    """At most 0.3 % of the span, a quarter of an sd of the paper's noise."""
-    effects = known(first), known(second)
-    by_name = readings(InTurn(effects))
-    np.testing.assert_array_equal(readings(*effects[::-1]), by_name)
-    np.testing.assert_allclose(readings(InTurn(effects[::-1])), by_name, atol=0.15)

@@ -1,13 +1,10 @@
 """A brick on a clock that tests move, and one in a process of its own."""
 
-from __future__ import annotations
-
 import select
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import pytest
@@ -16,22 +13,22 @@ from probewise.emulator import Brick, LightSensor, VirtualClock, empty_port
 
 
 @pytest.fixture
-def clock() -> VirtualClock:
+def clock():
     return VirtualClock()
 
 
 @pytest.fixture
-def brick(clock: VirtualClock) -> Brick:
+def brick(clock):
     """A light sensor at port 2 over something that reads 57.5 %."""
     sensors = [empty_port, LightSensor(lambda lit: 57.5 if lit else 28.75, clock), empty_port, empty_port]
     return Brick(clock, sensors=sensors, name="ARM1", programs=("arm.rxe",))
 
 
 @pytest.fixture
-def ask(brick: Brick) -> Callable[[str], str]:
+def ask(brick):
     """Send a telegram as hexadecimal text, return the reply as such; nothing where there is none."""
 
-    def ask(telegram: str) -> str:
+    def ask(telegram):
         reply = brick.answer(bytes.fromhex(telegram))
         return "" if reply is None else reply.hex(" ").upper()
 
@@ -48,16 +45,15 @@ class Running:
     process: subprocess.Popen[bytes]
     device: str
 
-    def line(self) -> str:
+    def line(self):
         """Read what it says next."""
-        assert self.process.stdout is not None
         ready, _, _ = select.select([self.process.stdout], [], [], LIMIT_S)
         assert ready, "the emulator says nothing"
         return self.process.stdout.readline().decode().rstrip("\n")
 
 
 @contextmanager
-def _running(*options: str) -> Iterator[Running]:
+def _running(*options):
     """Run an emulator, and make sure that it ends."""
     command = [sys.executable, "-m", "probewise", "emulate-nxt", *options]
     with subprocess.Popen(
@@ -77,12 +73,12 @@ def _running(*options: str) -> Iterator[Running]:
             process.kill()
 
 
-def _mind_interrupts() -> None:
+def _mind_interrupts():
     # A test runner in the background ignores Ctrl-C, and its children would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
-def emulator() -> Callable[..., AbstractContextManager[Running]]:
+def emulator():
     """Run `probewise emulate-nxt` with some options."""
     return _running

@@ -1,40 +1,35 @@
 """The arm on the brick: from motor counts to a place over the field, and what the sensor sees there."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from probewise.emulator import (
     EmulatedArm,
-    Geometry,
     LightModel,
     SensorPose,
     Tabletop,
-    VirtualClock,
     parse_scene,
     read_geometry,
     shipped_geometry_path,
 )
 from probewise.errors import FileError, ParameterError
 from probewise.recordings import Disc, HalfPlane, Polygon, Quadrant, Uniform
-from probewise.world import Blob, Oval, Surface, World, gaussian_spot
+from probewise.world import Blob, Oval, World, gaussian_spot
 
 WORLD = World(gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))]), black=10.0, white=60.0, noise_sd=0.6)
 CIRCLE = Disc((524.0, 300.0), 100.0)
 
 
 @pytest.fixture
-def geometry() -> Geometry:
+def geometry():
     return read_geometry(shipped_geometry_path())
 
 
-def posed(geometry: Geometry, *angles_deg: float) -> SensorPose:
+def posed(geometry, *angles_deg):
     """Bring an arm's base, shoulder and elbow to these angles by hand."""
     arm = EmulatedArm(geometry)
     for joint, angle_deg in zip(arm.joints, angles_deg, strict=True):
@@ -42,7 +37,7 @@ def posed(geometry: Geometry, *angles_deg: float) -> SensorPose:
     return arm.sensor_pose()
 
 
-def test_the_arm_stands_where_two_links_over_a_turning_base_lead(geometry: Geometry) -> None:
+def test_the_arm_stands_where_two_links_over_a_turning_base_lead(geometry):
     """rho = r0 + L1 cos a + L2 cos b + d, z = h0 + L1 sin a + L2 sin b - hs; worked out with complex numbers."""
     stand = posed(geometry, -70.0, 50.0, -40.0)
     upper, lower = geometry.links_mm
@@ -57,14 +52,7 @@ def test_the_arm_stands_where_two_links_over_a_turning_base_lead(geometry: Geome
     assert stand.orientation_rad == pytest.approx(math.radians(geometry.mounting_deg - 70 - 90))
 
 
-def test_a_relative_elbow_turns_with_the_upper_link(geometry: Geometry) -> None:
-    relative = posed(replace(geometry, elbow_is_absolute=False), -90.0, 50.0, -90.0)
-    absolute = posed(geometry, -90.0, 50.0, -40.0)
-    assert (relative.x_mm, relative.y_mm) == pytest.approx((absolute.x_mm, absolute.y_mm))
-    assert relative.height_mm == pytest.approx(absolute.height_mm)
-
-
-def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometry) -> None:
+def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry):
     arm = EmulatedArm(geometry)
     motor = arm.motors()["ABC".index(geometry.joints[0].port)]
     angles = []
@@ -75,22 +63,22 @@ def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometr
     assert math.degrees(angles[1] - angles[0]) == pytest.approx(geometry.joints[0].play_deg)
 
 
-def sight(stand: SensorPose, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
+def sight(stand, clock, *, albedo=1.0):
     world = replace(WORLD, noise_sd=0.0)
     return LightModel(world, Tabletop(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
 
 
-def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock: VirtualClock) -> None:
+def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock):
     assert sight(SensorPose(0, 0, 14.0, 0), clock)(True) == pytest.approx(60.5)
     assert sight(SensorPose(0, 0, 14.0, 0), clock, albedo=0.0)(True) == pytest.approx(10.5)
 
 
-def test_without_the_led_contrast_is_halved_and_height_does_not_matter(clock: VirtualClock) -> None:
+def test_without_the_led_contrast_is_halved_and_height_does_not_matter(clock):
     for height_mm in (5.0, 14.0, 60.0):
         assert sight(SensorPose(0, 0, height_mm, 0), clock)(False) == pytest.approx(30.25)
 
 
-def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetres(clock: VirtualClock) -> None:
+def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetres(clock):
     lit = {h: sight(SensorPose(0, 0, h, 0), clock)(True) for h in (0.0, 4.0, 8.0, 14.0, 25.0, 60.0)}
     assert lit[8.0] == max(lit.values())
     assert lit[0.0] == pytest.approx(30.25)
@@ -98,7 +86,7 @@ def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetr
     assert lit[60.0] == pytest.approx(30.25, abs=0.5)
 
 
-def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualClock) -> None:
+def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock):
     """As on the simulated arm with the same seed, however often it is read at one stand."""
     at = [SensorPose(0, 0, 14.0, 0)]
     look = LightModel(WORLD, Tabletop(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
@@ -109,7 +97,7 @@ def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualCloc
         assert look(True) != pytest.approx(expected)
 
 
-def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClock) -> None:
+def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock):
     """Over an edge the spot's centre, 6 mm along v, is on the white side, then on the black one."""
     table = Tabletop(HalfPlane(math.pi / 2, 0.0))
     world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
@@ -121,7 +109,7 @@ def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClo
     assert look(True) == pytest.approx(35.5)
 
 
-def test_what_a_person_cannot_do_changes_nothing() -> None:
+def test_what_a_person_cannot_do_changes_nothing():
     table = Tabletop(CIRCLE)
     for wish in ("turn", "turn round", "turn nan", "hexagon", ""):
         with pytest.raises(ParameterError, match="turn DEGREES"):
@@ -143,7 +131,7 @@ def test_what_a_person_cannot_do_changes_nothing() -> None:
         (r"\[joints.base\]", "[joints.base", "not TOML"),
     ],
 )
-def test_a_geometry_that_cannot_be_used_says_where(tmp_path: Path, old: str, new: str, found: str) -> None:
+def test_a_geometry_that_cannot_be_used_says_where(tmp_path, old, new, found):
     text = shipped_geometry_path().read_text(encoding="utf-8")
     file = tmp_path / "arm.toml"
     changed, n_changed = re.subn(old, new, text, count=1)
@@ -166,13 +154,13 @@ def test_a_geometry_that_cannot_be_used_says_where(tmp_path: Path, old: str, new
         ("uniform:0.5", Uniform(0.5)),
     ],
 )
-def test_a_scene_is_read_from_a_text(text: str, surface: Surface) -> None:
+def test_a_scene_is_read_from_a_text(text, surface):
     assert parse_scene(text) == surface
 
 
 @pytest.mark.parametrize(
     "text", ["", "1,2", "1,2,0", "1,2,nan", "blob:1,2,3", "polygon:1,2,3,4", "corner:1,2,0,1", "uniform:2", "a,b,c"]
 )
-def test_a_scene_of_no_form_is_refused_with_all_forms(text: str) -> None:
+def test_a_scene_of_no_form_is_refused_with_all_forms(text):
     with pytest.raises(ParameterError, match="ellipse:X,Y,A,B,ANGLE"):
         parse_scene(text)

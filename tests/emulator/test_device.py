@@ -1,16 +1,10 @@
 """`probewise emulate-nxt` as a person meets it: a process with a serial device."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select
 import signal
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import Any, TypeAlias
 
 import pytest
 
@@ -19,12 +13,11 @@ from probewise.cli import main
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="this system has no pseudo-terminals")
 
 LIMIT_S = 60.0
-Emulator: TypeAlias = Callable[..., AbstractContextManager[Any]]
 
 BATTERY, ANSWER = bytes.fromhex("02 00 00 0B"), bytes.fromhex("05 00 02 0B 00 F4 1C")
 
 
-def exchanged(device: str, sent: bytes, expected: int, *, limit_s: float = 10.0) -> bytes:
+def exchanged(device, sent, expected, *, limit_s=10.0):
     """Open the device, write, and read so many bytes."""
     file = os.open(device, os.O_RDWR | os.O_NOCTTY)
     try:
@@ -39,14 +32,14 @@ def exchanged(device: str, sent: bytes, expected: int, *, limit_s: float = 10.0)
         os.close(file)
 
 
-def _made_ns(device: str) -> int | None:
+def _made_ns(device):
     """Return when a pseudo-terminal was made, None if there is none; numbers are used again."""
     with contextlib.suppress(FileNotFoundError):
         return os.stat(device).st_ctime_ns
     return None
 
 
-def test_clients_come_and_go_and_ctrl_c_ends_it(emulator: Emulator, tmp_path: Path) -> None:
+def test_clients_come_and_go_and_ctrl_c_ends_it(emulator, tmp_path):
     log = tmp_path / "log"
     with emulator("--log", str(log), "--name", "ARM1") as running:
         for _ in range(3):
@@ -65,7 +58,7 @@ def test_clients_come_and_go_and_ctrl_c_ends_it(emulator: Emulator, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_person_changes_the_scene_by_typing(emulator: Emulator) -> None:
+def test_a_person_changes_the_scene_by_typing(emulator):
     with emulator() as running:
         running.process.stdin.write(b"uniform:0.5\ngremlins\n")
         assert running.line() == "done: uniform:0.5"
@@ -75,9 +68,7 @@ def test_a_person_changes_the_scene_by_typing(emulator: Emulator) -> None:
 
 
 @pytest.mark.slow
-def test_a_disconnection_takes_the_device_away_and_a_link_leads_to_the_new_one(
-    emulator: Emulator, tmp_path: Path
-) -> None:
+def test_a_disconnection_takes_the_device_away_and_a_link_leads_to_the_new_one(emulator, tmp_path):
     link = tmp_path / "rfcomm0"
     with emulator("--link", str(link), "--fault", "disconnect=1") as running:
         assert running.device == str(link)
@@ -97,7 +88,7 @@ def test_a_disconnection_takes_the_device_away_and_a_link_leads_to_the_new_one(
     assert not link.is_symlink()
 
 
-def _is_there(file: int) -> bool:
+def _is_there(file):
     ready, _, _ = select.select([file], [], [], 0)
     try:
         return not ready or bool(os.read(file, 1))
@@ -105,7 +96,7 @@ def _is_there(file: int) -> bool:
         return False
 
 
-def test_a_link_never_replaces_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_link_never_replaces_a_file(tmp_path, capsys):
     precious = tmp_path / "precious"
     precious.write_text("keep me", encoding="utf-8")
     assert main(["emulate-nxt", "--link", str(precious)]) == 2
@@ -126,9 +117,7 @@ def test_a_link_never_replaces_a_file(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--seed", "-1"], "--seed"),
     ],
 )
-def test_a_wrong_command_line_is_told_in_one_line(
-    options: list[str], found: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_command_line_is_told_in_one_line(options, found, capsys):
     assert main(["emulate-nxt", *options]) == 2
     said = capsys.readouterr()
     assert said.out == ""

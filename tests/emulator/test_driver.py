@@ -1,25 +1,14 @@
 """Our driver against our emulator, which share no code, on a clock that nobody waits for."""
 
-from __future__ import annotations
-
 import contextlib
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.emulator import (
-    EmulatedBench,
-    Faults,
-    VirtualClock,
-    VirtualLine,
-    read_geometry,
-    set_up_bench,
-    shipped_geometry_path,
-)
+from probewise.emulator import Faults, VirtualLine, read_geometry, set_up_bench, shipped_geometry_path
 from probewise.errors import LinkError
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
@@ -28,7 +17,7 @@ SEED = 11
 WORLD, CIRCLE = true_world("paper"), Disc((600.0, 250.0), 80.0)
 
 
-def measured(bench: EmulatedBench, clock: VirtualClock, places_mm: np.ndarray) -> list[arm.Reading]:
+def measured(bench, clock, places_mm):
     """Read at each place, in one session."""
     geometry = arm.read_geometry(arm.shipped_geometry_path())
     link = Link(VirtualLine(bench.radio, clock), clock=clock)
@@ -40,7 +29,7 @@ def measured(bench: EmulatedBench, clock: VirtualClock, places_mm: np.ndarray) -
         ]
 
 
-def some_places(n: int) -> np.ndarray:
+def some_places(n):
     """Draw places within reach, none where a millimetre more or less matters."""
     rng = np.random.default_rng(SEED)
     geometry = arm.read_geometry(arm.shipped_geometry_path())
@@ -54,14 +43,12 @@ def some_places(n: int) -> np.ndarray:
     return np.concatenate([inside, places[good & (from_edge > 0)][: n - len(inside)]])
 
 
-def bench_over_circle(clock: VirtualClock) -> EmulatedBench:
+def bench_over_circle(clock):
     return set_up_bench(read_geometry(shipped_geometry_path()), WORLD, CIRCLE, clock, seed=SEED)
 
 
 @pytest.mark.parametrize("play", [True, False])
-def test_joints_stand_where_their_counters_say_but_for_half_a_count(
-    clock: VirtualClock, tmp_path: Path, play: bool
-) -> None:
+def test_joints_stand_where_their_counters_say_but_for_half_a_count(clock, tmp_path, play):
     """Neither more on one side than on the other: a bias of half a count is an edge that lies 0.15 mm elsewhere."""
     text = arm.shipped_geometry_path().read_text(encoding="utf-8")
     file = tmp_path / "arm.toml"
@@ -82,22 +69,22 @@ def test_joints_stand_where_their_counters_say_but_for_half_a_count(
 class Cut:
     """Let the n-th telegram from now on be the last that the brick gets."""
 
-    def __init__(self, bench: EmulatedBench, n: int) -> None:
+    def __init__(self, bench, n):
         self._radio, self._left, self._answer = bench.radio, n, bench.radio.brick.answer
-        bench.radio.brick.answer = self  # type: ignore[method-assign]
+        bench.radio.brick.answer = self
 
-    def __call__(self, telegram: bytes) -> bytes | None:
+    def __call__(self, telegram):
         self._left -= 1
         if not self._left:
             self._radio.faults = Faults(disconnect=1.0)
         return self._answer(telegram)
 
-    def mend(self) -> None:
+    def mend(self):
         self._radio.faults = Faults()
 
 
 @pytest.mark.parametrize("n", [pytest.param(n, marks=[] if n % 12 == 1 else pytest.mark.slow) for n in range(1, 80, 3)])
-def test_after_a_cut_anywhere_the_motors_stop_and_the_next_reading_is_taken(clock: VirtualClock, n: int) -> None:
+def test_after_a_cut_anywhere_the_motors_stop_and_the_next_reading_is_taken(clock, n):
     """Also in the middle of lowering: the sensor comes up first, whatever the next place is."""
     places = np.array([[524.0, 320.0], [60.0, 300.0]])  # 76 telegrams from the one to the other and up
     bench = bench_over_circle(clock)

@@ -1,9 +1,6 @@
 """The whole autonomous run on the emulator: as on the simulated arm, and whatever happens to the line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +30,7 @@ from probewise.arm import LegoArm, Pose, Reading
 from probewise.arm.geometry import Accuracy
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.emulator import Faults, SensorPose, VirtualClock, VirtualLine
-from probewise.experiment import Experiment, arm_over
+from probewise.experiment import arm_over
 from probewise.recordings import Disc
 from probewise.scene import Field
 
@@ -41,7 +38,7 @@ SEED = 1
 
 
 @pytest.fixture(scope="module")
-def asked() -> Experiment:
+def asked():
     """A search that trusts its sensor: what happens to the line is asked here, and doubt takes ten times as long."""
     return replace(experiment(), trust=1.0)
 
@@ -50,9 +47,7 @@ QUICK = ("corrupt",)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FAULTS])
-def test_the_robot_finds_the_circle_under_every_fault_and_loses_nothing(
-    asked: Experiment, tmp_path: Path, name: str
-) -> None:
+def test_the_robot_finds_the_circle_under_every_fault_and_loses_nothing(asked, tmp_path, name):
     """What a run may not do is listed in `violations`: make readings up, lose, double them, hang, leave a motor on."""
     run = explored(asked, FAULTS[name], seed=SEED, journal=tmp_path / "journal.jsonl")
     assert not violations(run)
@@ -65,7 +60,7 @@ def test_the_robot_finds_the_circle_under_every_fault_and_loses_nothing(
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_measurements_as_on_the_simulated_arm(asked: Experiment, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_measurements_as_on_the_simulated_arm(asked, tmp_path):
     """Both begin at the same place, read the same there, and end at the same circle.
 
     At the places of the simulated arm's whole run, each reading of the emulator differs by no more than what the
@@ -99,7 +94,7 @@ READ = Reading(60.0, Pose(600.0, 250.0, 0.5), 1.0, {"battery_mv": 7400.0})
 GOOD = Taken(READ.pose, READ, 60.9, 0, Answer(1.0, 60.9, STAND, 7410.0))
 
 
-def ended(*taken: Taken, journal: tuple[Reading, ...], n_read: int | None = None) -> Run:
+def ended(*taken, journal, n_read=None):
     return Run(taken=[*taken], journal=journal, n_read=len(taken) if n_read is None else n_read)
 
 
@@ -116,12 +111,12 @@ def ended(*taken: Taken, journal: tuple[Reading, ...], n_read: int | None = None
         replace(GOOD, percent=20.9, reading=replace(READ, value=20.0), answer=Answer(1.0, 20.9, STAND, 7410.0)),
     ],
 )
-def test_a_reading_that_is_not_the_brick_s_is_found_out(bad: Taken) -> None:
+def test_a_reading_that_is_not_the_brick_s_is_found_out(bad):
     """Never answered; another percentage, value, place, orientation, battery, height; not what lies there."""
     assert len(wrong(ended(bad, journal=(bad.reading,)))) == 1
 
 
-def test_from_python_too_a_fitted_arm_counts_its_own_error() -> None:
+def test_from_python_too_a_fitted_arm_counts_its_own_error():
     clock = VirtualClock()
     bench, _ = bench_with(Faults(), clock, seed=SEED)
     rows = np.diag([0.0] * 5 + [9.0] + [0.0] * 3).tolist()  # the base's x is known to 3 mm

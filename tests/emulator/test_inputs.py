@@ -1,9 +1,6 @@
 """Input ports: what the firmware makes of a voltage, and when it says that it is valid."""
 
-from __future__ import annotations
-
 import struct
-from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -13,24 +10,24 @@ from probewise.emulator import Brick, LightSensor, VirtualClock, empty_port
 
 
 class Fixed:
-    def __init__(self, value: int) -> None:
+    def __init__(self, value):
         self.value = value
 
-    def __call__(self, lit: bool) -> int:
+    def __call__(self, lit):
         return self.value
 
 
-def values(ask: Callable[[str], str]) -> tuple[int, int, int, int]:
+def values(ask):
     """Read port 2: valid, raw, normalized, scaled."""
     valid, _, _, _, raw, normalized, scaled, _ = struct.unpack("<BBBBHHhh", bytes.fromhex(ask("00 07 01"))[4:])
     return valid, raw, normalized, scaled
 
 
-def light_brick(clock: VirtualClock, sensor: object) -> Brick:
-    return Brick(clock, sensors=[empty_port, sensor, empty_port, empty_port])  # type: ignore[list-item]
+def light_brick(clock, sensor):
+    return Brick(clock, sensors=[empty_port, sensor, empty_port, empty_port])
 
 
-def asking(brick: Brick) -> Callable[[str], str]:
+def asking(brick):
     return lambda telegram: (brick.answer(bytes.fromhex(telegram)) or b"").hex(" ").upper()
 
 
@@ -38,7 +35,7 @@ def asking(brick: Brick) -> Callable[[str], str]:
     ("raw", "normalized", "percent"),
     [(0, 1023, 100), (200, 1023, 100), (300, 876, 85), (500, 582, 56), (700, 288, 28), (842, 79, 7), (1023, 0, 0)],
 )
-def test_light_is_scaled_as_the_firmware_does(clock: VirtualClock, raw: int, normalized: int, percent: int) -> None:
+def test_light_is_scaled_as_the_firmware_does(clock, raw, normalized, percent):
     ask = asking(light_brick(clock, Fixed(raw)))
     for mode, scaled in (("00", normalized), ("80", percent)):
         ask(f"80 05 01 05 {mode}")
@@ -46,7 +43,7 @@ def test_light_is_scaled_as_the_firmware_does(clock: VirtualClock, raw: int, nor
         assert values(ask) == (1, raw, normalized, scaled)
 
 
-def test_readings_are_invalid_for_20_ms_after_a_change_of_type_and_show_the_old_values(ask, clock) -> None:
+def test_readings_are_invalid_for_20_ms_after_a_change_of_type_and_show_the_old_values(ask, clock):
     ask("80 05 01 05 80")
     clock.sleep(0.1)
     lit = values(ask)
@@ -63,7 +60,7 @@ def test_readings_are_invalid_for_20_ms_after_a_change_of_type_and_show_the_old_
 
 
 @given(percent=st.floats(0, 100))
-def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
+def test_what_is_seen_comes_back_in_percent(percent):
     """One count of the converter is 0.147 %, and the firmware truncates."""
     clock = VirtualClock()
     ask = asking(light_brick(clock, LightSensor(lambda lit: percent, clock)))
@@ -73,7 +70,7 @@ def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
 
 
 @given(telegrams=st.lists(st.binary(max_size=70), max_size=6))
-def test_the_brick_answers_any_bytes_with_a_reply_or_not_at_all(telegrams: list[bytes]) -> None:
+def test_the_brick_answers_any_bytes_with_a_reply_or_not_at_all(telegrams):
     clock = VirtualClock()
     brick = Brick(clock)
     for telegram in telegrams:

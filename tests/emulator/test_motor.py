@@ -1,40 +1,37 @@
 """Motors and the firmware over them, on a clock that tests move."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import pytest
 
-from probewise.emulator import Brick, Motor, VirtualClock
+from probewise.emulator import Brick, Motor
 from probewise.emulator.motors import OutputPort, OutputSetting, RunState
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
 
 
-def little(value: int) -> str:
+def little(value):
     return value.to_bytes(4, "little").hex(" ")
 
 
-def turn(ask: Callable[[str], str], power: int, limit: int, *, how: str = RUN, port: int = 0) -> None:
+def turn(ask, power, limit, *, how=RUN, port=0):
     ask(f"80 04 {port:02X} {power & 0xFF:02X} {how} {little(limit)}")
 
 
-def wait(clock: VirtualClock, brick: Brick, seconds: float) -> OutputPort:
+def wait(clock, brick, seconds):
     """Let time pass and return port A."""
     clock.sleep(seconds)
     brick.advance()
     return brick.outputs.ports[0]
 
 
-def coasted(speed_deg_s: float, motor: Motor) -> float:
+def coasted(speed_deg_s, motor):
     """Integrate speed' = -speed/T - f to standstill: T v - f T^2 ln(1 + v / (f T))."""
     t, f = motor.coasting_s, motor.friction_deg_s2
     return t * speed_deg_s - f * t * t * math.log1p(speed_deg_s / (f * t))
 
 
-def test_a_coasting_motor_stops_where_the_integral_says() -> None:
+def test_a_coasting_motor_stops_where_the_integral_says():
     motor = Motor(speed_deg_s=600.0)
     for _ in range(2000):
         motor.step(1e-3, 0, brake=False, battery_mv=7400)
@@ -42,7 +39,7 @@ def test_a_coasting_motor_stops_where_the_integral_says() -> None:
     assert motor.speed_deg_s == 0
 
 
-def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock, brick) -> None:
+def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock, brick):
     turn(ask, 50, 0, how="01 00 00 20")
     port = wait(clock, brick, 1.0)
     motor = port.motor
@@ -51,16 +48,14 @@ def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock,
 
 
 @pytest.mark.parametrize("battery_mv", [7412, 6500])
-def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(
-    clock: VirtualClock, battery_mv: float
-) -> None:
+def test_a_regulated_motor_keeps_ten_degrees_a_second_for_each_unit_of_power(clock, battery_mv):
     brick = Brick(clock, full_mv=battery_mv)
     brick.answer(bytes.fromhex(f"80 04 00 1E {RUN} 00 00 00 00"))
     begun = wait(clock, brick, 2.0).tacho_count
     assert wait(clock, brick, 4.0).tacho_count - begun == pytest.approx(1200, abs=15)
 
 
-def test_the_regulator_is_the_firmwares_by_hand() -> None:
+def test_the_regulator_is_the_firmwares_by_hand():
     """Power is half of 3 e (to 100), the sum of errors (3 s + e) / 4, and the change of e, all in whole numbers."""
     port = OutputPort(Motor(stops_deg=(0.0, 0.0)))
     port.apply_setting(OutputSetting(20, 7, 1, 0, 0x20))
@@ -72,7 +67,7 @@ def test_the_regulator_is_the_firmwares_by_hand() -> None:
     assert powers == [(60 + 5 + 20) // 2, (100 + 13 + 20) // 2, (100 + 24 + 20) // 2]
 
 
-def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(ask, clock, brick) -> None:
+def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(ask, clock, brick):
     """360 asked for, 420 measured (plain limit, coasting)."""
     turn(ask, 75, 360)
     port = brick.outputs.ports[0]
@@ -86,7 +81,7 @@ def test_a_limited_run_overshoots_as_published_and_shows_idle_before_it_rests(as
     assert 400 <= port.tacho_count <= 440
 
 
-def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick) -> None:
+def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick):
     ask(f"80 04 00 {HOLD}")
     port = wait(clock, brick, 0.5)
     port.motor.angle_deg += 20
@@ -97,7 +92,7 @@ def test_hold_brings_a_pushed_motor_back_and_coasting_does_not(ask, clock, brick
     assert wait(clock, brick, 2.0).tacho_count >= 17
 
 
-def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, brick) -> None:
+def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, brick):
     """The goal runs on from where the last run should have ended."""
     for _ in range(2):
         turn(ask, 75, 360)
@@ -105,14 +100,14 @@ def test_overshoot_is_taken_off_the_next_run_in_the_same_direction(ask, clock, b
     assert 720 + 40 <= port.tacho_count <= 720 + 80
 
 
-def test_a_motor_stands_still_at_its_stop() -> None:
+def test_a_motor_stands_still_at_its_stop():
     motor = Motor(stops_deg=(-50.0, 100.0))
     for _ in range(1000):
         motor.step(1e-3, 80, brake=False, battery_mv=7400)
     assert (motor.angle_deg, motor.speed_deg_s) == (100.0, 0.0)
 
 
-def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up() -> None:
+def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up():
     motor = Motor(play_deg=8.0)
     for side in (1, -1):
         while side * motor.angle_deg < 100:
@@ -120,7 +115,7 @@ def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up() -> None:
         assert motor.driven_deg == pytest.approx(motor.angle_deg - side * 4.0)
 
 
-def test_the_brick_sleeps_unless_it_is_kept_awake(ask, clock, brick) -> None:
+def test_the_brick_sleeps_unless_it_is_kept_awake(ask, clock, brick):
     """Only KEEPALIVE counts; asleep, it answers nothing and its motors coast."""
     clock.sleep(599.0)
     assert ask("00 0D") == "02 0D 00 C0 27 09 00"

@@ -3,16 +3,11 @@
 It waits for ever for an answer that does not come, so each of its programs runs in a process with a limit.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -31,16 +26,16 @@ with nxt.locator.find(backends=["devfile"], config=None, filename=sys.argv[1]) a
 
 
 @pytest.fixture(scope="module")
-def device(emulator: Callable[..., AbstractContextManager[Any]]) -> Iterator[str]:
+def device(emulator):
     with emulator("--scene", "524,300,100") as running:
         yield running.device
 
 
 @pytest.fixture
-def client(device: str) -> Callable[[str], list[str]]:
+def client(device):
     """Run statements with `brick` in hand and return the lines they print."""
 
-    def client(statements: str) -> list[str]:
+    def client(statements):
         body = "".join(f"    {line}\n" for line in statements.strip().splitlines())
         done = subprocess.run(
             [sys.executable, "-c", HEAD + body, device], capture_output=True, text=True, timeout=LIMIT_S, check=False
@@ -51,7 +46,7 @@ def client(device: str) -> Callable[[str], list[str]]:
     return client
 
 
-def test_its_own_test_program_is_content(device: str) -> None:
+def test_its_own_test_program_is_content(device):
     program = Path(sys.executable).parent / "nxt-test"
     done = subprocess.run(
         [program, "--backend", "devfile", "--filename", device],
@@ -65,7 +60,7 @@ def test_its_own_test_program_is_content(device: str) -> None:
     assert "Battery level 7412 mV" in done.stdout
 
 
-def test_it_reads_the_light_sensor(client: Callable[[str], list[str]]) -> None:
+def test_it_reads_the_light_sensor(client):
     """High above black with room light only: half of 10 %, 51 of 1023 or so."""
     (lit, dark) = client("""
 light = brick.get_sensor(nxt.sensor.Port.S1, nxt.sensor.generic.Light)
@@ -78,7 +73,7 @@ print(light.get_sample())
 
 
 @pytest.mark.slow  # on the wall clock: a busy machine polls too late
-def test_it_turns_a_motor(client: Callable[[str], list[str]]) -> None:
+def test_it_turns_a_motor(client):
     """Its own tolerance for turns over Bluetooth is 70 degrees."""
     there, back = client("""
 motor = brick.get_motor(nxt.motor.Port.A)
@@ -93,7 +88,7 @@ motor.idle()
     assert abs(int(back)) <= 70
 
 
-def test_it_starts_a_program_and_finds_the_errors_that_it_knows(client: Callable[[str], list[str]]) -> None:
+def test_it_starts_a_program_and_finds_the_errors_that_it_knows(client):
     assert client("""
 def raised(call, *arguments):
     try:

@@ -3,8 +3,6 @@
 Accepted counts come from the binomial distribution, so that a right program fails less than once in 10 000.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,17 +18,17 @@ ANSWER = framed(bytes.fromhex("020B00F41C"))
 N = 2000
 
 
-def link(clock: VirtualClock, faults: Faults, *, seed: int = 5) -> tuple[VirtualLine, Radio]:
+def link(clock, faults, *, seed=5):
     radio = Radio(Brick(clock, sleep_min=0), clock, rng=np.random.default_rng(seed), faults=faults)
     return VirtualLine(radio, clock), radio
 
 
-def likely(count: int, n: int, rate: float) -> bool:
+def likely(count, n, rate):
     low, high = binom.interval(1 - 1e-4, n, rate)
     return bool(low <= count <= high)
 
 
-def answers(clock: VirtualClock, faults: Faults, n: int = N) -> list[tuple[bytes, float]]:
+def answers(clock, faults, n=N):
     """Ask n times, wait for all that comes, return the bytes and the time from asking to the last of them."""
     line, _ = link(clock, faults)
     got = []
@@ -44,7 +42,7 @@ def answers(clock: VirtualClock, faults: Faults, n: int = N) -> list[tuple[bytes
     return got
 
 
-def test_a_link_without_faults_answers_everything_after_the_turnaround(clock: VirtualClock) -> None:
+def test_a_link_without_faults_answers_everything_after_the_turnaround(clock):
     assert all(a == ANSWER and s == pytest.approx(0.060) for a, s in answers(clock, Faults(), 50))
 
 
@@ -57,13 +55,13 @@ def test_a_link_without_faults_answers_everything_after_the_turnaround(clock: Vi
     ],
     ids=["silence", "fragment", "double"],
 )
-def test_a_fault_befalls_its_share_of_replies_and_changes_nothing_else(clock, faults, answered, befallen, rate) -> None:
+def test_a_fault_befalls_its_share_of_replies_and_changes_nothing_else(clock, faults, answered, befallen, rate):
     got = answers(clock, replace(faults, late_s=0.0))
     assert {answer for answer, _ in got} == answered
     assert likely(sum(befallen(answer, seconds) for answer, seconds in got), N, rate)
 
 
-def test_lateness_befalls_its_share_and_lasts_as_long_as_said(clock: VirtualClock) -> None:
+def test_lateness_befalls_its_share_and_lasts_as_long_as_said(clock):
     got = answers(clock, Faults(late=0.2, late_s=2.5))
     assert all(a == ANSWER for a, _ in got)
     late = [s for _, s in got if s > 1]
@@ -71,7 +69,7 @@ def test_lateness_befalls_its_share_and_lasts_as_long_as_said(clock: VirtualCloc
     assert late == pytest.approx([2.56] * len(late))
 
 
-def test_a_corrupted_reply_has_one_other_byte(clock: VirtualClock) -> None:
+def test_a_corrupted_reply_has_one_other_byte(clock):
     """Anywhere in the frame, its length included."""
     got = answers(clock, Faults(corrupt=0.2, late_s=0.0))
     other = [[k for k, (a, b) in enumerate(zip(answer, ANSWER, strict=True)) if a != b] for answer, _ in got]
@@ -80,7 +78,7 @@ def test_a_corrupted_reply_has_one_other_byte(clock: VirtualClock) -> None:
     assert {places[0] for places in other if places} == set(range(len(ANSWER)))
 
 
-def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock: VirtualClock) -> None:
+def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock):
     """A brick that got half a request waits 0.61 s for the rest: who asks later than that is heard."""
     faults = Faults(half=0.2, late_s=1.0)
     line, radio = link(clock, faults)
@@ -95,7 +93,7 @@ def test_half_a_telegram_is_the_beginning_of_a_request_or_of_a_reply(clock: Virt
     assert likely(sum(b"" < answer < ANSWER for answer in got), N, 0.9 * 0.1)
 
 
-def test_a_request_that_an_error_befalls_is_not_carried_out(clock: VirtualClock) -> None:
+def test_a_request_that_an_error_befalls_is_not_carried_out(clock):
     """The refusal is as long as the firmware makes it; without a reply wanted there is none."""
     line, radio = link(clock, Faults(error=1.0))
     line.write(framed(bytes.fromhex("00 04 00 32 01 00 00 20 00 00 00 00")))
@@ -112,7 +110,7 @@ def test_a_request_that_an_error_befalls_is_not_carried_out(clock: VirtualClock)
     assert radio.mishaps == {"error": 3}
 
 
-def test_a_lost_request_is_not_carried_out_and_a_silent_one_is(clock: VirtualClock) -> None:
+def test_a_lost_request_is_not_carried_out_and_a_silent_one_is(clock):
     start = framed(bytes.fromhex("00 04 00 32 01 00 00 20 00 00 00 00"))
     for faults, moves in ((Faults(deaf=1.0), False), (Faults(silence=1.0), True)):
         line, radio = link(clock, faults)
@@ -122,7 +120,7 @@ def test_a_lost_request_is_not_carried_out_and_a_silent_one_is(clock: VirtualClo
         assert (radio.brick.outputs.ports[0].tacho_count > 0) is moves
 
 
-def test_a_disconnection_ends_the_line_and_not_the_motors(clock: VirtualClock) -> None:
+def test_a_disconnection_ends_the_line_and_not_the_motors(clock):
     line, radio = link(clock, Faults(disconnect=1.0))
     line.write(framed(bytes.fromhex("80 04 00 32 01 00 00 20 00 00 00 00")))
     with pytest.raises(LinkError, match="cut"):
@@ -135,7 +133,7 @@ def test_a_disconnection_ends_the_line_and_not_the_motors(clock: VirtualClock) -
     assert VirtualLine(radio, clock).read(1, 0.1) == b""
 
 
-def test_no_byte_overtakes_another(clock: VirtualClock) -> None:
+def test_no_byte_overtakes_another(clock):
     """As on a real link: whatever waits behind a late reply is late too."""
     line, _ = link(clock, Faults(late=0.3, fragment=0.5, unasked=0.2))
     for _ in range(200):
@@ -146,18 +144,18 @@ def test_no_byte_overtakes_another(clock: VirtualClock) -> None:
     assert received == (ANSWER + framed(bytes.fromhex("020D0000000000"))) * 200
 
 
-def test_the_same_seed_brings_the_same_mishaps() -> None:
+def test_the_same_seed_brings_the_same_mishaps():
     faults = Faults(fragment=0.3, late=0.1, drop=0.01, silence=0.1, unasked=0.1, late_s=0.5)
     assert answers(VirtualClock(), faults, 300) == answers(VirtualClock(), faults, 300)
 
 
-def test_faults_are_read_from_texts() -> None:
+def test_faults_are_read_from_texts():
     faults = Faults.parse(["fragment", "late=0.1,1.5", "drop=0.25", "sag=30"])
     assert faults == Faults(fragment=1.0, late=0.1, late_s=1.5, drop=0.25, sag=30.0)
     assert Faults.parse(["late=0.1"]).late_s == Faults().late_s
 
 
 @pytest.mark.parametrize("text", ["gremlins", "drop=2", "drop=x", "drop=", "drop=0.1,0.2", "late=0.1,-1", "late=1,2,3"])
-def test_an_impossible_fault_is_refused(text: str) -> None:
+def test_an_impossible_fault_is_refused(text):
     with pytest.raises(ParameterError, match="--fault"):
         Faults.parse([text])

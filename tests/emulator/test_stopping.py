@@ -1,17 +1,11 @@
 """A command that moves the arm is stopped by a signal, as a process with a line of its own: nothing stays on."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import Any, TypeAlias
 
 import pytest
 from arm_faults import SENSOR
@@ -28,7 +22,6 @@ pytestmark = [
 LIMIT_S = 60.0
 PROMPT_S = 1.0  # until all motors are released
 RELEASE = "> 80 04 ff 00 00"
-Emulator: TypeAlias = Callable[..., AbstractContextManager[Any]]
 TASKS = {
     "explore": ("explore", "--sensor", "sensor.json", "--out", "found"),
     "jog": ("arm", "jog", "base", "-90"),
@@ -40,15 +33,13 @@ STOPS = ["SIGINT", "SIGTERM", "SIGHUP", "closed terminal", "SIGHUP twice"]
 
 
 @pytest.fixture
-def chance() -> random.Random:
+def chance():
     return random.Random(int(os.environ.get("PROBEWISE_STOP_SEED", "1")))
 
 
 @pytest.mark.parametrize("stop", STOPS)
 @pytest.mark.parametrize("task", TASKS)
-def test_nothing_stays_on_whatever_stops_which_command_when(
-    task: str, stop: str, emulator: Emulator, tmp_path: Path, chance: random.Random
-) -> None:
+def test_nothing_stays_on_whatever_stops_which_command_when(task, stop, emulator, tmp_path, chance):
     """At a random moment of the first seconds in which motors turn; the emulator says how it is left, and when."""
     pytest.importorskip("serial", reason="pyserial is not installed")
     write_sensor(SENSOR, tmp_path / "sensor.json")
@@ -94,7 +85,7 @@ def test_nothing_stays_on_whatever_stops_which_command_when(
         assert took_s < PROMPT_S
 
 
-def await_telegram(log: Path, text: str, n_before: int = 0) -> None:
+def await_telegram(log, text, n_before=0):
     """Wait until the emulator has heard a telegram, behind so many bytes of its log."""
     deadline_s = time.monotonic() + LIMIT_S
     while text not in (log.read_text(encoding="utf-8")[n_before:] if log.exists() else ""):
@@ -102,7 +93,7 @@ def await_telegram(log: Path, text: str, n_before: int = 0) -> None:
         time.sleep(0.02)
 
 
-def _lead(terminal: int) -> None:
+def _lead(terminal):
     """Become the leader of a session with this terminal, which hears Ctrl-C."""
     import fcntl
     import termios

@@ -1,10 +1,8 @@
 """The brick's bytes against vectors worked out by hand from LEGO's protocol, lengths in front included."""
 
-from __future__ import annotations
-
 import pytest
 
-from probewise.emulator import Brick, VirtualClock, empty_port
+from probewise.emulator import Brick, empty_port
 from probewise.emulator.motors import OutputSetting
 from probewise.emulator.protocol import COMMANDS, FrameAssembler, framed
 
@@ -12,21 +10,21 @@ from probewise.emulator.protocol import COMMANDS, FrameAssembler, framed
 class Fixed:
     """A sensor that gives a known number of counts."""
 
-    def __init__(self, counts: int) -> None:
+    def __init__(self, counts):
         self.value = counts
 
-    def __call__(self, lit: bool) -> int:
+    def __call__(self, lit):
         return self.value
 
 
-def exchanged(brick: Brick, sent: str) -> str:
+def exchanged(brick, sent):
     """Send a frame and return the frame that comes back."""
     (telegram,) = FrameAssembler().feed(bytes.fromhex(sent), 0.0)
     reply = brick.answer(telegram)
     return "" if reply is None else framed(reply).hex(" ").upper()
 
 
-def zeros(n: int) -> str:
+def zeros(n):
     return " 00" * n
 
 
@@ -64,7 +62,7 @@ PLAIN = {
 
 
 @pytest.mark.parametrize("name", PLAIN)
-def test_bytes_are_answered_with_bytes(brick: Brick, name: str) -> None:
+def test_bytes_are_answered_with_bytes(brick, name):
     sent, expected = PLAIN[name]
     assert exchanged(brick, sent) == expected
 
@@ -76,9 +74,7 @@ def test_bytes_are_answered_with_bytes(brick: Brick, name: str) -> None:
         (0.0, "06", "00", 640, "10 00 02 07 00 01 00 00 06 00 80 02 78 01 78 01 78 01"),
     ],
 )
-def test_input_values_are_laid_out_as_in_the_vectors(
-    clock: VirtualClock, wait_s: float, kind: str, mode: str, counts: int, expected: str
-) -> None:
+def test_input_values_are_laid_out_as_in_the_vectors(clock, wait_s, kind, mode, counts, expected):
     """512 counts: t = (512-200)*100//68 = 458, 1023 - 458 = 565, 55 %; 640 counts: 376, shown while invalid."""
     brick = Brick(clock, sensors=[empty_port, Fixed(counts), empty_port, empty_port])
     brick.answer(bytes.fromhex("80 05 01 05 00"))
@@ -88,7 +84,7 @@ def test_input_values_are_laid_out_as_in_the_vectors(
     assert exchanged(brick, "03 00 00 07 01") == expected
 
 
-def test_output_state_is_laid_out_as_in_the_vectors(brick: Brick) -> None:
+def test_output_state_is_laid_out_as_in_the_vectors(brick):
     port = brick.outputs.ports[2]
     port.apply_setting(OutputSetting(-40, 5, 1, 0, 0x20, 1000))
     port.tacho_count = port.block_count = -123
@@ -98,13 +94,13 @@ def test_output_state_is_laid_out_as_in_the_vectors(brick: Brick) -> None:
     )
 
 
-def test_no_error_of_a_command_without_reply_is_told(brick: Brick) -> None:
+def test_no_error_of_a_command_without_reply_is_told(brick):
     for opcode in COMMANDS:
         kind = 0x81 if opcode >= 0x80 else 0x80
         assert brick.answer(bytes((kind, opcode))) is None
 
 
-def test_frames_come_in_any_pieces() -> None:
+def test_frames_come_in_any_pieces():
     stream = framed(b"\x00\x0b") + framed(b"\x01\x88") + framed(b"")
     for size in range(1, len(stream) + 1):
         frames = FrameAssembler()
@@ -112,7 +108,7 @@ def test_frames_come_in_any_pieces() -> None:
         assert [t for piece in pieces for t in frames.feed(piece, 0.0)] == [b"\x00\x0b", b"\x01\x88", b""]
 
 
-def test_half_a_frame_is_forgotten_after_a_silence_however_often_somebody_looks_for_the_rest() -> None:
+def test_half_a_frame_is_forgotten_after_a_silence_however_often_somebody_looks_for_the_rest():
     """A terminal is read every 50 ms, mostly in vain."""
     for looks in ((), range(1, 20)):
         frames = FrameAssembler()

@@ -29,14 +29,14 @@ values = st.recursive(
 )
 
 
-def answered(folder, csv: bytes, description: bytes) -> None:
+def answered(folder, csv, description):
     (folder / "rec.csv").write_bytes(csv)
     (folder / "rec.json").write_bytes(description)
     with contextlib.suppress(FileError):
         read_recording(folder / "rec.csv")
 
 
-def replaced(content: bytes, at: int, new: bytes) -> bytes:
+def replaced(content, at, new):
     at %= len(content)
     return content[:at] + new + content[at + 1 :]
 

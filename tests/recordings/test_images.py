@@ -14,11 +14,11 @@ RNG = np.random.default_rng(8)
 SMOOTH = np.clip(np.add.outer(np.arange(40) * 3, np.arange(33) * 2) + RNG.integers(0, 9, (40, 33)), 0, 255)
 
 
-def chunk(kind: bytes, data: bytes) -> bytes:
+def chunk(kind, data):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def png(width, height, lines: bytes, *, depth=8, colour=0, interlace=0, more=b"") -> bytes:
+def png(width, height, lines, *, depth=8, colour=0, interlace=0, more=b""):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlace))
     return b"\x89PNG\r\n\x1a\n" + header + more + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
 

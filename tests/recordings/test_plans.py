@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.errors import ParameterError
-from probewise.recordings import paper_plan, read_recording, shipped, two_way_plan
+from probewise.recordings import paper_plan, shipped, two_way_plan
 from probewise.recordings.plans import with_jittered_times
 
 
@@ -49,14 +49,6 @@ def test_jitter_keeps_the_order_and_the_pace():
     assert taken.covariates["battery_mv"][-1] < taken.covariates["battery_mv"][0] - 100
     with pytest.raises(ParameterError):
         with_jittered_times(plan, rng=np.random.default_rng(1), share=2)
-
-
-@pytest.mark.parametrize(("name", "n_points"), [("paper", 408), ("concealed", 961)])
-def test_the_shipped_recordings_can_be_read(name, n_points):
-    recording = read_recording(shipped(name))
-    assert len(recording) == n_points
-    assert recording.usable.all()
-    assert recording.notes == ()
 
 
 def test_a_recording_that_does_not_ship_is_refused():

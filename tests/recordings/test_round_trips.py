@@ -95,7 +95,7 @@ def recordings(draw):
     return Recording(plan, [math.nan if v is None else v for v in values])
 
 
-def assert_same(one: Plan, two: Plan) -> None:
+def assert_same(one, two):
     for name in ("x_mm", "y_mm", "orientation_rad", "time_s", "scan", "pattern"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
     assert one.scan_names == two.scan_names
@@ -135,18 +135,8 @@ def test_round_angles_are_written_round():
     assert [shortest_degrees(math.radians(d)) for d in (0, 90, 180, 270, -84.5592)] == [0, 90, 180, 270, -84.5592]
 
 
-def plan_of(n: int, **changes) -> Plan:
-    base = Plan(
-        x_mm=np.arange(float(n)),
-        y_mm=np.zeros(n),
-        orientation_rad=np.zeros(n),
-        time_s=np.arange(float(n)),
-        scan=np.zeros(n, dtype=int),
-        scan_names=("a",),
-        pattern=np.zeros(n, dtype=int),
-        pattern_names=("white",),
-        patterns={"white": Uniform(1.0)},
-    )
+def plan_of(n, **changes):
+    base = Plan.from_arrays(x_mm=np.arange(n), y_mm=0, scan=["a"] * n, patterns={"white": Uniform(1.0)}, unit="LEGO")
     return replace(base, **changes)
 
 
@@ -256,7 +246,7 @@ def test_a_write_that_fails_leaves_the_old_file_whole(tmp_path, monkeypatch):
     write_plan(plan_of(2), path)
     before = path.read_bytes()
 
-    def no_room(*_: object) -> None:
+    def no_room(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", no_room)

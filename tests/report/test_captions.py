@@ -27,7 +27,6 @@ from probewise.inference import GaussianKnown
 from probewise.recordings import Disc, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
-from probewise.report.pictures import animated_gif
 from probewise.scene import Circle, HypothesisScene, Rectangle, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
@@ -87,20 +86,6 @@ def named_but_not_there(page):
             if re.search(rf"\b{name}\b", caption.lower()) and (np.abs(pixels - colour).max(axis=1) < 30).sum() < 20:
                 missing.append((name, caption))
     return missing
-
-
-def has_green(image):
-    return (np.abs(np.asarray(image.convert("RGB")).astype(int) - COLOURS["green"]).max(axis=2) < 16).sum() > 40
-
-
-@pytest.mark.slow
-def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_picture(frames):
-    """In the frames it is in the key and in the field; the last frame has no next place."""
-    moving = Image.open(io.BytesIO(animated_gif(frames)))
-    for number, frame in enumerate(frames):
-        moving.seek(number)
-        still = Image.open(io.BytesIO(frame))
-        assert has_green(still) == has_green(moving) == (number < len(frames) - 1)
 
 
 @pytest.mark.slow

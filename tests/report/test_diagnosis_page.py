@@ -163,10 +163,7 @@ def test_explanations_that_the_next_readings_leave_together_are_told_as_one():
         np.array([[0.0, 0.1, 20.0], [0.1, 0.0, 20.0], [20.0, 20.0, 0.0]]),
     )  # fmt: skip
     found = SimpleNamespace(
-        next_measurement=plan,
-        apparatus=LightSensorApparatus(),
-        hypotheses=(),
-        repaired=SimpleNamespace(effects=()),
+        next_measurement=plan, apparatus=LightSensorApparatus(), hypotheses=(), repaired=SimpleNamespace(effects=())
     )
     said = page._next_readings_in_words(found)
     rest = said.partition("Expected to separate ")[2]

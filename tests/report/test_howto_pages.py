@@ -14,7 +14,7 @@ HOWTO = Path(__file__).parents[2] / "docs" / "howto"
 
 def names_after_running(page, containing=""):
     blocks = re.findall(r"```python\n(.*?)```", (HOWTO / page).read_text(encoding="utf-8"), re.DOTALL)
-    names: dict[str, object] = {}
+    names = {}
     exec(compile("\n".join(block for block in blocks if containing in block), page, "exec"), names)
     return names
 

@@ -1,13 +1,10 @@
 """Figures show the data that they are given, and leave nothing behind."""
 
-import re
-
 import numpy as np
 import pytest
 
 from probewise.recordings import Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
-from probewise.report.plots.canvas import label_axes, legend_above, set_plain_tick_labels, stack_of_axes, svg
 from probewise.report.plots.readings import tracks_and_single_rows
 
 
@@ -52,19 +49,6 @@ def test_the_field_shows_readings_by_brightness_and_the_next_place():
     np.testing.assert_allclose(squares.get_facecolors()[:, :3], [[0, 0, 0], [1, 1, 1]])
     np.testing.assert_allclose(green.get_offsets(), [[300.0, 100.0]])
     assert "mm" in ax.get_xlabel()
-
-
-def test_the_label_of_an_axis_whose_ticks_become_finer_in_the_layout_is_within_the_drawing():
-    ax = stack_of_axes([2.6])[0]
-    for name in ("mean, the model as calibrated", "one reading", "95 % of the means lie here by chance"):
-        ax.plot([-0.05, 0.07], [-0.005, 0.005], label=name)
-    label_axes(ax, x="u_v (V)", y="residual (V)")
-    set_plain_tick_labels(ax)
-    legend_above(ax)
-    drawn = svg(ax).decode()
-    found = re.search(r"<!-- residual \(V\) -->\s*<g transform=\"translate\(([0-9.]+)", drawn)
-    assert found is not None
-    assert float(found[1]) > 7.6  # the height of the text, which is turned by a right angle
 
 
 def test_a_long_label_of_a_bar_is_broken_into_lines_within_the_axes():

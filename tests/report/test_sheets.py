@@ -6,7 +6,6 @@ import zlib
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_pdf import PdfPages
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
@@ -23,7 +22,6 @@ from probewise.report.sheets import (
     field_sheet,
     marks_sheet,
     pattern_sheets,
-    points_of_lines,
     target_sheet,
     tiles_of,
 )
@@ -172,41 +170,6 @@ def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is
     assert face == pytest.approx([np.hypot(x_mm - arm.axis_mm[0], y_mm - arm.axis_mm[1]), height_mm])
     assert set(crosses_in(pdf, above, 1 + len(tiles_of(side, "a4")))) == {arm.axis_mm, (round(x_mm, 2), round(y_mm, 2))}
     assert side.low_mm[1] == 0.0  # the cut stands on the table
-
-
-def texts_of(figures, monkeypatch):
-    """Texts of each page, with their places: those drawn while the PDF is made."""
-    drawn = []
-    monkeypatch.setattr(PdfPages, "savefig", lambda pdf, figure: drawn.append(figure.axes[0].texts))
-    sheets_pdf(figures, paper="a4", title="t")
-    return drawn
-
-
-def test_the_cover_tells_of_the_origin_and_the_sensor_only_what_a_pattern_needs(monkeypatch):
-    plan = paper_plan()
-    covers = [
-        " ".join(text.get_text() for text in texts_of(sheets, monkeypatch)[0])
-        for sheets in (
-            pattern_sheets(plan.patterns, plan),
-            arm_home_jig_sheets(read_geometry(shipped_geometry_path())),
-            [target_sheet("circle", CIRCLE)],
-        )
-    ]
-    assert ["arm record" in cover for cover in covers] == [True, False, False]
-    assert ["several pages" in cover for cover in covers] == [False, True, False]
-
-
-def test_no_label_of_a_glue_strip_lies_over_a_line_of_the_jig(monkeypatch):
-    side, _ = arm_home_jig_sheets(read_geometry(shipped_geometry_path()))
-    labels = 0
-    for tile, texts in zip(tiles_of(side, "a4"), texts_of([side], monkeypatch)[1:], strict=True):
-        lines = tile.on_page_mm(points_of_lines(side))
-        for text in texts:
-            if text.get_text().endswith("lies here"):
-                labels += 1
-                half = (3.0, 12.0) if text.get_rotation() else (12.0, 3.0)
-                assert not (np.abs(lines - text.get_position()) < half).all(axis=1).any()
-    assert labels
 
 
 def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, capsys):

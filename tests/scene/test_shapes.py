@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
@@ -108,23 +106,6 @@ def test_a_set_of_shapes_takes_each_with_its_weight():
     assert share == pytest.approx({"circle": 0.5, "rectangle": 0.3, "hexagon": 0.2}, abs=0.02)
 
 
-def test_a_set_of_shapes_shares_the_place_and_names_the_rest():
-    own = "circle.radius_mm rectangle.width_mm rectangle.height_mm rectangle.angle_rad"
-    own += " hexagon.radius_mm hexagon.angle_rad"
-    assert SHAPES["any"].prior.names == ("shape", "x_mm", "y_mm", *own.split())
-
-
-def test_a_set_of_shapes_makes_the_region_of_the_shape_it_takes():
-    shape = SHAPES["any"]
-    theta = draws(shape, 50)
-    points = np.random.default_rng(1).uniform(0, 1, (300, 2)) * [1048, 520]
-    found, which = shape.region(theta).albedo(points), shape.shape_index(theta)
-    circles = Circle().region(theta[which == 0][:, [1, 2, 3]])
-    rectangles = Rectangle().region(theta[which == 1][:, [1, 2, 4, 5, 6]])
-    assert np.array_equal(found[which == 0], circles.albedo(points))
-    assert np.array_equal(found[which == 1], rectangles.albedo(points))
-
-
 @dataclass(frozen=True)
 class Bands:
     """A user's own shape: stripes whose phase is unknown."""
@@ -150,19 +131,6 @@ def test_the_circle_is_white_up_to_its_radius():
     """Paper, eq. 1: albedo 1 where the distance is at most the radius."""
     region = Circle().region(np.array([[500.0, 200.0, 30.0]]))
     assert region.albedo(np.array([[530.0, 200.0], [530.01, 200.0], [500.0, 170.0]])).tolist() == [[1.0, 0.0, 1.0]]
-
-
-@settings(max_examples=30, deadline=None)
-@given(turn=st.floats(-7, 7), x=st.floats(-20, 20), y=st.floats(-20, 20))
-def test_a_rectangle_turns_about_its_centre(turn, x, y):
-    theta = np.array([[0.0, 0.0, 30.0, 12.0, 0.0]])
-    turned = theta + np.array([0, 0, 0, 0, turn])
-    c, s = np.cos(turn), np.sin(turn)
-    point = np.array([[x, y]])
-    moved = np.array([[c * x - s * y, s * x + c * y]])
-    # A pixel's coverage is continuous in its place, so rounding at the edge does no harm.
-    flat = Rectangle().region(theta).coverage(point, 1.0, np.zeros(1))
-    assert Rectangle().region(turned).coverage(moved, 1.0, np.array([turn])) == pytest.approx(flat, abs=1e-9)
 
 
 def test_scenes_name_their_parameters_and_give_their_regions():

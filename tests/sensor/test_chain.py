@@ -5,8 +5,6 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mixtures import fixed_mixture
 from scipy.special import ndtr
 
@@ -15,7 +13,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
-from probewise.scene import Circle, Ellipse, HypothesisScene, KnownScene, disc_region
+from probewise.scene import Circle, Ellipse, HypothesisScene, KnownScene
 from probewise.sensor import (
     ACCURATE_NODES,
     FAST_NODES,
@@ -26,7 +24,6 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     NaiveSensor,
-    SceneView,
     Stage,
     footprint_of,
     mean_ssf_field,
@@ -116,37 +113,6 @@ def test_theta_of_another_width_is_refused(model):
         sensor.predict(draw(2)[:, :-1], plan_of())
 
 
-def test_one_gaussian_over_a_half_plane_reads_the_error_function():
-    """Paper, eq. (modelI) and (Ssf): covariance is half the inverse of [[A, C], [C, B]]."""
-    chain, plan = CHAINS["one_free"][0], plan_of(30, names=("boundary",))
-    found = chain.predict(np.array([[*ONE, 10.0, 50.0]]), plan)[0]
-    _, u, v, aa, bb, cc = ONE
-    cov = 0.5 * np.linalg.inv([[aa, cc], [cc, bb]])
-    for j, turn in enumerate(plan.orientation_rad):
-        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        mean_x = plan.x_mm[j] + (rotation @ [u, v])[0]
-        sd_x = np.sqrt((rotation @ cov @ rotation.T)[0, 0])
-        assert found[j] == pytest.approx(10 + 40 * ndtr(mean_x / sd_x), abs=1e-7)
-
-
-@settings(max_examples=20, deadline=None)
-@given(turn=st.floats(-7, 7), seed=st.integers(0, 1000))
-def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):
-    c, s = np.cos(turn), np.sin(turn)
-    rotation = np.array([[c, -s], [s, c]])
-    plan = plan_of(12, seed=seed, names=("boundary", "disc"))
-    turned_patterns = {
-        "boundary": kinds.HalfPlane(turn, 0.0),
-        "disc": kinds.Disc(tuple(rotation @ PATTERNS["disc"].center_mm), 8.0),
-    }
-    x, y = rotation @ np.stack([plan.x_mm, plan.y_mm])
-    turned = replace(plan, x_mm=x, y_mm=y, orientation_rad=plan.orientation_rad + turn, patterns=turned_patterns)
-    still = Chain(FreeMixture(2), FreeLevels(), KnownScene(plan.patterns))
-    moved = Chain(FreeMixture(2), FreeLevels(), KnownScene(turned_patterns))
-    theta = thetas(3, 2)
-    assert moved.predict(theta, turned) == pytest.approx(still.predict(theta, plan), abs=1e-6)
-
-
 @pytest.mark.parametrize(
     "shape", [Circle(), pytest.param(Ellipse(), marks=pytest.mark.slow)], ids=["circle", "ellipse"]
 )
@@ -193,8 +159,6 @@ class Doer:
         return self.does(value, theta)
 
 
-SHIFT = Doer("shift", Stage.POSE, lambda poses, t: replace(poses, x_mm=poses.x_mm + t))
-TURN = Doer("turn", Stage.POSE, lambda poses, t: replace(poses, orientation_rad=poses.orientation_rad + t))
 SPREAD = Doer("spread", Stage.FOOTPRINT, lambda f, t: replace(f, var_u=f.var_u + t[:, :, None] ** 2))
 CURVE = Doer("curve", Stage.RESPONSE, lambda u, t: u**t)
 GAIN = Doer("gain", Stage.GAIN, lambda signal, t: signal * (1 + t))
@@ -216,72 +180,6 @@ def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
         columns = np.array([[sizes[effect.name] for effect in chain.effects]])
         found = chain.predict(np.concatenate([theta, np.repeat(columns, 4, axis=0)], axis=1), plan)
         assert found == pytest.approx(wanted, abs=1e-9)
-
-
-def test_effects_before_the_footprint_act_a_hypothesis_each():
-    """Shifting and turning the pose of each hypothesis equals predicting from a moved plan, and so does shifting it."""
-    base = CHAINS["two_free"][0]
-    plan, theta = plan_of(), thetas(3, 2)
-    moves = np.array([[0.0, 0.0], [2.0, 0.5], [-1.0, 3.0]])
-    found = base.with_effects(TURN, SHIFT).predict(np.concatenate([theta, moves], axis=1), plan)
-    for i, (shift, turn) in enumerate(moves):
-        moved = replace(plan, x_mm=plan.x_mm + shift, orientation_rad=plan.orientation_rad + turn)
-        assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
-    found = base.with_effects(SHIFT).predict(np.concatenate([theta, moves[:, :1]], axis=1), plan)
-    for i, shift in enumerate(moves[:, 0]):
-        moved = replace(plan, x_mm=plan.x_mm + shift)
-        assert found[i] == pytest.approx(base.predict(theta[i : i + 1], moved)[0], abs=1e-7)
-
-
-def test_an_effect_on_the_scene_may_give_each_hypothesis_its_own():
-    def grow(view, t):
-        disc = disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])
-        return SceneView({**view.regions, "disc": disc})
-
-    base, plan, theta = CHAINS["one_free"][0], plan_of(), thetas(2, 1)
-    found = base.with_effects(Doer("grow", Stage.SCENE, grow)).predict(
-        np.concatenate([theta, [[0.0], [3.0]]], axis=1), plan
-    )
-    larger = Chain(base.ssf, base.levels, KnownScene({**PATTERNS, "disc": kinds.Disc((3.0, 1.0), 11.0)}))
-    assert found[0] == pytest.approx(base.predict(theta, plan)[0], abs=1e-7)
-    assert found[1] == pytest.approx(larger.predict(theta, plan)[1], abs=1e-7)
-
-
-def test_a_footprint_that_varies_along_the_plan_equals_reading_by_reading():
-    widths = np.linspace(0, 6, 24)
-
-    def widen(footprint, t):
-        return replace(footprint, var_u=footprint.var_u + t[:, :, None] * widths[None, :, None])
-
-    base, plan, theta = CHAINS["two_free"][0], plan_of(), thetas(2, 2)
-    found = base.with_effects(Doer("widen", Stage.FOOTPRINT, widen)).predict(
-        np.concatenate([theta, [[1.0], [2.0]]], axis=1), plan
-    )
-    for j in range(24):
-        one = base.with_effects(SPREAD)
-        sizes = np.sqrt(widths[j] * np.array([[1.0], [2.0]]))
-        alone = one.predict(np.concatenate([theta, sizes], axis=1), plan.take(np.array([j])))
-        assert found[:, j] == pytest.approx(alone[:, 0], abs=1e-7)
-
-
-def test_a_known_width_with_a_place_of_each_hypothesis_equals_one_by_one():
-    """Only some of the footprint's arrays depend on the hypothesis; so do only some of the patterns."""
-
-    def move(footprint, t):
-        return replace(footprint, u_mm=footprint.u_mm + t[:, :, None])
-
-    def grow(view, t):
-        return SceneView({**view.regions, "disc": disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])})
-
-    plan = plan_of()
-    chain = Chain(fixed_mixture(TWO), FixedLevels(10, 50), KnownScene(PATTERNS))
-    for effect in (Doer("move", Stage.FOOTPRINT, move), Doer("grow", Stage.SCENE, grow)):
-        model = chain.with_effects(effect)
-        theta = np.array([[0.0], [1.5], [3.0]])
-        together = model.predict(theta, plan)
-        for i in range(3):
-            assert model.predict(theta[i : i + 1], plan)[0] == pytest.approx(together[i], abs=1e-8)
-        assert together[0] == pytest.approx(chain.predict(np.zeros((1, 0)), plan)[0], abs=1e-8)
 
 
 def test_effects_that_cannot_be_are_refused():

@@ -1,7 +1,5 @@
 """SSFs of any form: one Gaussian, bent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,14 +10,12 @@ from probewise.sensor import (
     N_BENDS,
     N_FREE_FORM,
     Chain,
-    DiscreteSSF,
     FreeLevels,
     FreeMixture,
     bend_coefficients,
     footprint_of,
     free_form_theta,
     is_free_form,
-    mean_ssf_field,
 )
 from probewise.sensor import chain as chain_module
 
@@ -29,7 +25,7 @@ RNG = np.random.default_rng(11)
 BENDS = 0.1 * RNG.standard_normal((6, N_BENDS))
 
 
-def moments(theta: np.ndarray) -> np.ndarray:
+def moments(theta):
     """Mean and covariance of whole mixtures by the law of total covariance, (n_samples, 5)."""
     f = footprint_of(theta, theta.shape[1] // 6)
     w = f.weight[:, 0]
@@ -39,7 +35,7 @@ def moments(theta: np.ndarray) -> np.ndarray:
     return np.stack([u, v, *(np.sum(w * s, axis=1) for s in second)], axis=1)
 
 
-def predicted(theta: np.ndarray) -> np.ndarray:
+def predicted(theta):
     levels = np.tile([10.0, 60.0], (len(theta), 1))
     chain = Chain(FreeMixture(theta.shape[1] // 6), FreeLevels(), KnownScene(PLAN.patterns))
     return chain.predict(np.concatenate([theta, levels], axis=1), PLAN)
@@ -68,17 +64,6 @@ def test_bends_are_found_again_and_free_forms_are_known():
     assert not is_free_form(ONE)
 
 
-@pytest.mark.slow
-def test_a_bent_form_sees_what_the_sum_over_its_pixels_sees():
-    """Route one: closed forms of each Gaussian; route two: the field, pixel by pixel (paper, eq. discreteR)."""
-    bent = free_form_theta(ONE, BENDS[:1])
-    grid = np.arange(-25.0, 25.01, 0.25)
-    field = mean_ssf_field(footprint_of(bent, N_FREE_FORM), u_mm=grid, v_mm=grid)
-    chain = Chain(DiscreteSSF(field), FreeLevels(), KnownScene(PLAN.patterns))
-    by_pixels = chain.predict(np.array([[10.0, 60.0]]), PLAN)
-    np.testing.assert_allclose(predicted(bent), by_pixels, atol=0.02)
-
-
 @pytest.mark.parametrize("name", [None, "position_scale", "albedo_gradient", "halo", "height_gradient", "edge_shadow"])
 def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(name, monkeypatch):
     """Route one: once a geometry and summed; route two: each hypothesis by itself."""
@@ -94,16 +79,3 @@ def test_hypotheses_that_share_a_geometry_are_seen_as_each_alone(name, monkeypat
     alone = built.predict(theta, PLAN)
     np.testing.assert_allclose(together, alone, atol=1e-6)
     assert np.abs(np.diff(together, axis=0)).max(axis=1).min() > 0.01
-
-
-def test_a_skirt_about_the_centre_of_many_gaussians_follows_their_amounts(monkeypatch):
-    """No free form: the common centre moves with the amounts, and what lies about it is seen once for each."""
-    halo = VOCABULARY["halo"].for_extent(Extent(10.0, 60.0, PLAN))
-    built = Chain(FreeMixture(9), FreeLevels(), KnownScene(PLAN.patterns), [halo])
-    shapes = np.tile(ONE, (12, 9))
-    shapes[:, 1::6] += np.linspace(-4.0, 4.0, 9)
-    shapes[:, 0] *= np.linspace(0.2, 5.0, 12)
-    theta = np.concatenate([shapes, np.tile([10.0, 60.0, 0.2, 9.0], (12, 1))], axis=1)
-    together = built.predict(theta, PLAN)
-    monkeypatch.setattr(chain_module, "_MANY", 10)
-    np.testing.assert_allclose(together, built.predict(theta, PLAN), atol=1e-6)

@@ -1,13 +1,10 @@
 """What a Gaussian footprint sees of every kind of region, by independent routes."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mixtures import mean_albedo_under_gaussians
-from scipy.integrate import dblquad
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
@@ -15,11 +12,8 @@ from probewise.errors import SlowWarning
 from probewise.recordings import patterns as kinds
 from probewise.scene import (
     EllipseRegion,
-    HalfPlaneRegion,
     PolygonRegion,
     QuadrantRegion,
-    RegionsOfMixedKinds,
-    UniformRegion,
     disc_region,
     region_of,
 )
@@ -49,19 +43,6 @@ def see(region, x, y, cov, **options):
 
 def covariance(sd_1, sd_2, rho):
     return np.array([[sd_1**2, rho * sd_1 * sd_2], [rho * sd_1 * sd_2, sd_2**2]])
-
-
-def over_rows(mean, cov, chords, low, high):
-    """Adaptive quadrature in the plane, x between the ends of each chord."""
-
-    (a, c), (_, b) = np.linalg.inv(cov).tolist()
-    height = 1 / (2 * math.pi * math.sqrt(np.linalg.det(cov)))
-
-    def density(x, y):
-        dx, dy = x - mean[0], y - mean[1]
-        return height * math.exp(-0.5 * (a * dx * dx + b * dy * dy) - c * dx * dy)
-
-    return dblquad(density, low, high, lambda y: chords(y)[0], lambda y: chords(y)[1], epsabs=1e-9, epsrel=1e-9)[0]
 
 
 def over_a_disc(mean, cov, center, radius):
@@ -133,14 +114,6 @@ def test_a_quadrant_is_the_bivariate_normal(rho, corner):
             assert see(region, 0.0, 0.0, cov) == pytest.approx(wanted, abs=1e-8)
 
 
-def test_a_polygon_agrees_with_adaptive_quadrature_in_the_plane():
-    """A triangle by scipy.integrate.dblquad, 1e-8."""
-    cov = covariance(4.0, 3.0, -0.4)
-    triangle = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]]]))
-    wanted = over_rows([2.0, 3.0], cov, lambda y: (0.0, 10.0 * (1 - y / 8.0)), 0.0, 8.0)
-    assert see(triangle, 2.0, 3.0, cov) == pytest.approx(wanted, abs=1e-8)
-
-
 @pytest.mark.parametrize("place", [(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (5.0, 2.0), (10.0, 0.0), (1.0, 99.0)])
 def test_a_rectangle_of_round_footprint_is_a_product(place):
     """Axis-parallel: differences of cumulatives in x and y; also with the mean on a corner or an edge's line."""
@@ -202,35 +175,6 @@ def test_hypotheses_readings_and_gaussians_together_equal_one_by_one(pattern):
     for i, j, k in np.ndindex(3, 4, 2):
         alone = see(region, x[i, j, k], y[i, j, k], covariance(sd_1[i, 0, k], sd_2[i, 0, k], rho[i, 0, k]))
         assert together[i, j, k] == pytest.approx(alone, abs=1e-9)
-
-
-def test_a_batch_of_regions_equals_one_by_one():
-    rng = np.random.default_rng(3)
-    centers, angles = rng.normal(size=(6, 2)) * 5, rng.uniform(0, 6, 6)
-    corners = np.array([[-6.0, -4.0], [6.0, -4.0], [6.0, 4.0], [-6.0, 4.0]])
-    makers = [
-        lambda i: UniformRegion(angles[i] / 6),
-        lambda i: HalfPlaneRegion(angles[i], centers[i, 0]),
-        lambda i: QuadrantRegion(centers[i], np.sign(centers)[i]),
-        lambda i: disc_region(centers[i], 3 + angles[i]),
-        lambda i: EllipseRegion(centers[i], 4 + np.abs(centers)[i], angles[i]),
-        lambda i: PolygonRegion.from_vertices(centers[i][:, None] + corners),
-    ]
-    x, y = rng.normal(size=(2, 1, 5, 1)) * 6
-    cov = [np.reshape(value, (1, 1, 1)) for value in (16.0, 9.0, 5.0)]
-    parts = []
-    for make in makers:
-        whole = mean_albedo_under_gaussians(make(slice(None)), x, y, *cov)
-        parts.append(whole)
-        for i in range(6):
-            assert np.allclose(whole[i], mean_albedo_under_gaussians(make(slice(i, i + 1)), x, y, *cov)[0], atol=1e-10)
-    which = np.array([3, 0, 1, 3, 2, 0])
-    mixed = RegionsOfMixedKinds(
-        which, tuple(make(np.flatnonzero(which == k)) if (which == k).any() else None for k, make in enumerate(makers))
-    )
-    found = mean_albedo_under_gaussians(mixed, x, y, *cov)
-    for i, k in enumerate(which):
-        assert np.allclose(found[i], parts[k][i], atol=1e-10)
 
 
 @settings(max_examples=40, deadline=None)

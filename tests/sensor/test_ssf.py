@@ -70,15 +70,6 @@ def test_the_ssf_integrates_to_one(a, aa, bb, rho, u):
     assert mean_ssf_field(footprint, u_mm=grid(60), v_mm=grid(60)).values.sum() == pytest.approx(1.0)
 
 
-def test_the_mean_field_is_a_mean_of_fields_not_of_parameters():
-    theta = np.array([[1.0, -8.0, 0.0, 0.05, 0.05, 0.0], [1.0, 8.0, 0.0, 0.05, 0.05, 0.0]])
-    weights = np.array([0.25, 0.75])
-    mean = mean_ssf_field(footprint_of(theta, 1), u_mm=grid(30), v_mm=grid(30), weights=weights)
-    one, other = (mean_ssf_field(footprint_of(theta[i : i + 1], 1), u_mm=grid(30), v_mm=grid(30)) for i in (0, 1))
-    assert np.allclose(mean.values, 0.25 * one.values + 0.75 * other.values)
-    assert mean.mean_mm == pytest.approx([4.0, 0.0], abs=1e-6)
-
-
 @pytest.mark.parametrize("n_gaussians", [1, 2])
 def test_the_mixture_of_a_field_keeps_its_moments(n_gaussians):
     field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))

@@ -270,12 +270,6 @@ def middle(plan):
     return places(plan) + np.stack([c * CENTER[0] - s * CENTER[1], s * CENTER[0] + c * CENTER[1]], axis=-1)
 
 
-def test_a_gradient_of_albedo_shows_its_value_at_the_spots_middle_on_white(plan):
-    white = plan.pattern == 1
-    got = read(plan, known.albedo_gradient(0.01, 0.02))[white]
-    np.testing.assert_allclose(got, BLACK + SPAN * (1 + middle(plan)[white] @ [0.01, 0.02]), atol=1e-3 * SPAN)
-
-
 def test_a_gradient_of_albedo_weights_the_seen_half_of_a_boundary(plan):
     """E[n . p ; beyond the edge] of a normal variable: m F(z) + s f(z)."""
     rows, k = on_boundary(plan), 0.01
@@ -308,13 +302,6 @@ def test_an_edge_casts_its_shadow_by_the_distance_of_the_sensor(plan, clean):
     distance = np.where(plan.pattern == 0, along, np.where(plan.pattern == 1, np.inf, rim))
     expected = clean - SPAN * 0.1 * np.exp(-(distance**2) / (2 * 9))
     np.testing.assert_allclose(read(plan, known.edge_shadow(0.1, 3.0)), expected, atol=1e-9)
-
-
-def test_a_shadow_moves_with_the_edge(plan):
-    """The edge of the real pattern and the sensor's real place."""
-    both = read(plan, known.edge_misplacement(0.9), known.edge_shadow(0.1, 3.0))
-    moved = {**plan.patterns, "boundary": HalfPlane(0.1, 1.6), "disc": Disc((2.2, -0.4), 12.0)}
-    np.testing.assert_allclose(both, read(replace(plan, patterns=moved), known.edge_shadow(0.1, 3.0)), atol=1e-9)
 
 
 def test_a_sagging_battery_needs_its_voltage(plan):

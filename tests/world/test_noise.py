@@ -20,17 +20,8 @@ SPOT = gaussian_spot([Blob(1.0, (0.0, 0.0), (1.0, 1.0))], pixel_mm=0.5)
 def ramp():
     """Readings over a ramp from black to white, so that every level comes."""
     x = np.tile(np.linspace(0, 100, N // N_SCANS), N_SCANS)
-    return Plan(
-        x_mm=x,
-        y_mm=np.zeros(N),
-        orientation_rad=np.zeros(N),
-        time_s=np.arange(N, dtype=float),
-        scan=np.repeat(np.arange(N_SCANS), N // N_SCANS),
-        scan_names=tuple(f"scan_{k}" for k in range(N_SCANS)),
-        pattern=np.zeros(N, dtype=int),
-        pattern_names=("ramp",),
-        patterns={"ramp": Ramp(0.0, 0.01)},
-    )
+    scan = np.repeat(np.arange(N_SCANS), N // N_SCANS)
+    return Plan.from_arrays(x_mm=x, y_mm=0, scan=scan, patterns={"ramp": Ramp(0.0, 0.01)}, unit="LEGO")
 
 
 @pytest.fixture(scope="module")

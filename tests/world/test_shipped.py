@@ -6,9 +6,8 @@ import pytest
 from probewise.arm import ReadingScale, read_geometry, shipped_geometry_path
 from probewise.cli._bench import plan_for_lego_arm
 from probewise.errors import ParameterError
-from probewise.recordings import paper_plan, read_recording, shipped, two_way_plan
-from probewise.world import Blob, World, gaussian_spot
-from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, regenerate_recording, true_world
+from probewise.recordings import paper_plan, read_recording, shipped
+from probewise.world.shipped import CANDIDATES, main, regenerate_recording, true_world
 
 
 @pytest.fixture(scope="module")
@@ -47,28 +46,3 @@ def test_a_recording_that_does_not_ship_cannot_be_made():
 def test_the_paper_recording_conceals_nothing_and_the_other_one_thing():
     assert true_world("paper").concealed == ()
     assert len(true_world("concealed").concealed) == 1
-
-
-PLAN = two_way_plan()
-TRUTH = np.array([*BLOB.center_mm, *BLOB.sd_mm, BLOB.correlation, BLACK, WHITE])
-
-
-def readings_of(theta, *concealed):
-    spot = gaussian_spot([Blob(1.0, (theta[0], theta[1]), (theta[2], theta[3]), theta[4])])
-    return World(spot, theta[5], theta[6], concealed=concealed).expected_readings(PLAN)
-
-
-@pytest.fixture(scope="module")
-def jacobian():
-    steps = np.diag([0.1, 0.1, 0.1, 0.1, 0.02, 0.1, 0.1])
-    return np.stack([(readings_of(TRUTH + d) - readings_of(TRUTH - d)) / (2 * d.sum()) for d in steps], axis=1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", [e for e in CANDIDATES if not e.disturbs], ids=lambda e: e.name)
-def test_every_candidate_has_a_size_of_15_to_25(effect, jacobian):
-    """Diagnosis, size of an effect: what is left of the noise-free readings after the null is refitted in full."""
-    readings, theta = readings_of(TRUTH, effect), TRUTH.copy()
-    for _ in range(3):
-        theta += np.linalg.lstsq(jacobian, readings - readings_of(theta), rcond=None)[0]
-    assert 15 < np.linalg.norm(readings - readings_of(theta)) / NOISE_SD < 25

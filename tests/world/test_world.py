@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.errors import ParameterError
-from probewise.recordings import Disc, HalfPlane, Uniform, paper_plan, two_way_plan
+from probewise.recordings import HalfPlane, Uniform, paper_plan, two_way_plan
 from probewise.world import Blob, World, gaussian_spot, simulate
 from probewise.world import concealed as known
 from probewise.world.stages import acts_at
@@ -28,17 +28,6 @@ def test_plain_black_and_white_read_the_two_levels(clean):
     names = np.array(PLAN.pattern_names)[PLAN.pattern]
     np.testing.assert_allclose(clean[names == "black"], 10)
     np.testing.assert_allclose(clean[names == "white"], 60)
-
-
-def test_the_shift_of_the_spot_parts_90_from_270_degrees(clean):
-    """Paper, Fig. data: the transition of the two orientations is shifted by twice the SSF's centre."""
-    at = {
-        deg: np.interp(35, clean[rows], PLAN.x_mm[rows])
-        for deg in (90, 270)
-        for rows in [PLAN.rows_by_scan()[PLAN.scan_names.index(f"edge_{deg}_out")]]
-    }
-    assert at[90] == pytest.approx(1.5, abs=0.02)
-    assert at[270] == pytest.approx(-1.5, abs=0.02)
 
 
 def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
@@ -119,10 +108,3 @@ def test_what_lies_there_can_differ_from_what_the_plan_says():
 def test_a_world_without_sense_is_refused(changes):
     with pytest.raises(ParameterError):
         world(**changes)
-
-
-def test_a_hidden_circle_is_bright_inside_dark_outside_and_half_on_its_edge():
-    circle = Disc((500.0, 250.0), 80.0)
-    inside, outside, edge = (world().read(circle, x, 250.0, time_s=0.0, rng=None) for x in (500.0, 300.0, 420.0))
-    assert (inside, outside) == pytest.approx((60, 10), abs=1e-9)
-    assert 25 < edge < 45

@@ -104,17 +104,6 @@ def test_medians_and_sds_are_those_of_a_long_chain(name):
     np.testing.assert_allclose(found.samples.std(axis=0) / certified, sd, rtol=0.15)  # some have heavy tails
 
 
-@pytest.mark.slow
-def test_the_noise_of_rounded_readings_has_the_rounding_in_it_whichever_way_they_are_fitted():
-    """Sd 0.1 and rounded to whole numbers: by quadrature 0.1 and 1 / sqrt(12) add up to 0.305."""
-    x = np.linspace(-10.0, 10.0, 60)
-    readings = np.round(1.0 + 2.0 * x + 0.1 * np.random.default_rng(3).standard_normal(60))
-    for way in (lambda p, data: p["a"] + p["b"] * data["x"], _one_by_one):
-        given = line(simulate=way, noise={"sd": 0.1, "step": 1.0})
-        fit = fit_simulator(given, {"x": x, "y": readings}, rng=np.random.default_rng(1))
-        assert np.median(fit.fitted.noise_sd) == pytest.approx(np.hypot(0.1, 1 / np.sqrt(12)), rel=0.1)
-
-
 def test_one_reading_more_than_parameters_is_enough():
     fit = fit_simulator(line(), {"x": X[::25], "y": Y[::25]}, rng=np.random.default_rng(1))
     assert fit.fitted.mode() == pytest.approx({"a": 1.0, "b": 2.0}, abs=0.3)

@@ -75,28 +75,12 @@ def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts(
     assert np.all(found[table.time_s > 2.1] == 0)
 
 
-def test_a_body_at_rest_sticks_until_the_force_is_larger_than_its_friction():
-    law = Law({"v": 0.0}, lambda s, p, u: {"v": u["force"] + 0 * s["v"]}, hold="linear")
-    table = _table(np.linspace(0, 4, 401), force=np.linspace(0, 4, 401))
-    found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 2.0)}), table, {}, 0.01)["v"]
-    assert np.all(found[table.time_s < 1.99] == 0)
-    assert found[-1] == pytest.approx(0.5 * 2.0**2, abs=0.05)
-
-
 def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction():
     """Closed form: a force of 2 t exceeds a friction of 1 at 0.5, amid the first step, and v = (t - 0.5)^2 after it."""
     law = Law({"v": 0.0}, lambda s, p, u: {"v": 2 * u["t_s"] + 0 * s["v"]})
     table = _table(np.linspace(0, 4, 6))
     found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 1.0)}), table, {}, 0.8)["v"]
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-9])
-def test_friction_that_vanishes_holds_nothing_at_rest(size):
-    law = Law({"x": 0.0, "v": 0.0}, lambda s, p, u: {"x": 1 - s["x"], "v": s["x"] - s["v"]})
-    table = _table(np.linspace(0, 5, 11))
-    held = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), size)}), table, {}, 0.5)["v"]
-    np.testing.assert_allclose(held, _states(law, table, {}, 0.5)["v"], atol=1e-8)
 
 
 def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_ends():

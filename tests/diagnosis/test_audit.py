@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mixtures import fixed_mixture
 
 from probewise.diagnosis import audit_plan
 from probewise.diagnosis.audit import Expected
@@ -17,9 +16,8 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import paper_plan, two_way_plan
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FreeLevels, FreeMixture
+from probewise.sensor import Chain, FreeLevels, FreeMixture
 
-SPOT = np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0])  # a Gaussian of sd 5 mm
 TWO = {name: VOCABULARY[name] for name in ("backlash", "edge_misplacement")}
 
 
@@ -117,17 +115,6 @@ def test_only_what_the_apparatus_can_command_is_asked_for():
     assert kinds == {"repeat", "reverse", "respeed", "rotate"}
     able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led", "height_mm")))
     assert {command.kind for command in candidate_scans(able)} == {"repeat", "reverse", "respeed", "relight", "raise"}
-
-
-def test_a_commanded_height_widens_the_footprint_and_dims_the_signal():
-    """Far from the edge the signal falls with the square of the height; across it the slope does with its cube."""
-    plan = paper_plan().take(np.arange(101))
-    high = replace(plan, covariates={"height_mm": np.full(101, 28.0)})
-    chain = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
-    usual, raised = (chain.predict(np.empty((1, 0)), p)[0] - 10.0 for p in (plan, high))
-    assert raised[-1] == pytest.approx(usual[-1] / 4)
-    middle = slice(49, 52)
-    assert np.ptp(raised[middle]) == pytest.approx(np.ptp(usual[middle]) / 8, rel=0.02)
 
 
 def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():

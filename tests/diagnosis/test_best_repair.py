@@ -54,15 +54,6 @@ def _law(**more):
     return NoiseLaw(**given)
 
 
-def test_readings_with_an_sd_of_their_own_count_by_it():
-    noise = 0.1 * np.random.default_rng(1).standard_normal(_N)
-    _, _, plain = _corrected(_law(), noise)
-    _, _, mixed = _corrected(_law(sd=_mixed_sds()), _mixed_sds() * noise)
-    np.testing.assert_allclose(mixed.change, plain.change, atol=0.1)
-    assert np.abs(mixed.change - _BUMP).max() < 0.15
-    assert mixed.held_out.per_reading > 4 * mixed.held_out.sd
-
-
 def test_lost_readings_do_not_count():
     rng, lost = np.random.default_rng(2), np.zeros(_N, dtype=bool)
     lost[[5, 40, 62, 90]] = True

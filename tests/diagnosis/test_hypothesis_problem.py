@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from probewise import nested
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.posterior import FoldedNormal, StandardNormal
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import Extent
-from probewise.nested.repartition import repartitioned
 from probewise.recordings import Recording, paper_plan
 
 PLAN = paper_plan().take(np.arange(0, 408, 8))
@@ -69,24 +66,3 @@ def test_where_orders_differ_in_density_what_is_drawn_has_the_folded_one():
         middle = np.median(drawn[:, column])
         upper = ratio * (z[:, column] > middle)
         assert abs(upper.mean() - 0.5) < 4.4 * np.hypot(upper.std(), 0.5) / 200
-
-
-@pytest.mark.slow
-def test_the_evidence_of_two_gaussians_is_the_same_folded():
-    """A likelihood that does not ask for names: prior draws, a folded run, one from a prior near what that found."""
-    prior = prior_of(2)
-    m = prior.sensor.n_params
-
-    def of(z):
-        levels = z[:, m - 2 : m]
-        spots = prior.sensor.theta(z[:, :m])[:, [1, 7]]  # u_1, u_2
-        return -0.5 * ((spots - 3.0) ** 2).sum(axis=1) - 0.5 * (levels**2).sum(axis=1) / 0.5**2
-
-    rng = np.random.default_rng(6)
-    likelihood = np.exp(of(rng.standard_normal((200_000, prior.n_params))))
-    truth, error = np.log(likelihood.mean()), likelihood.std() / likelihood.mean() / np.sqrt(len(likelihood))
-    problem = SimpleNamespace(prior=prior, log_likelihood=of)
-    first = nested.run(problem, rng=rng, n_live=200)
-    second = nested.run(repartitioned(problem, first.samples(2000, rng=rng)), rng=rng, n_live=200)
-    for found in (first, second):
-        assert abs(found.log_z - truth) < 4 * np.hypot(found.log_z_error, error)

@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
@@ -17,7 +16,7 @@ from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit
 from probewise.diagnosis.noise import NoiseLaw, NoiseModel, Tail, log_prior_of_lost_value
 from probewise.effects import Extent
-from probewise.effects.noise import correlated_noise, drifting_noise, dropouts, outliers, signal_dependent_noise
+from probewise.effects.noise import dropouts, outliers
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -64,35 +63,6 @@ def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
     assert np.var(plain) == pytest.approx(1 / float(tail.fisher_information), rel=0.02)
     assert np.abs(plain).max() < 10
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "effect",
-    [None, correlated_noise(), signal_dependent_noise(), drifting_noise(), outliers()],
-    ids=lambda e: e and e.name,
-)
-def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
-    """Route two: a grid over both, for each node. A floor of the scale that is below it plays no part."""
-    rng = np.random.default_rng(4)
-    slope = rng.normal(size=N)
-    noise = SD * rng.normal(size=N) * np.where(rng.random(N) < 0.03, 6.0, 1.0)
-    found, recording = found_with(noise, slope)
-    evidence = laplace_evidence(found, NoiseModel(() if effect is None else (effect,), recording, least_sd=0.6 * SD))
-    step = np.linspace(-0.2, 0.2, 161)
-    log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
-    for node in (0, len(evidence.nodes.laws) // 2):
-        law = evidence.nodes.laws[node]
-        whitened = law(noise)[:, None] - law(slope)[:, None] * step
-        total = []
-        for s in log_sigma:
-            z = whitened / math.exp(s)
-            density = log_mixture(z, law.share, law.times) if law.share else norm.logpdf(z)
-            total.append(logsumexp(density.sum(axis=0) - N * s + norm.logpdf(step)))
-        cell = (step[1] - step[0]) * (log_sigma[1] - log_sigma[0])
-        by_grid = float(logsumexp(total)) + math.log(cell) - law.half_log_det()
-        own = evidence.log_z_nodes[node] - evidence.nodes.log_weights[node]
-        assert own == pytest.approx(by_grid, abs=0.05)
 
 
 def test_readings_lost_to_one_value_are_no_wide_ones():

@@ -102,12 +102,6 @@ def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
     np.testing.assert_allclose(drawn.std(axis=0)[spread > 1e-9], spread[spread > 1e-9], rtol=0.08)
 
 
-def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
-    one = (np.zeros((5, 1)),) * 5
-    templates = EffectTemplates(one, one, (VOCABULARY["backlash"](),) * 3, np.array([0, 0, 1, 2, 2]))
-    np.testing.assert_allclose(templates.variant_probabilities(np.log([1.0, 3.0, 10.0, 5.0, 1.0])), [0.2, 0.5, 0.3])
-
-
 @pytest.mark.parametrize("name", ["flicker", "albedo_patch", "scan_angle_error"])
 def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, name):
     plan = two_way_plan()

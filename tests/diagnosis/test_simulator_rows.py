@@ -62,12 +62,6 @@ def test_a_control_is_swept_held_and_switched_between_its_ends():
     assert set(power["1 power_w middle"].tolist()) == {3.0}
 
 
-def test_commands_set_behind_each_other_are_runs_of_their_own():
-    together = cast(RunTable, SimulatorApparatus(ABOUT).plan_of_alternatives(list(offered().values())[:3], TABLE))
-    assert len(together.scan_names) == 3
-    assert set(together.like.values()) <= set(TABLE.scan_names)
-
-
 @pytest.mark.parametrize("run", [None, "run"])
 def test_what_is_planned_is_what_a_diagnosis_of_both_tables_predicts(run):
     """A warming block that starts at 20: of a FILE.py without runs a table is one run, so only one is planned."""

@@ -7,18 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from exploring import run
-from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.arm.fitting import fit_geometry, spread_mark_places
 from probewise.arm.geometry import (
     FITTED,
     RULER_SDS,
     Accuracy,
-    fitted_parameter_values,
     place_jacobian,
-    places_at_parameters,
 )
 from probewise.errors import ParameterError
 from probewise.experiment import FittedArm, found_shape, result_json, samples_csv
@@ -190,49 +186,3 @@ def test_a_run_whose_arm_alone_leaves_too_much_says_so_and_reads_no_further(clai
     assert "leaves 1.5 mm, which no reading lowers" in beyond.stop_reason
     assert not beyond.reached
     assert beyond.sd.max() > 1.5
-
-
-def built_and_fitted(rng):
-    """Build an arm as a ruler leaves it, touch marks with it to 1 mm, fit it: the geometry, and what is true."""
-    marks = spread_mark_places(ARM)
-    turned = ARM.angles_rad(marks, 32.0) - fitted_parameter_values(ARM)[:3]
-    true = fitted_parameter_values(ARM) + RULER_SDS * rng.standard_normal(9)
-    met = places_at_parameters(ARM, true, turned) + rng.standard_normal((len(marks), 3))
-    return fit_geometry(ARM, turned, met).geometry, true
-
-
-def circle_by(places, values):
-    """Fit the circle by least squares: its parameters, and their sds by the readings alone."""
-
-    def misses(theta):
-        return DARK + 50.0 * ndtr((theta[2] - np.hypot(*(places - theta[:2]).T)) / 8.0) - values
-
-    fit = least_squares(misses, np.array(TRUE))
-    return fit.x, np.sqrt(np.diagonal(np.linalg.inv(fit.jac.T @ fit.jac)))
-
-
-TRUE = (250.0, 140.0, 60.0)
-
-
-@pytest.mark.slow
-def test_two_hundred_fitted_arms_miss_the_circle_by_what_is_claimed(found):
-    """Readings from where each arm truly stands, light that falls with the square of the true height."""
-    rng = np.random.default_rng(8)
-    told = np.array([(r.pose.x_mm, r.pose.y_mm) for r in found.readings])
-    middle = np.array([ARM.field_mm]) / 2
-    with_arm, without = [], []
-    for _ in range(200):
-        fitted, true = built_and_fitted(rng)
-        turned = fitted.angles_rad(np.concatenate([told, middle]), 14.0) - fitted_parameter_values(fitted)[:3]
-        stands = places_at_parameters(ARM, true, turned)
-        height_mm = 14.0 + stands[:-1, 2] - stands[-1, 2]
-        seen = ndtr((TRUE[2] - np.hypot(*(stands[:-1, :2] - TRUE[:2]).T)) / 8.0)
-        values = DARK + 50.0 * (14.0 / height_mm) ** 2 * seen + rng.standard_normal(len(told))
-        theta, sd = circle_by(told, values)
-        arm_sd = with_arm_error(found, fitted).arm_error.sd
-        with_arm.append((theta - TRUE) / np.hypot(sd, arm_sd))
-        without.append((theta - TRUE) / sd)
-    held = np.mean(np.abs(with_arm) < 1.96, axis=0)
-    assert ((held > 0.90) & (held < 0.99)).all(), held  # 200 arms: 95 % to 1.5 %
-    assert np.mean(np.square(with_arm), axis=0) == pytest.approx(np.ones(3), abs=0.3)
-    assert (np.mean(np.abs(without) < 1.96, axis=0) < 0.85).all()

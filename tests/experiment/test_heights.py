@@ -12,7 +12,7 @@ from hand_made import NAMES, sensor_of
 from probewise.arm import Pose, Reading, as_instrument
 from probewise.cli._bench import InstrumentWithCallbacks
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.experiment import arm_over, experiment_for, explore, read_journal, result_json
+from probewise.experiment import arm_over, experiment_for, explore, result_json
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.recordings import Disc, Instrumentation, Plan
@@ -70,22 +70,6 @@ def test_every_height_is_a_design_and_the_lowest_signal_is_strongest(small):
     best = first.map.values.reshape(len(HEIGHTS), -1).max(axis=1)
     assert best[0] > best[1]
     assert first.reading.covariates["height_mm"] == first.reading.pose.height_mm
-
-
-@pytest.mark.slow
-def test_a_run_with_heights_finds_the_circle_and_is_resumed(small, tmp_path):
-    path = tmp_path / "journal.jsonl"
-
-    def run(n):
-        taken = read_journal(path).readings if path.exists() else ()
-        with arm_over(replace(WORLD, noise_sd=1.0), DISC, FIELD, seed=1, taken=taken) as arm:
-            return list(explore(arm, asked(small), rng=np.random.default_rng(2), max_readings=n, journal=path))
-
-    begun, whole = run(2), run(20)
-    assert [step.reading for step in whole[:2]] == [step.reading for step in begun]
-    assert whole[-1].stop_reason == "every length is known to better than 4 mm"
-    assert np.abs(whole[-1].mean - TRUTH).max() < 4 * whole[-1].sd.max()
-    assert all(step.reading.pose.height_mm in HEIGHTS for step in whole)
 
 
 @pytest.mark.parametrize(

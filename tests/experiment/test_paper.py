@@ -15,11 +15,9 @@ from probewise.errors import FileError, NotConvergedError, ParameterError
 from probewise.experiment import (
     NestedSampling,
     experiment_for,
-    explore,
     find_shape,
     naive_levels_from_recording,
     naive_levels_from_world,
-    read_journal,
 )
 from probewise.experiment.paper import OneScan, student_t_likelihood
 from probewise.inference import Naive
@@ -132,21 +130,6 @@ def same(a, b):
     return (a.reading, a.next_pose, a.bits, a.log_z) == (b.reading, b.next_pose, b.bits, b.log_z) and (
         a.samples == b.samples
     ).all()
-
-
-@pytest.mark.slow
-def test_a_run_that_was_cut_goes_on_bit_for_bit(small, tmp_path):
-    experiment = small.experiment(likelihood=STUDENT, utility=ReadingEntropy(), method=QUICK)
-    whole = run(small.arm(), experiment, rng=rng(), max_readings=4)
-    journal = tmp_path / "journal.jsonl"
-    steps = explore(small.arm(), experiment, rng=rng(), max_readings=4, journal=journal)
-    next(steps), next(steps)
-    steps.close()
-    arm = small.arm()
-    resumed = run(arm, experiment, rng=rng(), max_readings=4, journal=journal)
-    assert len(arm.poses) == 2
-    assert all(same(a, b) for a, b in zip(whole.steps, resumed.steps, strict=True))
-    assert read_journal(journal).settings["method"] == repr(QUICK)
 
 
 def test_a_journal_of_one_method_is_not_gone_on_with_by_another(small, tmp_path):
@@ -305,14 +288,3 @@ def test_the_loop_of_the_paper_and_the_method_of_explore_infer_the_same(small):
     assert posterior.log_z == pytest.approx(found.log_z, abs=error)
     spread = 5 * found.sd() * math.sqrt(found.run.memory / found.n_eff + posterior.memory / posterior.n_eff)
     assert (np.abs(posterior.mean() - found.mean()) < spread).all()
-
-
-@pytest.mark.slow
-def test_the_loop_of_the_paper_ends_when_it_has_found_the_circle(small):
-    experiment = small.experiment(likelihood=STUDENT)
-    options = {"bin_width": 1.0, "rng": rng()}
-    *_, last = find_shape(small.arm(), experiment.shape, experiment.model, STUDENT, experiment.grid, **options)
-    readings, posterior, _ = last
-    assert len(readings) < 40
-    assert posterior.sd().max() < 4.0
-    assert np.abs(posterior.mean() - small.arm().truth).max() < 16.0

@@ -306,21 +306,6 @@ def test_near_the_end_repeats_are_worth_more_than_one_reading(doubting, sd_mm, w
     assert more.mean() > 0.03
 
 
-def test_a_few_stragglers_of_a_name_promise_nothing():
-    """One hypothesis in 120 that predicts otherwise tells as little as its weight allows: exactly, by quadrature."""
-    n = 120
-    even = 20.0 + 0.5 * norm.ppf((np.arange(n) + 0.5) / n)
-    weight, names = np.full(2 * n, 0.5 / n), np.repeat(["", "halo"], n)
-    straggling = np.concatenate([even, np.append(even[:-1], 60.0)])
-    bits = expected_bits_about_left_out_effect(weight, straggling[:, None], names, Readout(1.0))
-    at = np.linspace(0.0, 80.0, 20_001)
-    given = [norm.pdf(at[:, None], own, 1.0).mean(axis=1) for own in np.split(straggling, 2)]
-    both = np.maximum(0.5 * (given[0] + given[1]), 1e-300)
-    exact = sum(0.5 * np.trapezoid(each * np.log2(np.maximum(each, 1e-300) / both), at) for each in given)
-    assert exact < 0.01
-    assert bits[0] == pytest.approx(exact, abs=0.002)
-
-
 @pytest.mark.slow
 def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting):
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
@@ -662,27 +647,3 @@ def test_the_next_run_starts_with_the_doubt_that_the_last_one_left(sensor):
     found, told = plain.model.predict(theta, plan)[0], trusted.kinds[0].model.predict(theta[:, :3], plan)[0]
     np.testing.assert_allclose(found[1:], told[1:], atol=1e-9)
     assert abs(found[0] - told[0]) > 1.0  # nobody knows whence the arm came
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
-    """Six readings of dark, then all 8 units brighter: a wide footprint explains them too, but no better."""
-    experiment = replace(experiment_of(REFERENCE), trust=0.9)
-    kinds = [kind for kind in experiment.kinds if kind.left_out in ("", "ambient_step", "edge_blur")]
-    taken = [(766, 284, 9.4), (419, 284, 9.5), (210, 268, 9.6), (605, 227, 7.7), (838, 171, 10.6), (419, 154, 8.6)]
-    taken += [
-        (597, 366, 18.2),
-        (597, 374, 16.8),
-        (588, 341, 16.3),
-        (572, 414, 19.1),
-        (556, 349, 16.6),
-        (500, 431, 17.7),
-    ]
-    read = [Reading(value, Pose(x, y), 8.0 * k) for k, (x, y, value) in enumerate(taken)]
-    rng = np.random.default_rng(seed)
-    now = prior_posterior(kinds, 3000, rng=rng)
-    for k in range(1, len(read) + 1):
-        recording = experiment.problem(read[:k]).recording
-        now = SequentialMonteCarlo(3000, n_live=100).updated(now, recording, rng=rng)
-    assert now.left_out["ambient_step"] > 0.97

@@ -30,13 +30,6 @@ def test_information_about_a_gaussian_is_the_closed_form(slope):
     assert predictive.information_bits[0] == pytest.approx(0.5 * math.log2(1 + slope**2), rel=0.03)
 
 
-def test_a_reading_that_separates_two_hypotheses_tells_one_bit():
-    predicted = np.repeat([0.0, 50.0], 500)[:, None]
-    one = given(predicted, np.ones(predicted.shape), ReadingNoise(1.0))
-    assert one.information_bits[0] == pytest.approx(1.0, abs=0.06)  # one group of 32 holds some of both
-    assert given(0 * predicted, np.ones(predicted.shape), ReadingNoise(1.0)).information_bits[0] < 1e-9
-
-
 def by_adding_up(predicted, scale, noise, n_readings, seed):
     """Nested Monte Carlo: mean log ratio of likelihood and predictive density, over readings of drawn hypotheses."""
     rng = np.random.default_rng(seed)

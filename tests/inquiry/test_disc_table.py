@@ -8,10 +8,8 @@ import pytest
 from probewise.effects import EFFECTS, VOCABULARY, Known
 from probewise.inquiry import (
     Designs,
-    DirectForecast,
     DiscForecast,
     Grid,
-    InformationGain,
     Readout,
     TabulatedChain,
     UtilityInput,
@@ -106,16 +104,6 @@ def test_only_a_known_sensor_over_one_circle_has_a_table(made):
     wide = FixedMixture([1.0], [[0.0, 0.0]], [[[900.0, 0.0], [0.0, 900.0]]])
     assert DiscTable.of(Chain(wide, FixedLevels(10.0, 60.0), HypothesisScene(Circle()))) is None
     assert DiscTable.of(made.chain().with_effects(VOCABULARY["backlash"]())) is None
-
-
-def test_the_information_of_the_table_is_that_of_asking(made):
-    """The same 400 hypotheses by both routes, all places of a coarse grid."""
-    theta, grid = made.circles(400), Grid(n_x=27, n_y=14)
-    quick = made.over_discs(made.chain(20), theta, grid=grid, orientations_rad=(0.0, 1.0))
-    slow = type(quick)(**{**vars(quick), "forecast": DirectForecast(made.chain(20))})
-    bits = InformationGain()(quick)
-    np.testing.assert_allclose(bits, InformationGain()(slow), atol=0.01)
-    assert bits.max() > 0.3
 
 
 def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():

@@ -9,7 +9,6 @@ import pytest
 
 from probewise.errors import ParameterError, ReachError
 from probewise.inquiry import Grid, ReadingEntropy, choose, entropy_map
-from probewise.inquiry.entropy import best_places_mask, label_entropy
 
 
 @dataclass(frozen=True)
@@ -40,15 +39,6 @@ def test_the_entropy_is_that_of_counting_each_place_by_itself(made):
     np.testing.assert_allclose(ReadingEntropy()(made.listed(predicted)), expected, atol=1e-12)
 
 
-def test_hypotheses_that_agree_leave_nothing_to_learn():
-    assert (label_entropy(np.full((50, 7), 3.0)) == 0.0).all()
-
-
-def test_hypotheses_that_all_differ_promise_log2_of_their_number():
-    labels = np.repeat(np.arange(32.0)[:, None], 3, axis=1)
-    np.testing.assert_allclose(label_entropy(labels), 5.0)
-
-
 def test_the_naive_map_is_the_partition_by_the_number_of_circles_that_hold_the_place():
     """Paper, conclusion: the entropy depends on the number of circles that contain the place alone."""
     theta, grid = circles(50), Grid()
@@ -62,17 +52,6 @@ def test_the_naive_map_is_the_partition_by_the_number_of_circles_that_hold_the_p
     binary = np.where((p < 1e-9) | (q < 1e-9), 0.0, -p * np.log2(p) - q * np.log2(q))
     np.testing.assert_allclose(result.values, binary[holds], atol=1e-12)
     assert result.values.max() <= 1.0
-
-
-def test_half_of_the_circles_make_the_best_place_worth_one_bit():
-    theta = np.array([[300.0, 200.0, 50.0]] * 25 + [[700.0, 200.0, 50.0]] * 25)
-    grid = Grid()
-    result = entropy_map(PointSensor(), theta, grid, grid.plan("field"), reachable=np.ones(grid.n_places, bool))
-    assert result.highest_utility == pytest.approx(1.0, abs=1e-12)
-    best = grid.places_mm[best_places_mask(result.values, result.reachable)]
-    inside = (np.hypot(*(best - [300, 200]).T) <= 50) | (np.hypot(*(best - [700, 200]).T) <= 50)
-    assert inside.all()
-    assert inside.sum() > 200
 
 
 def test_the_next_place_is_drawn_evenly_among_those_that_tie():

@@ -5,7 +5,6 @@ import pytest
 
 from probewise.errors import ParameterError
 from probewise.inquiry import Designs, Grid
-from probewise.inquiry.grid import Design
 
 SMALL = Grid(2.0, 1.0, 3, 2)
 
@@ -23,12 +22,6 @@ def test_every_combination_stands_at_every_place():
     assert len({designs[row] for row in range(len(designs))}) == len(designs)
     assert (plan.time_s == 7.0).all()
     assert (plan.direction_of_motion == 0).all()
-
-
-def test_the_default_is_one_reading_a_place():
-    designs = Designs(SMALL)
-    assert designs[4] == Design(1.0, 1.0)
-    assert len(designs) == 6
 
 
 @pytest.mark.parametrize(
@@ -52,11 +45,6 @@ def test_the_grid_is_the_papers_field_row_by_row():
     np.testing.assert_allclose(grid.y_mm, np.linspace(0, 520, 65))
     assert grid.image(grid.places_mm[:, 0])[3, 7] == pytest.approx(grid.x_mm[7])
     assert grid.image(grid.places_mm[:, 1])[3, 7] == pytest.approx(grid.y_mm[3])
-
-
-def test_the_places_of_a_plan_are_alternatives_without_a_direction():
-    """A lag or a backlash must not carry from one possible reading to the next."""
-    assert (Grid(n_x=3, n_y=3).plan("field").direction_of_motion == 0).all()
 
 
 @pytest.mark.parametrize("change", [{"width_mm": 0.0}, {"n_x": 1}, {"height_mm": float("nan")}])

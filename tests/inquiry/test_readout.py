@@ -35,12 +35,6 @@ def test_the_ends_of_the_scale_take_all_beyond():
     assert chance[1, -1] == pytest.approx(norm.sf(0.0))
 
 
-def test_fine_cells_give_the_gaussians_entropy():
-    """The entropy of cells of width w is the differential entropy less log2 w; Sheppard: 0.015 bits more."""
-    bits = entropy_bits(Readout(2.0, 1.0).cell_probability(np.array([20.0])))[0]
-    assert bits == pytest.approx(0.5 * math.log2(2 * math.pi * math.e * 2.0**2), abs=0.02)
-
-
 @pytest.mark.parametrize("sd", [0.1, 0.29, 0.4])
 @pytest.mark.parametrize("black", [10.0, 10.5])
 def test_the_information_of_a_reading_counts_the_noise_at_each_level(sd, black):
@@ -73,11 +67,6 @@ def test_repeats_of_rounded_readings_are_those_of_all_outcomes(noise_sd, repeats
     merged = readout.cell_probability(levels, repeats=repeats, most=5)
     assert merged.shape[1] <= 5
     np.testing.assert_allclose(merged.sum(axis=1), 1.0)
-
-
-def test_what_is_certain_has_no_entropy():
-    assert entropy_bits(np.array([0.0, 1.0, 0.0])) == 0.0
-    assert entropy_bits(np.full((2, 8), 0.125)) == pytest.approx([3.0, 3.0])
 
 
 def test_a_reading_that_the_sensor_cannot_return_is_refused():

@@ -37,10 +37,6 @@ def by_quadrature(levels, weight, sd):
     return whole - 0.5 * np.log2(2 * np.pi * np.e * sd**2)
 
 
-def test_hypotheses_far_apart_are_told_apart_in_whole_bits(made):
-    np.testing.assert_allclose(InformationGain()(made.listed(APART)), [0.0, 1.0, 2.0], atol=1e-3)
-
-
 def test_predictions_nearer_than_the_noise_tell_what_quadrature_says(made):
     """The cells of unrounded readings, three quarters of a noise sd, hide 0.03 bits at most."""
     table = np.random.default_rng(0).normal(0.0, [[0.5, 1.0, 2.0, 4.0, 8.0]], (40, 5))
@@ -48,23 +44,6 @@ def test_predictions_nearer_than_the_noise_tell_what_quadrature_says(made):
     exact = [by_quadrature(column, weight, 1.0) for column in table.T]
     bits = InformationGain()(made.listed(table, weight=weight, step=None))
     np.testing.assert_allclose(bits, exact, atol=0.04)
-
-
-def test_rounding_and_noise_lower_the_information(made):
-    table = np.random.default_rng(2).normal(0.0, 5.0, (100, 20))
-    fine, rounded, noisy = (
-        InformationGain()(made.listed(table, **options))
-        for options in ({"step": None}, {"step": 5.0}, {"noise_sd": 4.0})
-    )
-    assert (rounded < fine).all()
-    assert (noisy < fine).all()
-
-
-def test_the_papers_entropy_counts_disagreement_that_the_noise_hides(made):
-    table = np.random.default_rng(3).normal(0.0, 1.0, (50, 10))
-    utility_input = made.listed(table, noise_sd=5.0)
-    assert (ReadingEntropy()(utility_input) > 1.5).all()
-    assert (InformationGain()(utility_input) < 0.1).all()
 
 
 def test_repeats_tell_more_and_never_more_than_all_there_is(made):
@@ -82,13 +61,6 @@ def test_information_about_a_label_leaves_the_rest_out(made):
     """Rows 0, 1 | 2, 3: the second place tells rows of one label apart, the third also the labels."""
     label = ParameterValue("row", n_bins=2)
     np.testing.assert_allclose(InformationAbout(label)(made.listed(APART)), [0.0, 0.0, 1.0], atol=1e-3)
-
-
-def test_information_about_a_parameter_is_never_more_than_about_all(made):
-    utility_input = made.over_discs(made.chain(20), made.circles(400), grid=Grid(n_x=27, n_y=14))
-    about = InformationAbout(ParameterValue("radius_mm"))(utility_input)
-    assert (about <= InformationGain()(utility_input) + 1e-3).all()
-    assert about.max() > 0.01
 
 
 def test_worth_a_second_prefers_the_near_place(made):

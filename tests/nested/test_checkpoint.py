@@ -7,9 +7,6 @@ import errno
 import itertools
 import math
 import os
-import signal
-import subprocess
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -187,43 +184,6 @@ def test_every_bit_generator_is_taken_up_again(bits: type[np.random.PCG64], path
             run(slope(), rng=rng(), n_live=30, progress=stopper(k), checkpoint=path)
     assert_same(run(slope(), rng=other, n_live=30, checkpoint=path), whole)
     assert (one.random(5) == other.random(5)).all()
-
-
-KILLED = """
-import os, sys
-import numpy as np
-from probewise.nested import run
-
-n_calls, path = 0, sys.argv[1] if len(sys.argv) == 2 else None
-
-def log_likelihood(theta):
-    global n_calls
-    n_calls += 1
-    if path and n_calls == 60:
-        os.kill(os.getpid(), 9)
-    return -500 * (theta[:, 0] - 0.3) ** 2 - 5 * theta[:, 1]
-
-def go(path):
-    prior = {"x": (0, 1), "y": (0, 1)}
-    options = dict(vectorized=True, n_live=50, checkpoint=path, checkpoint_every_s=0)
-    return run(log_likelihood, prior, rng=np.random.default_rng(7), **options)
-
-if path:
-    go(path)
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no kill -9")
-def test_a_killed_run_ends_as_one_never_killed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], capture_output=True, timeout=120, check=False)
-    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
-    monkeypatch.setattr(sys, "argv", [""])
-    program: dict[str, Callable[..., NestedResult]] = {}
-    exec(KILLED, program)
-    before = path.read_bytes()
-    resumed = program["go"](path)
-    assert len(before) < len(path.read_bytes())
-    assert_same(resumed, program["go"](None))
 
 
 def test_a_run_at_its_call_limit_goes_on_with_a_higher_one(path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import kstest, multivariate_normal
+from scipy.stats import kstest
 
 from probewise.errors import ParameterError
 from probewise.nested.moves import KernelMove, Kernels
@@ -12,23 +12,6 @@ from probewise.priors import Product, Uniform
 
 def cloud(n=300, seed=0):
     return np.random.default_rng(seed).multivariate_normal([0.4, 0.6], [[0.01, 0.006], [0.006, 0.02]], size=n)
-
-
-def test_the_density_of_kernels_is_the_sum_of_their_gaussians():
-    """scipy's multivariate normal about every centre, half of the weight at a third of the width; up to a constant."""
-    kernels = Kernels(cloud(40), rng=np.random.default_rng(1))
-    points = kernels.draw(200, rng=np.random.default_rng(2))
-    centres = kernels.mean + kernels.centre_rows @ kernels.root.T
-    metric = kernels.root @ kernels.root.T * kernels.width**2
-    density = np.mean(
-        [
-            0.5 * multivariate_normal(c, metric).pdf(points) + 0.5 * multivariate_normal(c, metric / 9).pdf(points)
-            for c in centres
-        ],
-        axis=0,
-    )
-    difference = kernels.log_density(points) - np.log(density)
-    np.testing.assert_allclose(difference, difference[0], atol=1e-4)
 
 
 def test_far_points_do_not_underflow():

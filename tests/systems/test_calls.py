@@ -37,15 +37,6 @@ def test_a_function_that_broadcasts_is_called_once_for_all_samples():
     assert system.caller.n_calls == 1
 
 
-def test_a_loop_over_scalars_gives_what_the_broadcasting_function_gives():
-    loop, table = _system(_with_a_loop)
-    quick, _ = _system(_elementwise)
-    theta = loop.theta(loop.starts)
-    np.testing.assert_allclose(
-        loop.chain(table, ()).predict(theta, table), quick.chain(table, ()).predict(theta, table)
-    )
-
-
 def test_a_parameter_that_varies_by_row_is_interpolated_where_a_function_takes_only_numbers():
     """Between Chebyshev nodes of five values a smooth function is known to a millionth of its range here."""
     loop, _ = _system(_with_a_loop)

@@ -32,41 +32,6 @@ def _states(motion, table, parameters, max_step):
     return {k: v[0] for k, v in integrate_states(motion, steps_for_table(table, max_step), own, columns).items()}
 
 
-def test_a_pendulum_swings_as_an_adaptive_integrator_says():
-    """Route two: DOP853 of SciPy at rtol 1e-10."""
-    times = np.sort(np.random.default_rng(1).uniform(0, 5, 60))
-    table = _table(times)
-    found = _states(Law({"phi": 1.0, "omega": 0.0}, _pendulum), table, {"l_m": 0.7, "c": 0.3}, 0.005)
-
-    def rates(t, y):
-        out = _pendulum({"phi": y[0], "omega": y[1]}, {"l_m": 0.7, "c": 0.3}, {})
-        return [out["phi"], out["omega"]]
-
-    exact = solve_ivp(rates, (times[0], times[-1]), [1.0, 0.0], t_eval=times, method="DOP853", rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(found["phi"], exact.y[0], atol=1e-7)
-
-
-@pytest.mark.parametrize(("hold", "expected"), [("previous", 2.0), ("linear", 3.0)])
-def test_an_input_between_rows_is_held_or_runs_straight(hold, expected):
-    """The integral of an input of 1, 3 from t = 0 to 1 and of 1 before: 1 s of 1, then 1 s of 1 or of 1 to 3."""
-    table = _table([0.0, 1.0, 2.0], u=np.array([1.0, 1.0, 3.0]))
-    law = Law({"x": 0.0}, lambda s, p, u: {"x": u["u"] + 0 * s["x"]}, hold=hold)
-    found = _states(law, table, {}, 0.1)["x"]
-    assert found[-1] == pytest.approx(expected, abs=1e-12)
-
-
-def test_runs_go_on_side_by_side_as_each_would_alone():
-    rng = np.random.default_rng(3)
-    law = Law({"phi": 1.0, "omega": 0.0}, _pendulum)
-    times = [np.sort(rng.uniform(0, 3, n)) for n in (20, 7)]
-    both = RunTable(
-        {"t_s": np.concatenate(times), "y": np.zeros(27), "run": np.repeat([1.0, 2.0], [20, 7])}, time="t_s", run="run"
-    )
-    together = _states(law, both, {"l_m": 0.7, "c": 0.3}, 0.01)["phi"]
-    alone = np.concatenate([_states(law, _table(t), {"l_m": 0.7, "c": 0.3}, 0.01)["phi"] for t in times])
-    np.testing.assert_allclose(together, alone, atol=1e-7)
-
-
 def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts():
     """v = v0 - a t until 0, then it sticks."""
     law, table = Law({"v": 1.0}, lambda s, p, u: {"v": 0.0 * s["v"]}), _table(np.linspace(0, 4, 81))
@@ -75,28 +40,12 @@ def test_dry_friction_brings_a_body_to_rest_after_the_time_that_its_speed_lasts(
     assert np.all(found[table.time_s > 2.1] == 0)
 
 
-def test_a_body_at_rest_sticks_until_the_force_is_larger_than_its_friction():
-    law = Law({"v": 0.0}, lambda s, p, u: {"v": u["force"] + 0 * s["v"]}, hold="linear")
-    table = _table(np.linspace(0, 4, 401), force=np.linspace(0, 4, 401))
-    found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 2.0)}), table, {}, 0.01)["v"]
-    assert np.all(found[table.time_s < 1.99] == 0)
-    assert found[-1] == pytest.approx(0.5 * 2.0**2, abs=0.05)
-
-
 def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction():
     """Closed form: a force of 2 t exceeds a friction of 1 at 0.5, amid the first step, and v = (t - 0.5)^2 after it."""
     law = Law({"v": 0.0}, lambda s, p, u: {"v": 2 * u["t_s"] + 0 * s["v"]})
     table = _table(np.linspace(0, 4, 6))
     found = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), 1.0)}), table, {}, 0.8)["v"]
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-9])
-def test_friction_that_vanishes_holds_nothing_at_rest(size):
-    law = Law({"x": 0.0, "v": 0.0}, lambda s, p, u: {"x": 1 - s["x"], "v": s["x"] - s["v"]})
-    table = _table(np.linspace(0, 5, 11))
-    held = _states(LawWithEffects(law).plus(friction={"v": np.full((1, 1), size)}), table, {}, 0.5)["v"]
-    np.testing.assert_allclose(held, _states(law, table, {}, 0.5)["v"], atol=1e-8)
 
 
 def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_ends():

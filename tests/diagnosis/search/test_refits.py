@@ -10,6 +10,7 @@ from refitted import state_with_nulls
 
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit import Model, fit
+from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search.hypotheses import (
     Evidences,
@@ -150,20 +151,11 @@ def decaying():
     return prepare_system(simulator, RunTable({"t_min": t, "y": y}, time="t_min", run=None))
 
 
-@pytest.fixture(scope="module")
-def searched_cup(decaying):
-    return searching.search(decaying)
-
-
-def _far_start(prepared_line):
-    return prepared_line.null.starts[0] + 1.5
-
-
-def test_a_fit_that_would_stay_above_what_matters_is_given_up(decaying, searched_cup):
-    model = Model(decaying.null, (), decaying.recording.plan)
-    law = searched_cup.null.law
-    whole = fit(model, decaying.recording, _far_start(decaying), law)
-    asked = fit(model, decaying.recording, _far_start(decaying), law, hopeless_above=whole.objective - 1e6)
+def test_a_fit_that_would_stay_above_what_matters_is_given_up(decaying):
+    model, law = Model(decaying.null, (), decaying.recording.plan), white_noise(len(decaying.recording))
+    far = decaying.null.starts[0] + 1.5
+    whole = fit(model, decaying.recording, far, law)
+    asked = fit(model, decaying.recording, far, law, hopeless_above=whole.objective - 1e6)
     assert whole.settled
     assert not asked.settled
     assert asked.objective > whole.objective

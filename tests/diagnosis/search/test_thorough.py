@@ -131,32 +131,6 @@ def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, m
     assert "agrees to within a nat plus its standard error, but its runs gave a warning" in said
 
 
-@pytest.mark.single_case
-@pytest.mark.slow
-def test_a_peak_that_the_search_has_lost_is_found_from_the_fit(stepped, monkeypatch):
-    """Samples of the line in quite another place: a ledge of the likelihood from which nothing leads back."""
-
-    def lost(result):
-        return SimpleNamespace(
-            log_z=result.log_z - 20.0,
-            log_z_error=result.log_z_error,
-            samples=lambda n, rng: 5.0 + 0.001 * result.samples(n, rng=rng),
-        )
-
-    plain = thorough._evidence_near_posterior
-    about = []
-
-    def noted(*given):
-        about.append(plain(*given))
-        return about[-1] if len(about) % 2 == 0 else (about[-1][0] - 20.0, *about[-1][1:])
-
-    monkeypatch.setattr(thorough, "_evidence_near_posterior", noted)
-    stub_of_the_whole_prior(monkeypatch, lost)
-    _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
-    assert len(about) == 2 * len(weighings)
-    assert all(w.agree and not w.doubts for w in weighings)
-
-
 def moved(stepped, monkeypatch, gap, doubts=()):
     def weigh(candidate, noise, *_, **__):
         own = gap if candidate.names else 0.5

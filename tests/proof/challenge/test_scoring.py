@@ -20,11 +20,6 @@ def test_what_fewer_than_three_nats_tell_apart_is_the_same(make):
     assert found == {"lag", "backlash"}
 
 
-def test_a_larger_effect_has_fewer_aliases(make):
-    """lambda 20: 200 (1 - .98^2) is 7.9 nats."""
-    assert right_names(make.hidden("lag", 20.0, cosines={"lag": 1.0, "backlash": 0.98})) == {"lag"}
-
-
 def test_what_has_no_name_is_unknown_unless_it_is_like_one(make):
     chirp = make.outside(cosines={"flicker": 0.89})
     assert is_out_of_vocabulary(chirp)

@@ -8,100 +8,90 @@ import pytest
 from probewise.errors import NotConvergedError
 from probewise.proof.systems.simulate import simulate_noise_free
 
-from .conftest import small
+from .conftest import T, small
 
-SINCE = np.tile([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0], 3)
-
-
-def test_nothing_added_is_the_law_itself(solve):
-    _, _, bare = solve("damping:x", {"a": 0.0})
-    np.testing.assert_allclose(bare, 2 * np.exp(-0.5 * SINCE), rtol=1e-7)
+SINCE = np.tile(T, 3)
+FALLS = {"k": 0.0}  # of the law x' = u - k x from 2, so that only what was added acts
+W = 2 * np.pi * 0.3
+U = np.array([1.0, 0.0, 2.0, 0.0, -1.0, 0.5, 0.0])
 
 
-def test_damping_adds_to_the_decay(solve):
-    found, *_ = solve("damping:x", {"a": 0.3})
-    np.testing.assert_allclose(found, 2 * np.exp(-0.8 * SINCE), rtol=1e-7)
+def _begin(rows):
+    return rows.t - rows.time_since_start
 
 
-@pytest.mark.parametrize(
-    ("name", "solution"),
-    [
-        ("drag:x", lambda a, t: 2 / (1 + 2 * a * t)),
-        ("quadratic:x:x", lambda a, t: 2 / (1 + 2 * a * t)),
-        ("cubic:x:x", lambda a, t: 2 / np.sqrt(1 + 8 * a * t)),
-        ("forcing:x", lambda a, t: 2 + a * t),
-        ("damping:x", lambda a, t: 2 * np.exp(-a * t)),
-    ],
-)
-def test_a_term_alone_solves_as_by_hand(solve, name, solution):
-    found, *_ = solve(name, {"a": 0.4}, k=0.0)
-    np.testing.assert_allclose(found, solution(0.4, SINCE), rtol=1e-7)
+def _brought(between):
+    """Integrate, over each run, a column that has these values between its rows."""
+    return np.tile(np.concatenate([[0], np.cumsum(np.diff(T) * between)]), 3)
 
 
-def test_dry_friction_slows_down_steadily_and_then_holds(solve):
-    found, *_ = solve("friction:x", {"a": 0.9}, k=0.0)
-    np.testing.assert_allclose(found, np.maximum(2 - 0.9 * SINCE, 0), atol=1e-7)
-
-
-def test_what_rests_breaks_loose_when_the_force_is_larger_and_not_before(solve):
-    """From rest, u = 0.5 is held by a friction of 0.8; u = 2 leaves 1.2 to move it."""
-    found, *_ = solve("friction:x", {"a": 0.8}, k=0.0, x0=0.0, u=[0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0])
-    np.testing.assert_allclose(found, 1.2 * np.maximum(SINCE - 1.9, 0), atol=1e-7)
-
-
-def test_a_bound_holds_and_lets_go_at_once(solve):
-    """It rises by 1 to its bound of 2.5, waits, and falls by 2 from the row on at which the input turns."""
-    found, *_ = solve("limit:x", {"level": 2.5}, k=0.0, u=[1, 1, 1, 1, -2, -2, -2])
-    rising = np.minimum(2 + SINCE, 2.5)
-    np.testing.assert_allclose(found, np.where(SINCE <= 2.4, rising, 2.5 - 2 * (SINCE - 2.4)), atol=1e-7)
-
-
-def test_a_periodic_force_is_integrated_between_the_rows(solve):
-    found, rows, _ = solve("periodic_forcing:x", {"a": 0.6, "hz": 0.3, "phase": 0.4}, k=0.0)
-    w = 2 * np.pi * 0.3
-    begin = rows.t - rows.time_since_start
-    np.testing.assert_allclose(found, 2 + 0.6 / w * (np.cos(w * begin + 0.4) - np.cos(w * rows.t + 0.4)), rtol=1e-6)
-
-
-def test_a_parameter_that_drifts_does_so_between_the_rows_too(solve):
-    found, rows, _ = solve("drifts:k", {"a": 0.02})
-    begin = rows.t - rows.time_since_start
-    np.testing.assert_allclose(found, 2 * np.exp(-0.5 * SINCE - 0.01 * (rows.t**2 - begin**2)), rtol=1e-7)
-
-
-def test_a_parameter_steps_at_its_moment_not_at_a_row(solve):
-    found, rows, _ = solve("steps:k", {"a": 0.3, "at_s": 11.45})
-    after = np.where(rows.run == 1, np.maximum(rows.t - 11.45, 0), np.where(rows.run > 1, SINCE, 0))
-    np.testing.assert_allclose(found, 2 * np.exp(-0.5 * SINCE - 0.3 * after), rtol=1e-6)
-
-
-def test_a_parameter_follows_a_logged_column_on_straight_lines(solve):
-    found, rows, _ = solve("depends:k:warm", {"a": 0.2})
-    warm = rows.columns["warm"] - rows.columns["warm"].mean()
-    area = np.zeros(len(rows))
+def _area_of_warm(rows):
+    warm, area = rows.columns["warm"] - rows.columns["warm"].mean(), np.zeros(len(rows))
     for own in rows.rows_by_run:
         area[own[1:]] = np.cumsum(np.diff(rows.t[own]) * (warm[own[1:]] + warm[own[:-1]]) / 2)
-    np.testing.assert_allclose(found, 2 * np.exp(-0.5 * SINCE - 0.2 * area), rtol=1e-7)
+    return area
 
 
-def test_an_input_is_held_as_in_the_row_before(solve):
-    u = np.array([1.0, 0.0, 2.0, 0.0, -1.0, 0.5, 0.0])
-    _, rows, bare = solve("damping:x", {"a": 0.0}, k=0.0, u=u)
-    area = np.concatenate([[0], np.cumsum(np.diff(SINCE[:7]) * u[:-1])])
-    np.testing.assert_allclose(bare[rows.run == 0], 2 + area, rtol=1e-7)
+def _after(rows, at_s):
+    return np.where(rows.run == 1, np.maximum(rows.t - at_s, 0), np.where(rows.run > 1, SINCE, 0))
 
 
-def test_an_input_moves_on_straight_lines_where_the_owner_says_so(solve):
-    u = np.array([1.0, 0.0, 2.0, 0.0, -1.0, 0.5, 0.0])
-    _, rows, bare = solve("damping:x", {"a": 0.0}, k=0.0, u=u, linear=True)
-    area = np.concatenate([[0], np.cumsum(np.diff(SINCE[:7]) * (u[:-1] + u[1:]) / 2)])
-    np.testing.assert_allclose(bare[rows.run == 0], 2 + area, rtol=1e-7)
+SOLUTIONS = {
+    "nothing": ("damping:x", {"a": 0.0}, {}, lambda rows: 2 * np.exp(-0.5 * SINCE)),
+    "damping beside a decay": ("damping:x", {"a": 0.3}, {}, lambda rows: 2 * np.exp(-0.8 * SINCE)),
+    "damping": ("damping:x", {"a": 0.4}, FALLS, lambda rows: 2 * np.exp(-0.4 * SINCE)),
+    "drag": ("drag:x", {"a": 0.4}, FALLS, lambda rows: 2 / (1 + 0.8 * SINCE)),
+    "a square": ("quadratic:x:x", {"a": 0.4}, FALLS, lambda rows: 2 / (1 + 0.8 * SINCE)),
+    "a cube": ("cubic:x:x", {"a": 0.4}, FALLS, lambda rows: 2 / np.sqrt(1 + 3.2 * SINCE)),
+    "a constant force": ("forcing:x", {"a": 0.4}, FALLS, lambda rows: 2 + 0.4 * SINCE),
+    "dry friction, until it rests": ("friction:x", {"a": 0.9}, FALLS, lambda rows: np.maximum(2 - 0.9 * SINCE, 0)),
+    "rest, until a force of 2 leaves 1.2 of it": (
+        "friction:x",
+        {"a": 0.8},
+        {"k": 0.0, "x0": 0.0, "u": [0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0]},
+        lambda rows: 1.2 * np.maximum(SINCE - 1.9, 0),
+    ),
+    "a bound, which lets go at once": (
+        "limit:x",
+        {"level": 2.5},
+        {"k": 0.0, "u": [1, 1, 1, 1, -2, -2, -2]},
+        lambda rows: np.where(SINCE <= 2.4, np.minimum(2 + SINCE, 2.5), 2.5 - 2 * (SINCE - 2.4)),
+    ),
+    "a periodic force": (
+        "periodic_forcing:x",
+        {"a": 0.6, "hz": 0.3, "phase": 0.4},
+        FALLS,
+        lambda rows: 2 + 0.6 / W * (np.cos(W * _begin(rows) + 0.4) - np.cos(W * rows.t + 0.4)),
+    ),
+    "a drift": (
+        "drifts:k", {"a": 0.02}, {}, lambda rows: 2 * np.exp(-0.5 * SINCE - 0.01 * (rows.t**2 - _begin(rows) ** 2))
+    ),
+    "a step between two rows": (
+        "steps:k", {"a": 0.3, "at_s": 11.45}, {}, lambda rows: 2 * np.exp(-0.5 * SINCE - 0.3 * _after(rows, 11.45))
+    ),
+    "a logged column on straight lines": (
+        "depends:k:warm", {"a": 0.2}, {}, lambda rows: 2 * np.exp(-0.5 * SINCE - 0.2 * _area_of_warm(rows))
+    ),
+    "an input held as in the row before": (
+        "damping:x", {"a": 0.0}, {"k": 0.0, "u": U}, lambda rows: 2 + _brought(U[:-1])
+    ),
+    "an input on straight lines": (
+        "damping:x", {"a": 0.0}, {"k": 0.0, "u": U, "linear": True}, lambda rows: 2 + _brought((U[:-1] + U[1:]) / 2)
+    ),
+    "a late input, which jumps between the rows": (
+        "input_delay:u",
+        {"tau_s": 0.25},
+        {"k": 0.0, "u": [0, 0, 1, 1, 1, 1, 1]},
+        lambda rows: 2 + np.maximum(SINCE - 1.25, 0),
+    ),
+}  # fmt: skip
 
 
-def test_an_input_that_comes_late_jumps_between_the_rows(solve):
-    """u goes from 0 to 1 at the row of 1.0, and is felt from 1.25 on."""
-    found, *_ = solve("input_delay:u", {"tau_s": 0.25}, k=0.0, u=[0, 0, 1, 1, 1, 1, 1])
-    np.testing.assert_allclose(found, 2 + np.maximum(SINCE - 1.25, 0), atol=1e-6)
+@pytest.mark.parametrize("what", SOLUTIONS)
+def test_what_is_added_to_a_law_solves_as_by_hand(solve, what):
+    name, numbers, options, solution = SOLUTIONS[what]
+    found, rows, _ = solve(name, numbers, **options)
+    np.testing.assert_allclose(found, solution(rows), rtol=1e-6, atol=1e-7 if name != "input_delay:u" else 1e-6)
 
 
 def test_a_law_that_runs_away_between_two_rows_is_refused():

@@ -46,7 +46,7 @@ FILES = {
         ("return p", "raise ValueError('too hot')\n    return p"), "line 10: simulate raises ValueError: too hot",
     ),
     "a control that the table lacks": (
-        ('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'; allowed: a column that the table has and that can be set: power_w",
+        ('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'; allowed: a column that the table has",
     ),
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
     "a zero that is NaN": (('"sd": 0.05', '"zero": float("nan")'), 'noise["zero"] is nan; allowed: a finite number'),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -46,12 +47,14 @@ def stoppable() -> Iterator[None]:
     _asked.clear()
     with _signals_handled_by(_stop):
         try:
+            before, sys.unraisablehook = sys.unraisablehook, _raise_again
             yield
         except BaseException as error:
             if (stopped := _stopped_behind(error)) is None or stopped is error:
                 raise
             raise stopped from error
         finally:
+            sys.unraisablehook = before
             _asked.clear()  # answered: what the process does next is not interrupted by it
 
 
@@ -134,6 +137,15 @@ def _stop(number: int, frame: FrameType | None) -> None:
     if not _asked or now_s - _asked[-1][1] > SAME_S:
         _asked.append((number, now_s))
         raise Stopped(_asked[0][0])
+
+
+def _raise_again(ignored: sys.UnraisableHookArgs) -> None:
+    """Raise `Stopped` soon again where Python ignores exceptions, as in a callback of its garbage collection."""
+    if not isinstance(ignored.exc_value, Stopped):
+        sys.__unraisablehook__(ignored)
+        return
+    _asked.clear()
+    threading.Timer(0.01, signal.raise_signal, (ignored.exc_value.number,)).start()
 
 
 def _stopped_behind(error: BaseException) -> Stopped | None:

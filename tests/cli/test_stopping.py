@@ -6,6 +6,7 @@ import os
 import shlex
 import signal
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -41,6 +42,26 @@ def test_a_signal_raises_and_gives_the_status_that_shells_expect(number):
     assert stop.value.status == 128 + number
     assert [signal.getsignal(k) for k in ENDING] == before
     raise_if_stopped()  # answered: it does not interrupt what this process does next
+
+
+def test_a_signal_in_a_callback_that_ignores_exceptions_stops_the_command_all_the_same(capsys):
+    """Python prints what a callback of its garbage collection raises, and goes on."""
+
+    class Kept:
+        pass
+
+    kept = [Kept()]
+    follower = weakref.ref(kept[0], lambda _: signal.raise_signal(signal.SIGTERM))
+
+    def work():
+        kept.clear()
+        for _ in range(500):
+            time.sleep(0.01)
+
+    with pytest.raises(Stopped), stoppable():
+        work()
+    assert follower() is None
+    assert capsys.readouterr().err == ""
 
 
 def test_a_signal_that_is_ignored_stays_ignored():

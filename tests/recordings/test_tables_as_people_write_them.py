@@ -5,6 +5,7 @@ import pytest
 
 from probewise.errors import FileError
 from probewise.recordings import read_recording
+from probewise.recordings.cells import first_cell_without_number
 from probewise.systems import read_run_table
 
 TIMES = [0, 3, 6, 9]
@@ -197,3 +198,9 @@ def test_a_recording_is_read_by_the_same_rules(tmp_path):
     assert recording.plan.time_s.tolist() == [0.0, 2.0]
     assert recording.plan.scan_names == ("1.10", "1,1")
     assert "decimal commas in x_mm, reading" in recording.notes[0]
+
+
+def test_of_decimal_commas_and_a_word_the_word_is_at_fault():
+    assert first_cell_without_number(["1,5", "", "nope", "2,5"]) == 2
+    assert first_cell_without_number(["", "1,5", "2,5"]) == 1
+    assert first_cell_without_number(["1.5", ""]) is None

@@ -49,13 +49,19 @@ def _is_number(cell: str) -> bool:
 def first_cell_without_number(
     cells: Sequence[object], *, missing: bool = True, largest: float = math.inf
 ) -> int | None:
-    """Return the index of the first cell that is no number up to `largest` and, if `missing`, not missing; or None."""
+    """Return the index of the first cell that is no number up to `largest` and, if `missing`, not missing; or None.
+
+    One that is no number however it is written comes before those that another way of writing would explain.
+    """
+    first: int | None = None
     for k, cell in enumerate(cells):
         text = str(cell).strip()
         is_number = _is_number(text) and abs(float(text)) <= largest
         if not is_number and not (missing and text in MISSING):
-            return k
-    return None
+            if not looks_like_number(text):
+                return k
+            first = k if first is None else first
+    return first
 
 
 def count_numbers(cells: Sequence[str]) -> int:

@@ -173,7 +173,8 @@ def test_an_extra_effect_of_a_file_is_bound_with_its_own_prior_and_sentence():
 
 
 @pytest.mark.parametrize(
-    ("a", "told"), [(0.7, "a damping term -a x, a = 0.700 ± 0.020"), (-0.7, "a term +b x, b = -a = 0.700 ± 0.020")]
+    ("a", "told"),
+    [(0.7, "a damping term -a x, a = 0.700 ± 0.020 per s"), (-0.7, "a term +b x, b = -a = 0.700 ± 0.020 per s")],
 )
 def test_a_term_that_adds_to_a_rate_is_told_without_a_double_negative(a, told):
     damping = bind_forms(_about_law(_rising, max_step_s=0.2))["damping:x"]

@@ -66,18 +66,30 @@ _TERMS: dict[str, tuple[Callable[[Any], Any], int, str]] = {
 def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> Iterator[Form]:
     kind = name.split(":")[0]
     term, degree, what = _TERMS[kind]
+    per = (
+        f"per {about.time_unit}" if kind == "damping" else ""
+    )  # in a sentence; of another term it says more than it helps
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         said, minus, of = what.format(other).partition(" -a ")
         if minus and mean[0] < 0:  # a term that adds to the rate, without a double negative
-            return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], '')}"
-        return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], '')}"
+            return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], per)}"
+        return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], per)}"
 
     act = acting(lambda motion, rows, a: motion.plus(terms=((state, lambda s, p, u: a * term(s[other])),)))
-    size = {"a": (AMPLITUDE, f"{state} per {about.time_unit}" if kind == "forcing" else f"rate of {state}")}
+    size = {"a": (AMPLITUDE, _unit_of_term(state, other, degree, about.time_unit))}
     largest = float(np.nanmax(np.abs(about.states[other]))) or 1.0
     own = (name, Stage.RATE, size, (f"state:{other}", "time"), act, says)
     yield from about.form(*own, guess=trial_rate(about, state) / largest**degree)
+
+
+def _unit_of_term(state: str, other: str, degree: int, time_unit: str) -> str:
+    """Return the unit of a term's size: of a state per time, over the power of the state that it multiplies."""
+    if degree == 0:
+        return f"{state} per {time_unit}"
+    power, above = (degree - 1, "1") if other == state else (degree, state)
+    below = {0: time_unit, 1: f"({other} {time_unit})"}.get(power, f"({other}^{power} {time_unit})")
+    return f"{above}/{below}"
 
 
 def _friction_form(about: ReferenceFit, state: str) -> Iterator[Form]:

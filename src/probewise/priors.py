@@ -6,9 +6,10 @@ The packages of shapes, sensors and effects all import this module, so it import
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -176,6 +177,31 @@ class LogNormal:
 
     def __str__(self) -> str:
         return f"log-normal about {self.median:g}"
+
+
+def parse_prior(what: str, given: Any) -> Marginal:
+    """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
+
+    Raises ParameterError if it is none of these, or has no mass; `what` is its name there.
+    """
+    allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
+    if isinstance(given, Marginal):
+        return given
+    require(isinstance(given, Sequence) and not isinstance(given, str) and given, what, given, allowed)
+    kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}
+    kind, numbers = (given[0], given[1:]) if isinstance(given[0], str) else ("uniform", given)
+    require(
+        kind in kinds
+        and len(numbers) == 2
+        and all(isinstance(number, Real) and not isinstance(number, bool) for number in numbers),
+        what,
+        given,
+        allowed,
+    )
+    try:
+        return kinds[kind](float(numbers[0]), float(numbers[1]))
+    except ParameterError as error:
+        raise ParameterError(what, given, f"{error.allowed}: a prior with mass") from error
 
 
 @dataclass(frozen=True)

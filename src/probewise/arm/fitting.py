@@ -110,7 +110,7 @@ class FittedGeometry:
         rms = np.sqrt(np.nanmean(self.residuals_mm**2))
         known = self.geometry.accuracy
         lines.append(
-            f"residuals         {rms:.2f} mm root mean square at {len(self.residuals_mm)} marks (p {self.p_value:.2g})"
+            f"residuals         {rms:.2f} mm rms at {len(self.residuals_mm)} marks (p-value {self.p_value:.2g})"
         )
         if known is not None:
             lines.append(

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import dataclass, field, fields
-from numbers import Real
 from typing import Any, Protocol, Self, TypeAlias, cast
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.special import ndtr, ndtri
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise._kinds import require_callable, require_like
 from probewise.errors import NotConvergedError, ParameterError, message_of, require
-from probewise.priors import Coordinates, Marginal, Prior, Product, Uniform, require_prior
+from probewise.priors import Coordinates, Marginal, Prior, Product, parse_prior, require_prior
 
 AnyPrior: TypeAlias = "Prior | Mapping[str, Any] | Sequence[Any] | Callable[[FloatArray], Any]"
 
@@ -507,10 +506,8 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
 
 def _as_marginal(name: str, one: Any) -> Marginal:
     """Convert a distribution in any of its forms to a marginal; `name` is its name in error messages."""
-    if isinstance(one, tuple | list) and len(one) == 2 and all(isinstance(end, Real) for end in one):
-        return Uniform(float(one[0]), float(one[1]))
-    if isinstance(one, Marginal):
-        return one
+    if isinstance(one, tuple | list | Marginal):
+        return parse_prior(name, one)
     has_quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
     if has_quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type):
         if hasattr(one, "freeze"):

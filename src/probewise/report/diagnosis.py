@@ -180,7 +180,9 @@ def _formula_in_words(formula: Formula) -> str:
 def _heldout_gain_in_words(nats: float, sd: float) -> str:
     measured = f"{_signed_nats(nats, sd)} per held-out reading"
     if nats > 2 * sd:
-        return f"Yes: each reading is {math.exp(min(nats, 50.0)):.3g} times as probable as before ({measured})."
+        times = math.exp(min(nats, 50.0))
+        many = f"{times:.3g}" if times < 1000 else "over a thousand"
+        return f"Yes: each reading is {many} times as probable as before ({measured})."
     return f"{'No better than before' if nats > -2 * sd else 'Worse than before'}: {measured}."
 
 

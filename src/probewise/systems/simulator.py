@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import checked_path, checked_text, checked_texts, require_callable, require_kind, require_mapping
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
-from probewise.priors import LogUniform, Marginal, Normal, Uniform
+from probewise.priors import Marginal, parse_prior
 from probewise.recordings.io import raising_exceptions, read_text, run_python_text
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable, read_run_table
@@ -242,24 +242,6 @@ def read_table_for(simulator: Simulator, path: str | os.PathLike[str]) -> RunTab
     """Read a simulator's table from a file, as `read_run_table` does."""
     own = simulator
     return read_run_table(path, time=own.time, run=own.run, reading=own.reading, time_unit=own.time_unit)
-
-
-def parse_prior(what: str, given: Any) -> Marginal:
-    """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
-
-    Raises ParameterError if it is none of these, or has no mass; `what` is its name there.
-    """
-    allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
-    if isinstance(given, Marginal):
-        return given
-    require(isinstance(given, Sequence) and not isinstance(given, str) and given, what, given, allowed)
-    kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}
-    kind, numbers = (given[0], given[1:]) if isinstance(given[0], str) else ("uniform", given)
-    require(kind in kinds and len(numbers) == 2 and all(map(_is_number, numbers)), what, given, allowed)
-    try:
-        return kinds[kind](float(numbers[0]), float(numbers[1]))
-    except ParameterError as error:
-        raise ParameterError(what, given, f"{error.allowed}: a prior with mass") from error
 
 
 def _is_finite_number(value: object) -> bool:

@@ -393,7 +393,9 @@ def _alias_elements(diagnosis: Diagnosis) -> Sequence[str]:
     if not ranked:
         return ("None: these readings tell apart all effects of the vocabulary that they can detect.",)
     first, rest = ranked[:_MOST_ALIASES], ranked[_MOST_ALIASES:]
-    return (_alias_table(first), *((html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()))
+    said = "While they are small, the effects of a pair change these readings alike; larger ones may differ, as the "
+    folded = (html.details(f"{len(rest)} more pairs", _alias_table(rest)),) if rest else ()
+    return (f"{said}probabilities above say.", _alias_table(first), *folded)
 
 
 def _alias_table(aliases: Sequence[Alias]) -> html.Markup:

@@ -217,7 +217,7 @@ _TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         "aliased": (
             r"(?i)\balias(es|ed)?\b",
-            "two effects that change these readings in the same way, so that the readings cannot tell which it is",
+            "two effects that change these readings in the same way while they are small",
         ),
         "cosine": (r"\bcosine\b", "1 where two effects change the readings in the same proportions, 0 where unrelated"),
         "unknown": (r"\bunknown\b", "something that no effect which this program knows explains"),

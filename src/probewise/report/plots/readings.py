@@ -108,7 +108,8 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
         along, readings = track.along_mm[ok], recording.readings[track.rows][ok]
         ax.plot(along, readings, markersize=size, markeredgewidth=1.0, label=track.label, **_symbol_of_track(k))
     if 0 < len(tracks) <= _MOST_NAMED:
-        canvas.legend_above(ax, title="orientation of the sensor")
+        turned = all("°" in track.label for track in tracks)
+        canvas.legend_above(ax, title="orientation of the sensor" if turned else "scan")
     unit = recording.plan.instrumentation.unit_after_number
     return canvas.label_axes(ax, x=_along_label(tracks, ", white side positive"), y=f"reading ({unit})")
 

@@ -623,6 +623,16 @@ def test_a_leader_whose_residuals_change_with_the_place_is_not_believed():
         assert trend_of_residuals(best, problem) == said
 
 
+@pytest.mark.parametrize("column", ["dark_level.offset", "gain.frac"])
+def test_levels_that_a_sensor_holds_as_changed_are_no_rivals_of_it(sensor, column):
+    name, change = column.partition(".")[0], np.full((len(sensor.samples), 1), 0.1)
+    samples = np.concatenate([sensor.samples, change], axis=1)
+    held = replace(sensor, names=(*sensor.names, column), samples=samples, effects=(name,))
+    field = scene.Field()
+    kinds = experiment_for(held, scene.Circle(field), field, trust=0.9).kinds
+    assert name not in {kind.left_out for kind in kinds}
+
+
 def test_the_next_run_starts_with_the_doubt_that_the_last_one_left(sensor):
     """What a repaired sensor knows of its effect is inferred along with the shape; a run that trusts takes the mean."""
     width = np.random.default_rng(1).normal(6.0, 0.8, (len(sensor.samples), 1))

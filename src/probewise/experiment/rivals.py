@@ -119,7 +119,7 @@ def rivals_of(
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
     extent = Extent(min(dark, bright), max(dark, bright), _plan_there_and_back(_SCAN_MM, height_mm))
-    forms = SINCE_CALIBRATION if cards_of(model) or "position_scale" in carried else ONLY_IN_RUNS
+    forms = [form for form in (SINCE_CALIBRATION if cards_of(model) else ONLY_IN_RUNS) if form.name not in carried]
     in_any_run = [effect for form in forms if (effect := form.for_extent(extent)) is not None]
     found += [SensorModelRival(form.name, effect=EffectWithRunPrior(form, field_mm)) for form in in_any_run]
     noise = DeclaredNoise.from_likelihood(likelihood)

@@ -219,7 +219,7 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     if plan is None and diagnosis.is_settled:
         return "Nothing more is needed."
     if plan is None:
-        return "None of the readings that were considered, within the ranges recorded here, would settle what is open."
+        return "No readings that were considered, within the ranges recorded here, would settle what is open."
     told = plan.expected_log_bayes_factor
     asked = count_with_noun(len(plan.plan), "reading")
     if diagnosis.apparatus.words.tells_duration:

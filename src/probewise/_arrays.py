@@ -114,3 +114,16 @@ def require_finite(name: str, values: FloatArray) -> None:
     if bad.any():
         at = int(np.flatnonzero(bad.ravel())[0])
         raise ParameterError(f"{name}[{at}]", float(values.ravel()[at]), "finite numbers")
+
+
+_SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
+
+
+def nearly_equal(first: FloatArray, second: FloatArray) -> bool:
+    """Return whether two ways of calling a function give the same readings, up to rounding."""
+    if first.shape != second.shape or not np.array_equal(np.isfinite(first), np.isfinite(second)):
+        return False
+    there = np.isfinite(first)
+    return bool(
+        np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0)))
+    )

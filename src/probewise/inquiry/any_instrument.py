@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtri
 
-from probewise._arrays import FloatArray, IntArray, floats, own_arithmetic
+from probewise._arrays import FloatArray, IntArray, floats, nearly_equal, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_callable, require_rng
 from probewise.errors import ParameterError, ShapeError, did_you_mean, require
@@ -47,10 +47,9 @@ _ALLOWED = (
 _BLOCK = 2_000_000  # densities held, or readings predicted, at a time
 _LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
 _N_PROBED = 3
-_SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
-_TIE = 1e-9  # utilities closer than this differ by rounding only
 _N_ASKED = 500  # samples whose predictions value the settings
 _FEWER_ASKED = 200  # of a model that is called for one sample at a time
+_TIE = 1e-9  # utilities closer than this differ by rounding only
 _N_ROUGH = 120  # samples that pick the settings worth a closer look, far from a goal
 _N_BEST = 32  # settings that get it
 _FEW_SETTINGS = 64  # all of which get it
@@ -190,7 +189,7 @@ class InstrumentModel:
         except Exception:
             alone, one = _repeatable(one_reading, theta, some), one_reading
         try:
-            if _nearly_equal(together(theta, some), alone):
+            if nearly_equal(together(theta, some), alone):
                 return cls(together, True, prior, noise)
         except Exception:  # it takes no arrays
             pass
@@ -250,16 +249,11 @@ def _repeatable(one: Callable[[bytes, Settings], FloatArray], theta: FloatArray,
     if not sound.any():
         found = f"not finite at any of the {sound.size} points of the prior that were tried"
         raise ParameterError("model", found, "finite readings: look for divisions by 0 and priors that are too wide")
-    if not _nearly_equal(one(theta[np.argmax(sound)].tobytes(), at), alone[np.argmax(sound)]):
+    if not nearly_equal(one(theta[np.argmax(sound)].tobytes(), at), alone[np.argmax(sound)]):
         found = "different when it is called again with the same parameters"
         allowed = "the same readings each time: no random numbers, which `noise` stands for, no state between calls"
         raise ParameterError("model", found, allowed)
     return alone
-
-
-def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
-    size = float(np.abs(second[np.isfinite(second)]).max(initial=0.0))
-    return bool(np.allclose(first, second, rtol=_SAME, atol=_SAME * size, equal_nan=True))
 
 
 @dataclass(frozen=True, eq=False)

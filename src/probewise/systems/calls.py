@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, nearly_equal
 from probewise.errors import FileError, ShapeError, message_of, require
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
@@ -26,7 +26,6 @@ from probewise.systems.simulator import Columns, Simulate, Simulator, Values, re
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
 _NODES = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))  # in its range
 _MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
-_SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 _WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
     "output operand": "k = k * x in place of k *= x: an array changed in place keeps its shape",
     "converted to Python scalar": "np.sin(x) in place of math.sin(x), and so on: states and columns are arrays",
@@ -148,7 +147,7 @@ class Caller:
     def _returns(self, readings: FloatArray, samples: Values, columns: Columns) -> bool:
         """Return whether a call for samples returns these readings; False if it raises an error."""
         try:
-            return _nearly_equal(self(samples, columns, strict=True), readings)
+            return nearly_equal(self(samples, columns, strict=True), readings)
         except Exception:
             return False
 
@@ -160,7 +159,7 @@ class Caller:
         require(sound.any(), self.name, found, allowed)
         at = int(np.argmax(sound))
         again = Caller(self.simulate, self.broadcasts, self.by_row, name=self.name)
-        same = _nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]])
+        same = nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]])
         no_state = "no random numbers (declare the noise instead), no state kept between calls"
         found = "different when it is called again with the same parameters"
         require(same, self.name, found, f"the same readings each time: {no_state}")
@@ -375,15 +374,6 @@ def _values_of_sample(
     """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
     own, table = (take_samples(each, slice(k, k + 1)) for each in (parameters, columns))
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
-
-
-def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
-    if first.shape != second.shape or not np.array_equal(np.isfinite(first), np.isfinite(second)):
-        return False
-    there = np.isfinite(first)
-    return bool(
-        np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0)))
-    )
 
 
 def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:

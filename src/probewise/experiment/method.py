@@ -82,12 +82,13 @@ class SequentialMonteCarlo:
         probability, can_sleep = previous.probability, can_sleep_mask(previous)
         each_s = [Pace.from_times(times).each_s for times in (recording.plan.time_s[:-1], recording.plan.time_s)]
         for k, (kind, own, problem) in enumerate(zip(previous.kinds, previous.particles, problems, strict=True)):
+            perfect = problem.perfect_log_likelihood
             if can_sleep[k]:
-                updated[k] = own.asleep_with(problem.perfect_log_likelihood)
+                found = own.asleep_with(perfect)
             else:
                 effort = BRIEF if kind.left_out and probability[k] < unsuspected else usual
                 found = update(kind.at_pace(own, *each_s), problem, rng=rng, effort=effort)
-                updated[k] = replace(found, lost_log_z=own.lost_log_z + problem.perfect_log_likelihood)
+            updated[k] = replace(found, lost_log_z=own.lost_log_z + perfect)
         now = replace(previous, particles=tuple(updated))
         now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():

@@ -162,9 +162,7 @@ class Particles:
 
     def asleep_with(self, log_likelihood: float) -> Self:
         """Return the samples as they are, with the evidence as if they all gave a reading this log likelihood."""
-        lost = self.lost_log_z + log_likelihood
-        had = replace(self.weighted, log_z=self.log_z + log_likelihood)
-        return replace(self, weighted=had, lost_log_z=lost, asleep=True)
+        return replace(self, weighted=replace(self.weighted, log_z=self.log_z + log_likelihood), asleep=True)
 
     def searched(self, log_z: float) -> Self:
         """Return the samples as those of a search of the prior that has found this log evidence."""

@@ -45,9 +45,10 @@ class Stopped(KeyboardInterrupt):
 def stoppable() -> Iterator[None]:
     """Let signals interrupt the block, unless they are ignored, as under `nohup`; any exception then is `Stopped`."""
     _asked.clear()
+    before = sys.unraisablehook
     with _signals_handled_by(_stop):
         try:
-            before, sys.unraisablehook = sys.unraisablehook, _raise_again
+            sys.unraisablehook = _raise_again
             yield
         except BaseException as error:
             if (stopped := _stopped_behind(error)) is None or stopped is error:

@@ -38,7 +38,7 @@ def problem_for(recording: Recording, prior: SSFPrior) -> SensorProblem:
     """
     plan = recording.plan
     chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
-    return SensorProblem(prior, chain, student_t_of(recording, plan.scan), recording)
+    return SensorProblem(prior, chain, student_t_of(recording), recording)
 
 
 def estimate_ssf(

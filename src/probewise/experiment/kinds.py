@@ -150,24 +150,32 @@ def kinds_of(
     kinds = []
     for part in _member_shapes(shape, sensor_prior, prior):
         whole = _prior_and_model_with_estimated_effects(part.prior, chain, quick) if trust < 1 else (part.prior, quick)
-        made: list[tuple[str, float, Prior, SensorModel, Likelihood, DescribedEffect | None]]
-        made = [("", trust, *whole, likelihood, None)]
+        kinds.append(_kind(part, "", trust, *whole, likelihood))
         for rival in rivals:
             share = (1.0 - trust) / (len(ways) * ways[rival.name])
             if rival.effect is None:
-                made.append((rival.name, share, part.prior, quick, rival.likelihood or likelihood, None))
+                kinds.append(_kind(part, rival.name, share, part.prior, quick, rival.likelihood or likelihood))
                 continue
             assert isinstance(chain, Chain)
             both = Joint((part.prior, _PrefixedPrior(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
-            made.append((rival.name, share, both, TabulatedChain.of(acting, quick) or acting, likelihood, rival.effect))
-        kinds += [
-            HypothesisKind(
-                part, name, math.log(part.share) + math.log(p), prior, part.restrict_model(model), law, effect
-            )
-            for name, p, prior, model, law, effect in made
-        ]
+            model = TabulatedChain.of(acting, quick) or acting
+            kinds.append(_kind(part, rival.name, share, both, model, likelihood, rival.effect))
     return tuple(kinds)
+
+
+def _kind(
+    member: _MemberShape,
+    left_out: str,
+    share: float,
+    prior: Prior,
+    model: SensorModel,
+    likelihood: Likelihood,
+    effect: DescribedEffect | None = None,
+) -> HypothesisKind:
+    """Build a kind of a shape, with its `share` of the shape's probability and a model of all parameters."""
+    log_prior = math.log(member.share) + math.log(share)
+    return HypothesisKind(member, left_out, log_prior, prior, member.restrict_model(model), likelihood, effect)
 
 
 def _prior_and_model_with_estimated_effects(

@@ -17,7 +17,7 @@ from probewise.scene import (
     disc_region,
     region_of,
 )
-from probewise.sensor import FAST_NODES
+from probewise.sensor import FAST_NODES, gaussian
 from probewise.sensor._normal import normal_cdf
 
 PATTERNS = {
@@ -158,6 +158,18 @@ def test_an_image_of_pixels_is_the_sum_of_its_squares(rho):
         square = low + 2.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         wanted += albedo * see(PolygonRegion.from_vertices(square[None]), 3.0, -2.0, cov)
     assert see(image, 3.0, -2.0, cov) == pytest.approx(wanted, abs=1e-8)
+
+
+def test_over_an_image_many_gaussians_are_done_together_by_a_rule_computed_once(monkeypatch):
+    """A diagnosis asks for half a million; one by one, each with its own rule, they took most of its time."""
+    sizes = []
+    monkeypatch.setattr(gaussian, "normal_cdf", lambda z: (sizes.append(z.size), normal_cdf(z))[1])
+    image, places = region_of(PATTERNS["image"]), np.linspace(-20, 20, 2000).reshape(40, 50, 1)
+    for _ in range(2):
+        mean_albedo_under_gaussians(image, places, 0.0, 9.0, 9.0, 0.0)
+        monkeypatch.setattr(np.polynomial.legendre, "leggauss", lambda n: pytest.fail("a rule is computed again"))
+    assert len(sizes) < 2 * places.size / 5
+    assert max(sizes) < 100_000  # more would not stay in the cache
 
 
 @pytest.fixture(params=PATTERNS, name="pattern")

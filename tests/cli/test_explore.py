@@ -178,11 +178,13 @@ def test_the_papers_robot_leaves_what_the_other_leaves_and_its_journal_names_it(
 
 def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    given = ["explore", "--out", str(out), "--trust", "1", "--quiet", "--max-readings"]
-    assert main([*given, "2"]) == 0
+    given = ["explore", "--out", str(out), "--trust", "1", "--max-readings"]
+    assert main([*given, "2", "--quiet"]) == 0
     assert json.loads((out / "journal.jsonl").read_text().splitlines()[0])["sensor_file"] == "shipped_sensor.json"
     monkeypatch.setattr("probewise.cli._explore.calibrate", lambda *_, **__: pytest.fail("calibrated again"))
+    monkeypatch.setattr("probewise._progress._PATIENCE_S", 0.0)
     assert main([*given, "3", "--resume"]) == 0
+    assert "going through the journal, 0 of 2" in capsys.readouterr().err.splitlines()[0]
     assert json.loads((out / "result.json").read_text())["readings"] == 3
     assert main(["explore", "--out", str(tmp_path / "other"), "--arm", "nxt:none"]) == 2
     assert "--sensor is 'none'" in capsys.readouterr().err

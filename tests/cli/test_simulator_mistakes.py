@@ -53,6 +53,7 @@ FILES = {
     "a range that ends at no number": (('"sd": 0.05', '"range": (0, "5")'), "noise[\"range\"] is (0, '5')"),
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "line 9: is no Python"),
     "100,000 pluses": (("noise =", f"sum = 1{100000 * '+1'}\nnoise ="), "too long or too deeply nested"),
+    "8,000 minus signs": (("noise =", f"sign = {8000 * '-'}1\nnoise ="), "too long or too deeply nested"),
     "an end": (("noise =", "raise BaseException('over')\nnoise ="), "line 7: stops with BaseException: over"),
     "an exit": (("noise =", "raise GeneratorExit\nnoise ="), "line 7: stops with GeneratorExit; allowed"),
     "an error that cannot be shown": (("noise =", f"{MUTE}raise Mute\nnoise ="), "its message raises ValueError"),

@@ -494,6 +494,7 @@ def test_the_only_place_within_reach_is_read_while_it_tells_something(small):
     assert result.steps[0].map.highest_utility > result.steps[2].map.highest_utility > 0
 
 
+@np.errstate(all="raise")  # which is the caller's, and ends no run
 def test_a_run_stops_when_the_only_place_within_reach_has_told_all_and_is_refused_where_it_tells_nothing(small):
     """A sensor that says yes or no, and has said it; and no circle of the prior near that place."""
     arm = small.arm(sensor=small.sensor(0.0), reach_mm=30.0)

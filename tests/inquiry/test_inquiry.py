@@ -65,6 +65,7 @@ def test_a_surprising_reading_starts_nested_sampling_anew():
     assert found.evidence[0] == pytest.approx(log_z, abs=5 * found.evidence[1] + 0.05)
 
 
+@np.errstate(all="raise")  # which is the caller's, and ends no run
 def test_the_first_reading_of_a_line_is_taken_where_the_predictions_differ_most():
     asked = inquiry()
     bits = 0.5 * np.log2(1 + (4.0 + PLACES**2) / 0.09)

@@ -241,7 +241,9 @@ def test_a_problem_without_parameters_is_its_likelihood(rng: np.random.Generator
     assert "log Z" in result.summary()
 
 
-@pytest.mark.parametrize("options", [{"n_live": 5}, {"n_replaced": 30, "n_live": 50}, {"max_calls": 10, "n_live": 50}])
+@pytest.mark.parametrize(
+    "options", [{"n_live": 5}, {"n_live": 10**9}, {"n_replaced": 30, "n_live": 50}, {"max_calls": 10, "n_live": 50}]
+)
 def test_options_out_of_range_are_named(options: dict[str, int], rng: np.random.Generator) -> None:
     with pytest.raises(ParameterError, match="allowed"):
         run(problems.plateau(), rng=rng, **options)

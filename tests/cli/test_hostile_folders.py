@@ -183,7 +183,8 @@ def test_a_pipe_and_a_device_are_written_to_a_link_is_followed_and_a_folder_is_r
     assert stat.S_ISCHR((tmp_path / "null").stat().st_mode)
 
 
-def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_any_new_file(tmp_path):
+def test_a_file_keeps_its_permissions_and_a_new_one_has_those_of_any_new_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "umask", lambda mode: pytest.fail("other threads would write with it"))
     (tmp_path / "ordinary").touch()
     write_bytes_atomically(tmp_path / "new", b"1")
     assert (tmp_path / "new").stat().st_mode == (tmp_path / "ordinary").stat().st_mode

@@ -91,6 +91,7 @@ def test_every_verb_explains_itself(verb, capsys):
     said = capsys.readouterr().out
     assert said.startswith(f"usage: probewise {verb}")
     assert ("--out" in said) == (verb not in ("arm", "emulate-nxt"))  # these write nothing by themselves
+    assert ("run only those that you trust" in " ".join(said.split())) == ("FILE.py" in said)
 
 
 @pytest.mark.slow

@@ -60,7 +60,6 @@ def run(arguments: argparse.Namespace) -> int:
         )
     return finish(
         drawings,
-        *(f"note: {note}" for note in fitted.recording.notes),
         *renamed,
         f"{fitted.summary()}\nseed {arguments.seed}; written to {drawings.out}",
         quiet=arguments.quiet,

@@ -417,7 +417,8 @@ def _proposals_to_refit(
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
-        return [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
+        alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
+        return [*alone, *_proposals_under_simplest_noise(state, null)]
     best = _largest_scores_about_null(state) if size == 2 else {}
     scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
     chosen = promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS)
@@ -501,6 +502,25 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     always = state.tried_always | faint | twice
     chosen = promising_combinations(state, scores, width=_SINGLES, behind=_REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
+
+
+def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
+    """Propose the effects that lead about the given null refitted under the simplest noise.
+
+    Noise with memory absorbs an effect where it leads, and the null that was fitted under it may be far from where the
+    effect acts: beside a random walk, a tank that runs over need not be full. Otherwise there are no proposals.
+    """
+    if state.refits.sensor is None or not state.refits.likeliest_law(null).has_memory:
+        return []
+    plain = state.refits.null_under_simplest_noise(null)
+    scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
+    odds = {
+        name: log_mean_exp(own) + state.prior.log_prior_on_mean((name,)) - state.prior.log_prior_on_mean(())
+        for name, own in scores.items()
+        if name_of_first_copy(name) is None
+    }
+    least = max(0.0, max(odds.values(), default=0.0) - _REFITTED_WITHIN)
+    return [Proposal(value, plain, name) for name, value in odds.items() if value > least]
 
 
 def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:

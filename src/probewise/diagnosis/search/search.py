@@ -73,6 +73,7 @@ from probewise.progress import Progress, silent
 # effects that screening did not favour were lost.
 _REFITTED_WITHIN = 6.0
 _SINGLES = 6  # effects that are refitted alone; a bound on cost
+_HIDDEN = 3  # effects that noise with memory may hide, refitted beside these; a bound on cost
 _BEAM = 8  # combinations that are refitted at each size above one
 # Shares of a limited budget of refits that single effects, and then pairs, may use up: without a part kept for them,
 # pairs would never be refitted.
@@ -519,8 +520,8 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
         for name, own in scores.items()
         if name_of_first_copy(name) is None
     }
-    least = max(0.0, max(odds.values(), default=0.0) - _REFITTED_WITHIN)
-    return [Proposal(value, plain, name) for name, value in odds.items() if value > least]
+    ranked = sorted(odds, key=lambda name: -odds[name])[:_HIDDEN]
+    return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > 0]
 
 
 def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -414,6 +414,13 @@ class Refits:
             text = "the model predicts readings that are not finite; check the model and its prior"
             raise NotConvergedError(text, found)
         return found
+
+    def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit:
+        """Refit the given null under the simplest noise: with no noise effects but those beyond doubt."""
+        law = null.evidence[self.noises.certain].likeliest_law
+        starts = np.stack([null.found.z, *cast(Null, self.sensor).starts])
+        found = self._fit_from_best_start(null.found.model, starts, law, 30)
+        return WeighedFit(found, law, self.noises.evidence_by_noise(found), 0.0, 0.0, {})
 
     def refit_with_effect(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).

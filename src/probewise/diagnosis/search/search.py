@@ -73,6 +73,7 @@ from probewise.progress import Progress, silent
 # effects that screening did not favour were lost.
 _REFITTED_WITHIN = 6.0
 _SINGLES = 6  # effects that are refitted alone; a bound on cost
+_HIDDEN = 3  # effects that noise with memory may hide, refitted beside these; a bound on cost
 _BEAM = 8  # combinations that are refitted at each size above one
 # Shares of a limited budget of refits that single effects, and then pairs, may use up: without a part kept for them,
 # pairs would never be refitted.
@@ -417,7 +418,8 @@ def _proposals_to_refit(
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
-        return [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
+        alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
+        return [*alone, *_proposals_under_simplest_noise(state, null)]
     best = _largest_scores_about_null(state) if size == 2 else {}
     scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
     chosen = promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS)
@@ -501,6 +503,25 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     always = state.tried_always | faint | twice
     chosen = promising_combinations(state, scores, width=_SINGLES, behind=_REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
+
+
+def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
+    """Propose the effects that lead about the given null refitted under the simplest noise.
+
+    Noise with memory absorbs an effect where it leads, and the null that was fitted under it may be far from where the
+    effect acts: beside a random walk, a tank that runs over need not be full. Otherwise there are no proposals.
+    """
+    if state.refits.sensor is None or not state.refits.likeliest_law(null).has_memory:
+        return []
+    plain = state.refits.null_under_simplest_noise(null)
+    scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
+    odds = {
+        name: log_mean_exp(own) + state.prior.log_prior_on_mean((name,)) - state.prior.log_prior_on_mean(())
+        for name, own in scores.items()
+        if name_of_first_copy(name) is None
+    }
+    ranked = sorted(odds, key=lambda name: -odds[name])[:_HIDDEN]
+    return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > 0]
 
 
 def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:

@@ -1,13 +1,15 @@
-"""Display of results in a notebook; the packages that define the results need not import plotting.
+"""How results show themselves: text, HTML in a notebook, a picture, a page; tables as data frames.
 
-A result's class derives from `ShowsItself`; `report.notebook`, higher in the layers, registers its renderer. It is
-found by its name when a result is first displayed, since it loads plotting.
+A result's class derives from `ShowsItself`, of a verb's result from `Reported`. What draws and writes it is registered
+in `report`, higher in the layers, and loaded by name when it is first needed: it loads plotting.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 
@@ -46,6 +48,13 @@ class ShowsItself:
         first_line = " ".join(said.partition("\n")[0].split())
         return said if said.startswith("<") else f"<{type(self).__name__}: {first_line}>"
 
+    def plot(self) -> Any:
+        """Draw the result's main picture; return its matplotlib axes, or an array of them.
+
+        Raises ParameterError if a result of this kind has no picture.
+        """
+        return importlib.import_module("probewise.report.notebook").drawing_of(self)
+
     def _repr_html_(self) -> str:
         importlib.import_module("probewise.report.notebook")
         import numpy as np  # it is loaded by the time there is a result
@@ -55,3 +64,41 @@ class ShowsItself:
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         printer.text(str(self))
+
+
+class Reported(ShowsItself):
+    """Base of the results of verbs, which have a page."""
+
+    __slots__ = ()
+
+    def to_html(self, *, seed: int | None = None) -> str:
+        """Return the command's report.html: one page with its figures inside; it states the `seed` if given."""
+        return str(importlib.import_module("probewise.report.saving").page_of(self, seed=seed))
+
+    def save(self, folder: str | Path, *, seed: int | None = None) -> Path:
+        """Write the files that the command writes with `--out`, figures and report.html too; return the folder.
+
+        The folder is made if missing; files of the same names are replaced, all or none. With the `seed` of the
+        result's random generator the files are those of the command; without it the report states none.
+
+        Raises
+        ------
+        ParameterError
+            If a file is in the way, or the folder holds results of another verb.
+        FileError
+            If the folder cannot be written to.
+        NotDrawnError
+            If a figure could not be drawn; everything else is complete.
+        """
+        return Path(importlib.import_module("probewise.report.saving").save(self, folder, seed=seed))
+
+
+def data_frame(columns: Mapping[str, Any]) -> Any:
+    """Return columns by name as a pandas DataFrame; ParameterError without pandas."""
+    from probewise.errors import ParameterError
+
+    try:
+        pandas = importlib.import_module("pandas")
+    except ImportError as error:
+        raise ParameterError("to_frame", "no pandas", "an environment with it: pip install pandas") from error
+    return pandas.DataFrame(dict(columns))

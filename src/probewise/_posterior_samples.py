@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, read_only_floats, require_finite
-from probewise._display import ShowsItself
+from probewise._display import ShowsItself, data_frame
 from probewise._kinds import checked_texts
 from probewise.errors import ShapeError, require
 
@@ -57,6 +57,11 @@ class NamedSamples(ShowsItself):
             require(fits, "absent", name, f"effects of the model, each with {n} truth values")
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "noise_sd", noise_sd)
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame: a row per sample, a column per parameter, then `noise_sd`."""
+        columns = {name: self.samples[:, k] for k, name in enumerate(self.names)}
+        return data_frame({**columns, "noise_sd": self.noise_sd})
 
     def mean(self) -> dict[str, float]:
         """Return the posterior mean by name of the parameter."""

@@ -209,8 +209,9 @@ class StagedFiles:
         return self.folder / name
 
     def write(self, name: str, content: str | bytes) -> None:
-        """Write a file into the directory: bytes, or a text in UTF-8."""
+        """Write a file into the directory, or a folder of it: bytes, or a text in UTF-8."""
         content = content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content
+        (self / name).parent.mkdir(exist_ok=True)
         write_bytes_atomically(self / name, content)
 
     def write_json(self, name: str, document: object) -> None:

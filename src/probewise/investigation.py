@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from probewise._arrays import own_arithmetic
-from probewise._display import ShowsItself
+from probewise._display import Reported
 from probewise._kinds import checked_number, checked_whole, require_accepts, require_kind, require_rng
 from probewise.arm import Reading, readings_of_recording, recording_of_readings
 from probewise.diagnosis import SETTLED, Diagnosis, SensorPrior, diagnose
@@ -184,7 +184,7 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
-class Investigation(ShowsItself):
+class Investigation(Reported):
     """All rounds of an investigation, in order."""
 
     rounds: tuple[Round, ...]

@@ -348,7 +348,7 @@ def explore(
                 continue
             believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
             told(f"reading {step.number} of at most {max_readings}", note=believed)
-        return experiment.Exploration(asked, tuple(steps), hidden)
+        return experiment.Exploration(asked, tuple(steps), hidden, sensor)
 
 
 def naive_levels(sensor: FittedSensor, levels: Recording | None, *, rng: np.random.Generator) -> Naive:
@@ -455,8 +455,7 @@ def diagnose(
         An earlier calibration, whose posterior becomes the prior.
     thorough
         Recompute the evidence of the leading hypotheses by nested sampling. It replaces Laplace's approximation if the
-        two differ by more than a nat plus the standard error, and no run gave a warning. The progress bar estimates the
-        minutes; they grow with the numbers of readings and of leading hypotheses.
+        two differ by more than a nat plus the standard error, and no run gave a warning.
 
     Raises
     ------

@@ -1,13 +1,28 @@
-"""Results show themselves in a notebook, with a picture."""
+"""Results show themselves in a notebook, with a picture; they are saved as their commands save them."""
+
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
+import probewise
 from probewise._display import ShowsItself, render_html
+from probewise.cli import main
+from probewise.errors import ParameterError
 from probewise.nested import run
 from probewise.priors import Product, Uniform
-from probewise.recordings import Recording, paper_plan
+from probewise.recordings import Recording, paper_plan, shipped, write_recording
 from probewise.sensor import SSFField
+from probewise.systems import read_simulator, read_table_for
+
+SIMULATOR = """reading, unit, time, run = "y", "V", "t_s", "run"
+parameters = {"a": (0, 20)}
+def simulate(p, data):
+    return p["a"] / (1 + data["t_s"])
+"""
+ROWS = [f"{t},{run},{8 / (1 + t) + 0.1 * (t % 3 - 1)}" for run in ("1.1", "1.10") for t in range(6)]
 
 
 class Bell:
@@ -38,3 +53,47 @@ def test_a_value_without_a_renderer_shows_its_escaped_summary():
     assert Plain()._repr_html_() == "<pre>a &lt; b\nand more</pre>"
     assert repr(Plain()) == "<Plain: a < b>"
     assert render_html(3) == "<pre>3</pre>"
+
+
+def test_what_has_no_picture_says_so():
+    with pytest.raises(ParameterError, match="one with a picture"):
+        ShowsItself().plot()
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose", "audit", "fit"])
+def test_a_result_is_saved_as_its_command_saves_it(verb, tmp_path):
+    write_recording(probewise.read_recording(shipped("paper")).take(np.arange(0, 408, 21)), tmp_path / "few.csv")
+    (tmp_path / "sim.py").write_text(SIMULATOR)
+    (tmp_path / "data.csv").write_text("\n".join(["t_s,run,y", *ROWS, ""]))
+    words = {"calibrate": ["--orders", "1", "--live", "20"], "fit": ["--simulator", str(tmp_path / "sim.py")]}
+    recorded = str(tmp_path / ("data.csv" if verb == "fit" else "few.csv"))
+    seed = [] if verb == "audit" else ["--seed", "7"]
+    assert main([verb, recorded, *words.get(verb, []), *seed, "--quiet", "--out", str(tmp_path / "cli")]) == 0
+
+    rng = {} if verb == "audit" else {"rng": np.random.default_rng(7)}
+    if verb == "fit":
+        simulator = read_simulator(tmp_path / "sim.py")
+        found = probewise.fit(read_table_for(simulator, recorded), simulator=simulator, progress=False, **rng)
+    else:
+        more = {"orders": [1], "n_live": 20} if verb == "calibrate" else {}
+        found = getattr(probewise, verb)(probewise.read_recording(recorded), progress=False, **rng, **more)
+    out = found.save(tmp_path / "saved", seed=7)
+    files = {path.name: path.read_bytes() for path in (tmp_path / "cli").iterdir()}
+    assert {path.name for path in out.iterdir()} == set(files)
+    for name in set(files) - {"report.html", "fit.json", "fitted.json"}:  # these name the source
+        assert (out / name).read_bytes() == files[name], name
+    assert "data:image/" in found.to_html()
+    assert all(isinstance(ax, Axes | None) for ax in np.ravel(found.plot()))
+
+
+def test_tables_come_out_as_data_frames(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=dict))
+    recording = Recording(paper_plan(), np.linspace(10, 60, 408))
+    again = Recording.from_table(recording.to_frame(), patterns=recording.plan.patterns, unit="LEGO", min=0, max=100)
+    assert again.plan.scan_names == recording.plan.scan_names
+    np.testing.assert_array_equal(again.plan.x_mm, recording.plan.x_mm)
+    found = run(Bell(), rng=np.random.default_rng(0), n_live=50).to_frame()
+    assert list(found) == ["weight", "log_likelihood", "x_mm", "y_mm"]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ParameterError, match="pip install pandas"):
+        recording.to_frame()

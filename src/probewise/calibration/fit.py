@@ -14,7 +14,7 @@ from pathlib import PurePath
 import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic
-from probewise._display import ShowsItself
+from probewise._display import Reported
 from probewise._kinds import checked_whole, require_flag, require_like, require_rng
 from probewise.calibration.fields import (
     choose_pixel_mm,
@@ -70,7 +70,7 @@ class OrderFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration(ShowsItself):
+class Calibration(Reported):
     """The fits of all orders that were tried; the evidence chooses one."""
 
     recording: Recording

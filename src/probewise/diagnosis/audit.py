@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, own_arithmetic, read_only_floats
-from probewise._display import ShowsItself
+from probewise._display import Reported
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.advice import LAMBDA, LEAST_SHARE, classes_of
@@ -237,7 +237,7 @@ class Cure(Command):
 
 
 @dataclass(frozen=True, eq=False)
-class PlanAudit(ShowsItself):
+class PlanAudit(Reported):
     """Audit of a plan: which effects its readings detect and tell apart, and scans to add for the others.
 
     `assumed`: the assumed sensor, in words; `effects`, `after`: every effect, under the plan and under the plan with

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic, read_only_floats
-from probewise._display import ShowsItself
+from probewise._display import Reported
 from probewise._kinds import checked_texts, require_kind, require_like, require_one_of, require_progress, require_rng
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
 from probewise.diagnosis.apparatus import Apparatus
@@ -191,7 +191,7 @@ def _place_in_everything(place: Place, prepared: Prepared) -> Place:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Diagnosis(Judged, ShowsItself):
+class Diagnosis(Judged, Reported):
     """The result of a diagnosis, which is the verdict and more: all of diagnosis.json, and the arrays for its figures.
 
     `recording` is what was diagnosed (several are joined). `reason`: the verdict and its reason, in a sentence or two.

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise import nested
 from probewise._arrays import FloatArray, own_arithmetic
-from probewise._display import ShowsItself
+from probewise._display import Reported
 from probewise._kinds import require_kind, require_progress, require_rng
 from probewise.diagnosis.diagnose_simulator import notes_on_declared_noise, prepare_system
 from probewise.diagnosis.diagnosis import Diagnosis
@@ -110,7 +110,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, eq=False)
-class SystemFit(ShowsItself):
+class SystemFit(Reported):
     """A simulator fitted to a table: posterior, evidence and predictions.
 
     `predicted`, `sd`: mean and sd of every row's posterior predictive distribution, (n_points,), in the unit of the

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._display import ShowsItself
+from probewise._display import Reported, ShowsItself
 from probewise._kinds import require_kind
 from probewise._words import count_with_noun
 from probewise.arm.instrument import Pose, Reading
@@ -149,12 +149,13 @@ def stop_reason_with_checks(steps: Sequence[Step]) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Exploration(ShowsItself):
-    """A whole run: its configuration and its steps; `hidden` is the true shape, if it is known."""
+class Exploration(Reported):
+    """A whole run: its configuration and its steps; the true shape and the calibrated sensor, if they are known."""
 
     experiment: Experiment
     steps: tuple[Step, ...]
     hidden: HiddenShape | None = None
+    sensor: FittedSensor | None = None
 
     @property
     def arm_error(self) -> ArmError | None:

@@ -19,7 +19,7 @@ import scipy
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray, frozen_int, own_arithmetic, read_only_floats
-from probewise._display import ShowsItself
+from probewise._display import ShowsItself, data_frame
 from probewise._kinds import checked_number, checked_path, checked_whole, require_rng
 from probewise._version import __version__
 from probewise._writing import write_bytes_atomically
@@ -60,6 +60,11 @@ class Samples(ShowsItself):
     def weight(self) -> FloatArray:
         """Posterior weights, summing to one, (n,)."""
         return np.asarray(np.exp(self.log_weight))
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame: a row per sample; columns `weight`, `log_likelihood` and one per parameter."""
+        columns = {name: self.theta[:, k] for k, name in enumerate(self.names)}
+        return data_frame({"weight": self.weight, "log_likelihood": self.log_likelihood, **columns})
 
     @own_arithmetic
     def draw_rows(self, n: int, *, rng: np.random.Generator) -> IntArray:

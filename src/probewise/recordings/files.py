@@ -91,6 +91,13 @@ def write_plan(plan: Plan, path: PathLike) -> None:
     _write_with_json(plan, checked_path("path", path), plan_columns(plan))
 
 
+def plan_values(plan: Plan) -> dict[str, Sequence[str] | list[float]]:
+    """Return the columns of a plan's CSV file as numbers, names as texts; ParameterError as `plan_columns`."""
+    cells = plan_columns(plan)
+    names = ("scan", "pattern")
+    return {name: own if name in names else [float(cell or "nan") for cell in own] for name, own in cells.items()}
+
+
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     """Format the rows of a plan as cells by column of its CSV file, in full precision; ParameterError if it cannot."""
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):

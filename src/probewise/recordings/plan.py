@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from probewise._arrays import (
     require_finite,
     rounding_error,
 )
-from probewise._display import ShowsItself
+from probewise._display import ShowsItself, data_frame
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError, require
@@ -312,6 +312,12 @@ class Recording(ShowsItself):
 
     def _require_plan(self) -> None:
         require_plan(self.plan)
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame with the columns of the recording's CSV file, a row per reading."""
+        from probewise.recordings.files import plan_values
+
+        return data_frame({**plan_values(self.plan), "reading": self.readings})
 
     @property
     def relative_sd(self) -> FloatArray:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, read_only_floats, require_finite
-from probewise._display import ShowsItself
+from probewise._display import ShowsItself, data_frame
 from probewise._kinds import checked_path
 from probewise._writing import write_text_atomically
 from probewise.errors import FileError, ParameterError, ShapeError
-from probewise.recordings.files import plan_columns
+from probewise.recordings.files import plan_columns, plan_values
 from probewise.recordings.plan import Plan
 from probewise.recordings.table import csv_text, number_text, read_table
 
@@ -50,6 +51,11 @@ class Prediction(ShowsItself):
 
     def __len__(self) -> int:
         return len(self.plan)
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame with the columns of the prediction's CSV file, a row per reading."""
+        predicted = {name: getattr(self, name) for name in ("mean", "sd", "log_density")}
+        return data_frame({**plan_values(self.plan), **predicted})
 
     def summary(self) -> str:
         """Summarise: number of predictions; for recorded readings, chi-square and log density per reading."""

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._words import count_with_noun, unit_after_number
 from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
-from probewise.report.html import Markup, Section, figures, notes_in_words, page, table
+from probewise.report.html import Markup, Section, figures, notes_in_words, page, seed_fact, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.readings import (
     predicted_and_recorded_by_scan,
@@ -128,7 +128,7 @@ def _printed_unit(unit: str) -> str:
 
 
 def sections(
-    sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
+    sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int | None
 ) -> list[Section]:
     """Build the sections of a calibration's page, below the first screen; `drawn` is from `figure_drawers`."""
     ok, shown = recording.usable, figures(drawn, _CAPTIONS)
@@ -146,7 +146,7 @@ def sections(
     run = {
         "recording": PurePath(sensor.source).name or "unnamed",
         "its fingerprint": sensor.fingerprint,
-        "seed": str(seed),
+        **seed_fact(seed),
         "version": f"probewise {sensor.version}",
     }
     of_ssf = ((words_without_unit(q.name), q.unit, q.median, q.interval95) for q in sensor.ssf_quantities())
@@ -162,7 +162,12 @@ def sections(
 
 
 def page_html(
-    calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
+    calibration: Calibration,
+    recording: Recording,
+    prediction: Prediction,
+    drawn: Mapping[str, bytes],
+    *,
+    seed: int | None,
 ) -> str:
     """Return the HTML of a calibration's page; `drawn` is from `figure_drawers`."""
     return page(

@@ -86,12 +86,17 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Sect
 
 
 def page_html(
-    diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
+    diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int | None, audit: PlanAudit | None = None
 ) -> str:
     """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`, `audit` that of its plan, if any."""
     n_used = int(diagnosis.recording.usable[rows_to_diagnose(diagnosis.recording)].sum())
     readings = f"{n_used} used of {len(diagnosis.recording)}"
-    facts = {"recordings": source, "readings": readings, "seed": str(seed), **dict(diagnosis.apparatus.words.facts)}
+    facts = {
+        "recordings": source,
+        "readings": readings,
+        **html.seed_fact(seed),
+        **dict(diagnosis.apparatus.words.facts),
+    }
     notes = html.notes_in_words((*diagnosis.recording.notes, *notes_on_calls(diagnosis)))
     design = () if audit is None else (html.Section("What these readings could have shown", _audit_elements(audit)),)
     shown = html.figure(drawn["first.svg"], _first_figure_caption(diagnosis))

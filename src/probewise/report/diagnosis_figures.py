@@ -39,7 +39,7 @@ def figure_drawers(diagnosis: Diagnosis) -> dict[str, Callable[[], bytes]]:
     """List a diagnosis's figures by file name, as functions that draw SVGs."""
     chance = cache(partial(ResidualNoise, diagnosis))
     drawers: dict[str, Callable[[], bytes]] = {
-        "first.svg": lambda: _first_figure_svg(chance()),
+        "first.svg": lambda: svg(draw_first_figure(chance())),
         "before_after.svg": lambda: svg(before_and_after(diagnosis)),
         "residuals.svg": lambda: _all_residuals_svg(diagnosis),
         "noise.svg": lambda: _noise_tests_svg(chance()),
@@ -73,14 +73,18 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
     return (chance or ResidualNoise(diagnosis)).first_view()
 
 
-def _first_figure_svg(chance: ResidualNoise) -> bytes:
-    """Draw the first figure's content (`first_figure_content`) and, below it, the probability of each explanation."""
+def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
+    """Draw the first figure's content (`first_figure_content`) and, below it, the probability of each explanation.
+
+    Return both axes, (2,).
+    """
     diagnosis = chance.diagnosis
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names, most = [hypothesis_in_words(h.effects) for h in listed], min(len(listed), _MOST_BARS)
     n_bars = most + (len(diagnosis.hypotheses) > most)
     lines = n_further_lines(names[:_MOST_BARS], width_in=_FIGURE_IN)
-    above, below = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3) + 0.16 * lines], width_in=_FIGURE_IN)
+    axes = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3) + 0.16 * lines], width_in=_FIGURE_IN)
+    above, below = axes
     shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
         plots.readings_in_order(diagnosis.recording, ax=above)
@@ -92,7 +96,7 @@ def _first_figure_svg(chance: ResidualNoise) -> bytes:
     names += [""] * (len(diagnosis.hypotheses) - len(listed))
     probabilities = [h.probability for h in (*listed, *diagnosis.hypotheses[len(listed) :])]
     hypothesis_probabilities(names, probabilities, most=most, ax=below)
-    return svg(above)
+    return axes
 
 
 def _place_svg(chance: Callable[[], ResidualNoise], place: Place) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -81,10 +82,37 @@ def robot_view_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
+    drawn = _view_in_frame(step, experiment, readings, levels=levels, truth_mm=truth_mm)
+    return png(drawn, dpi=90, tight=False)
+
+
+def _view_in_frame(
+    step: Step, experiment: Experiment, readings: Sequence[tuple[float, float, float]], **at: Any
+) -> Axes:
     ax = axes_of_frame((8.4, 4.7), (0.75, 1.1, 1.15, 0.35))
-    draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
+    draw_robot_view(step, experiment, readings, ax=ax, **at)
     draw_field_legend(ax)
-    return png(ax, dpi=90, tight=False)
+    return ax
+
+
+def draw_last_view(run: Exploration) -> Axes:
+    """Draw the robot's view at the end of a run, with its legend; return the axes."""
+    return _view_in_frame(run.last, run.experiment, **_seen(run))
+
+
+def frame_png(run: Exploration, number: int) -> bytes:
+    """Draw the robot's view after the reading of this number, from 1; return a PNG."""
+    return robot_view_png(run.steps[number - 1], run.experiment, **_seen(run, number))
+
+
+def _seen(run: Exploration, number: int | None = None) -> dict[str, Any]:
+    """Return the first readings of a run, their lowest and highest level, and the true outline if it is known."""
+    readings, values = run.readings[:number], [r.value for r in run.readings]
+    return {
+        "readings": [(r.pose.x_mm, r.pose.y_mm, r.value) for r in readings],
+        "levels": (min(values), max(values)),
+        "truth_mm": None if run.hidden is None else run.hidden.outline_mm,
+    }
 
 
 def robot_views_by_model_png(
@@ -216,7 +244,7 @@ def page_html(
     run: Exploration,
     frames: Sequence[bytes],
     *,
-    seed: int,
+    seed: int | None,
     model: str,
     truth: Mapping[str, float] | None = None,
     beside: Mapping[str, Sequence[Step]] | None = None,
@@ -281,7 +309,7 @@ def page_html(
     )
 
 
-def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed: int) -> dict[str, str]:
+def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed: int | None) -> dict[str, str]:
     """Return what a run is and cost, in words, by name."""
     p_value = run.last.p_value
     fits = "not tested: the most probable noise is not the declared one"
@@ -299,5 +327,5 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
         **({"the paper's count": f"{paper} bits per reading (25 bits over the readings)"} if run.reached else {}),
         f"probability that a length is off by over {OFF_MM:g} mm": off,
         "fit of the best hypothesis": fits,
-        "seed": str(seed),
+        **html.seed_fact(seed),
     }

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, varies
 from probewise._words import unit_after_number
 from probewise.diagnosis import SystemFit
-from probewise.report.html import Section, definition_list, figure, notes_in_words, page, table
+from probewise.report.html import Section, definition_list, figure, notes_in_words, page, seed_fact, table
 from probewise.report.plots.canvas import svg
 from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
 from probewise.report.words import digits_of_range, typeset_numbers
@@ -60,7 +60,7 @@ def _labelled_covariates(fit: SystemFit) -> list[tuple[str, FloatArray]]:
     return [(time, plan.time_s), (level, fit.predicted), *varying[:_MOST_INPUTS]]
 
 
-def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
+def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int | None) -> str:
     """Return the HTML of a fit's page; `drawn` is from `figure_drawers`."""
     own, mode = fit.fitted, fit.fitted.mode()
     median, interval = np.median(own.samples, axis=0), own.interval()
@@ -76,7 +76,7 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
         "noise sd of a reading": f"{np.median(own.noise_sd):.4g} {unit_after_number(own.simulator.unit)}",
     }
     evidences = [typeset_numbers(each.in_words) for each in (fit.evidence, fit.nested) if each is not None]
-    facts = [*run.items(), *(("log evidence", said) for said in evidences), ("seed", str(seed))]
+    facts = [*run.items(), *(("log evidence", said) for said in evidences), *seed_fact(seed).items()]
     residuals = figure(drawn["residuals.svg"], "Recorded minus predicted reading, with running means.")
     return page(
         f"Fit of {own.source}",

@@ -96,6 +96,11 @@ Draw: TypeAlias = Callable[[str, Callable[[], bytes]], bytes]
 """Takes a figure's name and what draws it, and returns the figure; b"" if it could not be drawn."""
 
 
+def seed_fact(seed: int | None) -> dict[str, str]:
+    """Return the seed of a run as a row of its facts; none if it is not known."""
+    return {} if seed is None else {"seed": str(seed)}
+
+
 def draw_or_raise(name: str, drawer: Callable[[], bytes]) -> bytes:
     """Return what `drawer` returns; what it raises is raised."""
     return drawer()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from matplotlib.axes import Axes
+
 from probewise._words import count_with_noun
 from probewise.diagnosis import p_in_words
 from probewise.diagnosis.words import hypothesis_in_words
@@ -11,7 +13,7 @@ from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.headline import headline
-from probewise.report.html import Markup, Section, figure, page, table
+from probewise.report.html import Markup, Section, figure, page, seed_fact, table
 from probewise.report.plots.canvas import png
 from probewise.report.plots.probabilities import probabilities_by_round
 from probewise.report.words import probability_text, typeset_numbers
@@ -20,9 +22,14 @@ _MOST_TOLD = 4
 _LEAST_TOLD = 0.005
 
 
+def draw_probabilities_by_round(found: Investigation) -> Axes:
+    """Draw the probability of each explanation after each round; return the axes."""
+    return probabilities_by_round({_round_title(each): _probability_by_explanation(each) for each in found.rounds})
+
+
 def probabilities_png(found: Investigation) -> bytes:
     """Draw the probability of each explanation after each round; return a PNG."""
-    return png(probabilities_by_round({_round_title(each): _probability_by_explanation(each) for each in found.rounds}))
+    return png(draw_probabilities_by_round(found))
 
 
 def probabilities_figure_html(image: bytes) -> Markup:
@@ -41,7 +48,12 @@ def summary_sentence(found: Investigation) -> str:
 
 
 def page_html(
-    found: Investigation, drawn: Mapping[str, bytes], *, source: str, seed: int, concealed: Sequence[str] | None = None
+    found: Investigation,
+    drawn: Mapping[str, bytes],
+    *,
+    source: str,
+    seed: int | None,
+    concealed: Sequence[str] | None = None,
 ) -> str:
     """Return the HTML of an investigation's page; `drawn` has the last diagnosis's figures, and by_round.png.
 
@@ -50,7 +62,7 @@ def page_html(
     hidden = ", ".join(map(spoken_name, concealed or ())) or "nothing"
     bars, diagnosis = probabilities_figure_html(drawn["by_round.png"]), found.last.diagnosis
     n_readings, rounds = sum(len(each.recording) for each in found.rounds), count_with_noun(len(found.rounds), "round")
-    run = {"arm": source, "readings": f"{n_readings} in {rounds}", "seed": str(seed)}
+    run = {"arm": source, "readings": f"{n_readings} in {rounds}", **seed_fact(seed)}
     run |= {} if concealed is None else {"the world concealed": hidden}
     sections = [
         Section("How it came to that", (), tuple(_round_section(each) for each in found.rounds)),

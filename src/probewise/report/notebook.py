@@ -1,4 +1,4 @@
-"""HTML of results in notebooks, registered by type with `render_html`: a sentence, a picture, sometimes a table."""
+"""The main picture of each type of result, for `plot`, and its HTML in notebooks: a sentence, a picture, a table."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from probewise._words import count_with_noun, unit_of_name
 from probewise.calibration import Calibration, FittedSensor
 from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
 from probewise.diagnosis.words import effect_in_words, hypothesis_in_words
+from probewise.errors import ParameterError
 from probewise.experiment import Exploration, Step
 from probewise.investigation import Investigation
 from probewise.nested import NestedResult, Weighted
+from probewise.nested.result import Samples
 from probewise.recordings import Prediction, Recording
 from probewise.report import audit, calibration, diagnosis, exploration, fit, investigation
+from probewise.report.covariates import ResidualNoise
+from probewise.report.diagnosis_figures import draw_first_figure
 from probewise.report.html import Markup, element, figure, paragraph, table
-from probewise.report.plots.canvas import AxesGrid, png
+from probewise.report.plots.canvas import AxesGrid, lay_out, png
 from probewise.report.plots.nested import corner_plot
 from probewise.report.plots.probabilities import hypothesis_probabilities
 from probewise.report.plots.readings import predicted_and_recorded_by_scan, readings_by_orientation
@@ -51,9 +55,45 @@ def _pre(value: Any) -> Markup:
     return element("pre", value.summary())
 
 
+def _draw_recorded_against_predicted(value: SystemPrediction) -> Axes:
+    unit = value.table.instrumentation.unit_after_number
+    return recorded_against_predicted(value.readings, value.mean, value.sd, label="reading", unit=unit)
+
+
+# In the HTML an exploration's is a PNG as in its report, and a diagnosis's has the probabilities alone.
+_DRAWINGS: dict[type, Callable[[Any], Axes | AxesGrid]] = {
+    SSFField: spatial_sensitivity,
+    FittedSensor: lambda value: spatial_sensitivity(value.field),
+    Calibration: calibration.draw_ssf_by_n_gaussians,
+    Recording: readings_by_orientation,
+    Prediction: lambda value: predicted_and_recorded_by_scan(
+        Recording(value.plan, value.readings), value.mean, value.sd
+    ),
+    Samples: lambda value: corner_plot(value, parameters=value.names[:_MOST_PARAMETERS]),
+    Exploration: exploration.draw_last_view,
+    Diagnosis: lambda value: lay_out(draw_first_figure(ResidualNoise(value))),
+    SystemFit: fit.draw_recorded_against_predicted,
+    SystemPrediction: _draw_recorded_against_predicted,
+    PlanAudit: audit.draw_detectability_and_aliases,
+    Investigation: investigation.draw_probabilities_by_round,
+}
+
+
+def drawing_of(value: object) -> Axes | AxesGrid:
+    """Draw a result's main picture; return its axes. ParameterError if a result of this type has none."""
+    draw = next((_DRAWINGS[kind] for kind in type(value).__mro__ if kind in _DRAWINGS), None)
+    if draw is None:
+        raise ParameterError("result", value, f"one with a picture: {', '.join(k.__name__ for k in _DRAWINGS)}")
+    return draw(value)
+
+
+def _drawn(value: object, caption: str) -> Markup:
+    return _picture(drawing_of(value), caption)
+
+
 def _recording_parts(value: Recording) -> tuple[str, ...]:
     taken, scans = count_with_noun(len(value), "reading"), count_with_noun(len(value.plan.scan_names), "scan")
-    return (_picture(readings_by_orientation(value), f"{taken}, {int(value.usable.sum())} usable, {scans}"),)
+    return (_drawn(value, f"{taken}, {int(value.usable.sum())} usable, {scans}"),)
 
 
 def _nested_result_parts(value: NestedResult) -> tuple[str, ...]:
@@ -61,8 +101,7 @@ def _nested_result_parts(value: NestedResult) -> tuple[str, ...]:
         return (_pre(value),)
     left_out = len(value.names) - _MOST_PARAMETERS
     of = f" of the first {_MOST_PARAMETERS} of {len(value.names)} parameters" if left_out > 0 else ""
-    drawn = corner_plot(value, parameters=value.names[:_MOST_PARAMETERS])
-    return _picture(drawn, f"Posterior{of}: each by itself, and each pair"), _pre(value)
+    return _drawn(value, f"Posterior{of}: each by itself, and each pair"), _pre(value)
 
 
 def _weighted_parts(value: Weighted) -> tuple[str, ...]:
@@ -71,18 +110,13 @@ def _weighted_parts(value: Weighted) -> tuple[str, ...]:
         f"{words_without_unit(n)} {value_with_error(float(m), float(s), unit_of_name(n))}"
         for n, m, s in zip(names, value.mean(), value.sd(), strict=False)
     )
-    picture = _picture(corner_plot(value, parameters=names), "Posterior: each parameter by itself, and each pair")
+    picture = _drawn(value, "Posterior: each parameter by itself, and each pair")
     count = count_with_noun(len(value.theta), "sample")
     return picture, f"{known}; {count}, effective sample size {value.n_eff:.0f}."
 
 
 def _exploration_parts(value: Exploration) -> tuple[str, ...]:
-    readings = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in value.readings]
-    seen = [r.value for r in value.readings]
-    truth_mm = None if value.hidden is None else value.hidden.outline_mm
-    picture = exploration.robot_view_png(
-        value.last, value.experiment, readings, levels=(min(seen), max(seen)), truth_mm=truth_mm
-    )
+    picture = exploration.frame_png(value, len(value.steps))
     sds = {"run": np.array([s.largest_sd_mm for s in value.steps])}
     widths = posterior_widths(sds, target_mm=value.experiment.stop_sd_mm)
     return (
@@ -105,28 +139,23 @@ def _diagnosis_parts(value: Diagnosis) -> tuple[str, ...]:
 def _system_prediction_parts(value: SystemPrediction) -> tuple[str, ...]:
     if not np.isfinite(value.readings).any():
         return (_pre(value),)
-    unit = value.table.instrumentation.unit_after_number
-    drawn = recorded_against_predicted(value.readings, value.mean, value.sd, label="reading", unit=unit)
-    return _picture(drawn, _ON_THE_LINE), _pre(value)
+    return _drawn(value, _ON_THE_LINE), _pre(value)
 
 
 _PARTS: dict[type, Callable[[Any], tuple[str, ...]]] = {
     SSFField: lambda value: (
-        _picture(
-            spatial_sensitivity(value),
-            "Spatial sensitivity function, seen from above; white lines at a half and a tenth of its peak",
-        ),
+        _drawn(value, "Spatial sensitivity function, seen from above; white lines at a half and a tenth of its peak"),
     ),
     Recording: _recording_parts,
     RunRecording: lambda value: (f"{value.summary()}; {count_with_noun(len(value.plan.scan_names), 'run')}",),
     FittedSensor: lambda value: (
         calibration.summary_sentence(value),
-        _picture(spatial_sensitivity(value.field), "Mean SSF field"),
+        _drawn(value, "Mean SSF field"),
         calibration.parameter_table(value),
     ),
     Calibration: lambda value: (
         calibration.summary_sentence(value.sensor),
-        _picture(calibration.draw_ssf_by_n_gaussians(value), "Mean SSF by number of Gaussians"),
+        _drawn(value, "Mean SSF by number of Gaussians"),
         calibration.evidence_table(value.sensor),
     ),
     NestedResult: _nested_result_parts,
@@ -135,20 +164,17 @@ _PARTS: dict[type, Callable[[Any], tuple[str, ...]]] = {
     Exploration: _exploration_parts,
     Prediction: lambda value: (
         value.summary().replace("\n", "; "),
-        _picture(
-            predicted_and_recorded_by_scan(Recording(value.plan, value.readings), value.mean, value.sd),
-            "Predicted readings, each with its 95 % band",
-        ),
+        _drawn(value, "Predicted readings, each with its 95 % band"),
     ),
     PlanAudit: lambda value: (
         audit.summary_sentence(value),
-        _picture(audit.draw_detectability_and_aliases(value), "Detectability of effects, and aliases"),
+        _drawn(value, "Detectability of effects, and aliases"),
         _pre(value),
     ),
     Diagnosis: _diagnosis_parts,
     SystemFit: lambda value: (
         fit.summary_sentence(value),
-        _picture(fit.draw_recorded_against_predicted(value), _ON_THE_LINE),
+        _drawn(value, _ON_THE_LINE),
         _pre(value),
     ),
     SystemPrediction: _system_prediction_parts,

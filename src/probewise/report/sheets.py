@@ -24,6 +24,7 @@ LEFT_MM, RIGHT_MM, TOP_MM, BOTTOM_MM = 16.0, 12.0, 10.5, 20.0
 """Margins of a page: printers leave some 6 mm blank; the rest holds text."""
 
 OVERLAP_MM = 6.0
+CROSS_MM = 15.0  # half of a cross: long enough to show beyond a block of two LEGO studs
 """Width of the strip printed beyond the cut, on which the next page is glued."""
 
 AROUND_MM = 40.0  # margin beyond the outermost reading, which the sensor still sees
@@ -114,13 +115,20 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     return tuple(t for t in tiles if ((points > t.low_mm) & (points < t.high_mm)).all(axis=1).any())
 
 
+def lines_of_crosses(sheet: Sheet) -> FloatArray:
+    """Return both lines of each cross, (2 n, 2 ends, 2)."""
+    arms = CROSS_MM * np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 1.0]]])
+    marks = np.empty((0, 2)) if sheet.crosses_mm is None else np.asarray(sheet.crosses_mm)
+    return (marks[:, None, None, :] + arms).reshape(-1, 2, 2)
+
+
 def points_of_lines(sheet: Sheet) -> FloatArray:
-    """Return the crosses of a sheet and places half a millimetre apart along its lines, (n, 2)."""
-    lines = [*sheet.strokes_mm, *([] if sheet.outline_mm is None else [sheet.outline_mm])]
+    """Return places half a millimetre apart along the lines of a sheet, those of its crosses too, (n, 2)."""
+    lines = [*sheet.strokes_mm, *lines_of_crosses(sheet), *([] if sheet.outline_mm is None else [sheet.outline_mm])]
     places = [
         np.linspace(a, b, 2 + math.ceil(2 * math.dist(a, b))) for line in lines for a, b in itertools.pairwise(line)
     ]
-    return np.concatenate([np.empty((0, 2)) if sheet.crosses_mm is None else sheet.crosses_mm, *places])
+    return np.concatenate([np.empty((0, 2)), *places])
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:

@@ -67,6 +67,15 @@ class SystemPrediction(ShowsItself):
     n_failed: int = 0
     notes: tuple[str, ...] = ()
 
+    @property
+    def predicted_table(self) -> RunTable:
+        """All rows of the table with `mean`, `sd` and `log_density`; columns of these names are overwritten."""
+        return self.table.with_columns({name: getattr(self, name) for name in ("mean", "sd", "log_density")})
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame: the table's columns, `mean`, `sd` and `log_density`; a row per reading."""
+        return self.predicted_table.to_frame()
+
     def summary(self) -> str:
         """Return a text: notes; number of predicted readings; chi-square and log density per recorded reading."""
         found = prediction_summary(self.readings, self.mean, self.sd, self.log_density)
@@ -464,5 +473,4 @@ def write_system_prediction(prediction: SystemPrediction, path: str | os.PathLik
 
     Columns of the table with one of these names are overwritten. Raises FileError if the file cannot be written.
     """
-    predicted = {name: getattr(prediction, name) for name in ("mean", "sd", "log_density")}
-    write_text_atomically(path, run_table_csv(prediction.table.with_columns(predicted)))
+    write_text_atomically(path, run_table_csv(prediction.predicted_table))

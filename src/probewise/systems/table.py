@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
+from probewise._display import data_frame
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
@@ -199,6 +200,10 @@ class RunTable:
         """Return a table of these rows, given by indices or by a mask, in this order."""
         return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
 
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame of the columns, names of runs as texts; a row per row of the table."""
+        return data_frame(self.columns)
+
     def with_columns(self, columns: Mapping[str, FloatArray]) -> RunTable:
         """Return a table with these columns replaced or added."""
         return replace(self, columns={**self.columns, **columns})
@@ -224,6 +229,10 @@ class RunRecording(Recording):
             return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
         return relative_sds_of_column(table, self.sd_column)
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame of the table's columns, a row per reading."""
+        return cast(RunTable, self.plan).to_frame()
 
     @property
     def weighting_in_words(self) -> str:

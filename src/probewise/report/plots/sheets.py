@@ -20,7 +20,17 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
-from probewise.report.sheets import BOTTOM_MM, LEFT_MM, OVERLAP_MM, PAPERS_MM, Sheet, Tile, points_of_lines, tiles_of
+from probewise.report.sheets import (
+    BOTTOM_MM,
+    LEFT_MM,
+    OVERLAP_MM,
+    PAPERS_MM,
+    Sheet,
+    Tile,
+    lines_of_crosses,
+    points_of_lines,
+    tiles_of,
+)
 from probewise.scene import region_of
 
 _MM_PER_IN = 25.4
@@ -31,7 +41,6 @@ _ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
 _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
 _THUMB_MM = 38.0
 _LETTER_MM, _COVER_LETTERS = 1.6, 66  # of small print; letters on a line beside an overview
-_CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
 
 _PRINT = ("Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",)
 _GLUE = (
@@ -170,7 +179,7 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
             (near[axis], low[axis], ("left", "bottom")),
             (far[axis], high[axis], ("right", "top")),
         ):
-            if abs(value) > 12 or value == 0:
+            if abs(value) > 25 or value == 0:  # else two texts would touch
                 write(axis, at, f"{name} = {value:.4g} mm", **{("ha", "va")[axis]: aside[axis]})
     for axis, name in enumerate("xy"):
         if low[axis] < 0 < high[axis]:
@@ -228,10 +237,10 @@ def _draw_sheet_part(
     if sheet.outline_mm is not None:
         line = ax.add_patch(Outline(place(sheet.outline_mm), closed=True, fc="none", ec=BLACK, lw=0.4, zorder=2))
         line.set_clip_path(clip)
+    for line in lines_of_crosses(sheet):
+        (drawn,) = ax.plot(*place(line).T, color=BLACK, lw=0.35, solid_capstyle="butt", zorder=2)
+        drawn.set_clip_path(clip)
     for k, mark in enumerate([] if sheet.crosses_mm is None else sheet.crosses_mm):
-        for arm in ([[-_CROSS_MM, 0.0], [_CROSS_MM, 0.0]], [[0.0, -_CROSS_MM], [0.0, _CROSS_MM]]):
-            (half,) = ax.plot(*place(mark + np.array(arm)).T, color=BLACK, lw=0.35, solid_capstyle="butt", zorder=2)
-            half.set_clip_path(clip)
         (x, y), (left, _), (right, _) = place(np.array([mark + 10.0, mark - 10.0, high_mm])).tolist()
         if (low_mm[0] <= mark[0] < high_mm[0]) and (low_mm[1] <= mark[1] < high_mm[1]):
             name = sheet.cross_names[k] if sheet.cross_names else f"{k + 1}: ({mark[0]:g}, {mark[1]:g})"

@@ -31,7 +31,7 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     geometry = read_geometry(file)
     plan = plan_for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
-    bench = SimulatedBench(true_world("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
+    bench = SimulatedBench(true_world("paper"), ReadingScale(), "600,250,80", seed=seed)
     arm = bench.open_emulated_arm(geometry, file)
     stands, read = [], arm.read_here
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]

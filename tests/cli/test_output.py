@@ -12,7 +12,7 @@ import pytest
 from probewise._writing import Drawings, staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._common import holds_readings
+from probewise.cli._inputs import holds_readings
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_recording, write_text_atomically
 

@@ -31,9 +31,9 @@ from probewise.arm import (
     SimulatedArm,
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.cli._arm import SCENE, ArmName
-from probewise.cli._common import DEFAULT_SEED, CommandError, parse_finite_numbers, print_warning, write_to_terminal
-from probewise.errors import ParameterError, require
+from probewise.cli._common import CommandError, print_warning, write_to_terminal
+from probewise.cli._options import ARMS, DEFAULT_SEED, SCENE, parse_finite_numbers
+from probewise.errors import ParameterError, did_you_mean, require
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World
@@ -45,25 +45,52 @@ _SEEN_MM = 0.5  # least offset of the sensor from a mark, and gap above the bloc
 # Opening an arm
 
 
+@dataclasses.dataclass(frozen=True)
+class ArmName:
+    """An arm as chosen by --arm: its `kind`, and `where`: its port or file, or an emulated arm's true geometry file.
+
+    A real one is a brick or a user's own instrument; the reach of a LEGO arm, real or emulated, follows from its
+    geometry, from which the arm as built may differ.
+    """
+
+    kind: str
+    where: str = ""
+
+    @property
+    def is_real(self) -> bool:
+        return self.kind in ("nxt", "file")
+
+    @property
+    def is_lego(self) -> bool:
+        return self.kind in ("nxt", "emulator")
+
+    @property
+    def may_differ_from_geometry(self) -> bool:
+        return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
+
+
+def parse_arm(text: str) -> ArmName:
+    """Parse the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py"."""
+    if text in ("simulated", "emulator"):
+        return ArmName(text)
+    kind, _, where = text.partition(":")
+    if kind in ("emulator", "nxt") and where:
+        return ArmName(kind, where)
+    if text.endswith(".py"):
+        return ArmName("file", text)
+    meant = "; its port is missing" if kind == "nxt" else did_you_mean(kind, ("simulated", "emulator", "nxt"))
+    raise ParameterError("--arm", text, ARMS + meant)
+
+
 def open_brick(port: str) -> Brick:
-    """Connect to the LEGO brick at a port."""
     return Brick.open(port)
 
 
 def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
-    """Connect to the LEGO brick at a port; return its arm."""
     return LegoArm(BrickMachine(open_brick(port), geometry), geometry, start_s=start_s)
 
 
-def open_real_arm(chosen: ArmName, geometry: Geometry | None, *, start_s: float) -> LegoArm | OwnInstrument:
-    """Open a brick's arm, or a user's instrument, whose `connect()` is called when the instrument is entered."""
-    if chosen.kind == "file":
-        return OwnInstrument.from_file(chosen.where, start_s=start_s)
-    assert geometry is not None
-    return open_nxt_arm(chosen.where, geometry, start_s=start_s)
-
-
-def open_arm_and_bench(
+def open_arm(
     chosen: ArmName,
     geometry: Geometry,
     geometry_file: Path | None,
@@ -74,35 +101,37 @@ def open_arm_and_bench(
     start_s: float = 0.0,
     n_taken: int = 0,
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
-    """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
+    """Open an arm; return it with its simulated bench, None for a real arm.
 
-    With a `geometry_file`, the simulated arm has the geometry's reach. A simulated or emulated arm has the sensor of
-    the file `sensor`, the initial target `scene`, and noise of this `seed`, after the `n_taken` readings of an earlier
-    session.
+    A user's instrument is connected when it is entered. With a `geometry_file`, the simulated arm has the geometry's
+    reach. A simulated or emulated arm has the sensor of the file `sensor`, the initial target `scene`, and noise of
+    this `seed`, after the `n_taken` readings of an earlier session.
     """
-    if chosen.is_real:
-        return open_real_arm(chosen, geometry, start_s=start_s), None
-    from probewise.experiment import scale_of
-
-    world, instrumentation = world_and_instrumentation(sensor)
-    if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
-        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
-    scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
-    bench = SimulatedBench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
+    if chosen.kind == "file":
+        return OwnInstrument.from_file(chosen.where, start_s=start_s), None
+    if chosen.kind == "nxt":
+        return open_nxt_arm(chosen.where, geometry, start_s=start_s), None
+    bench = SimulatedBench(*world_and_scale(sensor, lego=chosen.is_lego), scene, seed=seed, n_taken=n_taken)
     if chosen.is_lego:
-        return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
+        return bench.open_emulated_arm(geometry, chosen.where or geometry_file, start_s=start_s), bench
     return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
 
 
 def open_emulated_arm_and_bench(
-    geometry: Geometry, geometry_file: Path | None, world: World, surface: Surface, *, seed: int, start_s: float = 0.0
+    geometry: Geometry,
+    geometry_file: str | Path | None,
+    world: World,
+    surface: Surface,
+    *,
+    seed: int,
+    start_s: float = 0.0,
 ) -> tuple[LegoArm, emulator.EmulatedBench]:
     """Open the LEGO arm on an emulated brick, built as `geometry_file` says, over a simulated table; and its bench.
 
     The clock runs as fast as possible. When the arm's `with` block ends, it warns if the sensor hit the table.
     """
     clock = emulator.VirtualClock()
-    numbers = emulator.read_geometry(geometry_file or emulator.shipped_geometry_path())
+    numbers = emulator.read_geometry(Path(geometry_file or emulator.shipped_geometry_path()))
     bench = emulator.set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(emulator.VirtualLine(bench.radio, clock), clock=clock), clock=clock)
 
@@ -121,17 +150,22 @@ def open_emulated_arm_and_bench(
     return TableContactReporter(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench
 
 
-def world_and_instrumentation(sensor: Path | None) -> tuple[World, recordings.Instrumentation | None]:
-    """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
+def world_and_scale(sensor: Path | None, *, lego: bool = False) -> tuple[World, ReadingScale]:
+    """Return the world of a sensor.json and the scale of its readings; for None those of the shipped recordings.
+
+    Raises ParameterError if the sensor of a LEGO arm reads in another unit.
+    """
     if sensor is None:
         from probewise.world.shipped import true_world
 
-        return true_world("paper"), None
+        return true_world("paper"), ReadingScale()
     from probewise.calibration import read_sensor
-    from probewise.experiment import world_like
+    from probewise.experiment import scale_of, world_like
 
     fitted = read_sensor(sensor)
-    return world_like(fitted), fitted.instrumentation
+    if lego and fitted.instrumentation.unit not in ("", "LEGO"):
+        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
+    return world_like(fitted), scale_of(fitted.instrumentation)
 
 
 class InstrumentWithCallbacks:
@@ -158,7 +192,7 @@ class SimulatedBench:
     that of the noise, which continues after the `n_taken` readings of an earlier session.
     """
 
-    def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
+    def __init__(self, world: World, scale: ReadingScale, scene: str, *, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
         self._table = emulator.Tabletop(emulator.parse_scene(scene))
         self._stand: Callable[[], emulator.SensorPose] | None = None
@@ -175,12 +209,12 @@ class SimulatedBench:
         make = partial(SimulatedArm, read_world, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
         return make(last=Reading(math.nan, make().pose, start_s))
 
-    def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
+    def open_emulated_arm(
+        self, geometry: Geometry, geometry_file: str | Path | None, *, start_s: float = 0.0
+    ) -> LegoArm:
         """Return the LEGO arm over the table, on an emulated brick."""
-        surface, seed = self._table.surface, self._seed + self._n_taken
-        arm, bench = open_emulated_arm_and_bench(
-            geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s
-        )
+        on_table, seed = (self._world, self._table.surface), self._seed + self._n_taken
+        arm, bench = open_emulated_arm_and_bench(geometry, geometry_file, *on_table, seed=seed, start_s=start_s)
         self._table, self._stand = bench.table, bench.arm.sensor_pose
         return arm
 
@@ -309,30 +343,26 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
 
 
 def _read_line() -> str:
-    """Read a line of standard input; "" if it has ended or cannot be read."""
     try:
         return "" if sys.stdin is None else sys.stdin.readline()
     except (OSError, ValueError):
         return ""
 
 
-def enable_confirmed_lowering(arm: LegoArm) -> None:
-    """Make the arm ask a person, at its first lowering, to confirm each step."""
-    ask = prompter(arm)
-
-    def confirm(height_mm: float) -> None:
-        ask(f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further")
-
-    arm.first_down = confirm
-
-
-def warn_and_confirm_lowering(chosen: ArmName, instrument: Instrument, geometry: Geometry | None) -> None:
+def confirm_lowering(chosen: ArmName, arm: Instrument, geometry: Geometry | None) -> None:
     """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
-    if geometry is None or not chosen.may_differ_from_geometry or not isinstance(instrument, LegoArm):
+    if geometry is None or not chosen.may_differ_from_geometry or not isinstance(arm, LegoArm):
         return
     warn_if_clearance_doubtful(geometry)
     if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
-        enable_confirmed_lowering(instrument)
+        confirm_each_step_down(arm)
+
+
+def confirm_each_step_down(arm: LegoArm) -> None:
+    ask = prompter(arm)
+    arm.first_down = lambda height_mm: ask(
+        f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further"
+    )
 
 
 def warn_if_clearance_doubtful(geometry: Geometry) -> None:

@@ -15,10 +15,9 @@ from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import Geometry, LegoArm, read_geometry, shipped_geometry_path
 from probewise.arm.fitting import fit_geometry, read_turns_and_places, spread_mark_places, write_marks
 from probewise.arm.geometry_file import text_with_fitted_values
-from probewise.cli._arm import parse_arm
-from probewise.cli._arm_tasks import open_instrument
-from probewise.cli._bench import prompter, prompter_for_answer
-from probewise.cli._common import CommandError, message_to_resume, print_result
+from probewise.cli._bench import parse_arm, prompter, prompter_for_answer
+from probewise.cli._common import CommandError, message_to_resume, print_result, say
+from probewise.cli.arm import open_instrument
 from probewise.errors import FileError, ParameterError, ReachError, require
 from probewise.recordings import write_text_atomically
 
@@ -47,11 +46,11 @@ def fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) -> 
         _touch_and_save_marks(arguments, geometry, checked_output_file(kept, arguments.geometry, option="--marks"))
     turned, marks = read_turns_and_places(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
-    print_result(fitted.summary(), quiet=arguments.quiet)
+    say(arguments, fitted.summary())
     write_text_atomically(out, text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry))
     if not is_device_or_pipe(out):
         read_geometry(out)  # check that edits by hand have not hidden a number
-    print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
+    say(arguments, f"written      {out}; give it as --geometry from now on")
 
 
 def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
@@ -63,16 +62,15 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     taken = np.concatenate(read_turns_and_places(kept), axis=1).tolist() if kept.exists() else []
     done = {(x, y) for *_, x, y, _ in taken}
     marks = [(x, y) for x, y in spread_mark_places(geometry).tolist()]
-    instrument, bench = open_instrument(arguments, geometry)
+    instrument, bench = open_instrument(arguments, geometry, watched=True)
     assert isinstance(instrument, LegoArm)
 
     def kept_message() -> str:
-        return (
-            message_to_resume(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
-        )
+        resume = partial(message_to_resume, kept, len(taken), "mark", arguments, "--resume")
+        return resume() if kept.exists() else "no mark was kept"
 
     with reporting_what_is_kept(kept_message), instrument as arm:
-        answer, tell = prompter_for_answer(arm), partial(print_result, quiet=bench is not None)
+        answer, tell = prompter_for_answer(arm), print_result if bench is None else lambda text: None
         if bench is None:
             prompter(arm)(
                 "lay the sheet of marks (probewise sheets marks) on the field, and on each cross in its turn a "
@@ -88,7 +86,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
             if met is not None:
                 taken.append(met)
                 write_marks(taken, kept)
-                print_result(f"mark {number} kept: {kept}", quiet=arguments.quiet)
+                say(arguments, f"mark {number} kept: {kept}")
 
 
 def bring_to_mark(

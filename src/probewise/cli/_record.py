@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import (
@@ -31,10 +30,12 @@ from probewise.arm import (
 )
 from probewise.arm.carry_out import BY_HAND_S, duration_s
 from probewise.arm.geometry import wrapped_to_pi
+from probewise.calibration import read_sensor
 from probewise.cli import _bench
-from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
-from probewise.cli._arm_tasks import confirm_lowering, nxt_port, open_instrument, prompter_unless_dry_run
-from probewise.cli._common import message_to_resume, print_result, print_warning, refuse_options
+from probewise.cli._common import message_to_resume, print_warning, progress_of, say
+from probewise.cli._inputs import read_or_shipped_plan
+from probewise.cli._options import SHIPPED, parse_place, refuse_options
+from probewise.cli.arm import nxt_port, open_instrument, prompter_unless_dry_run
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
@@ -50,6 +51,7 @@ _LOOK_MM = 25.0  # margin around the plan's places within which a sheet shows it
 _SHARE = 0.05  # least contrast of white and black, as a share of the range of readings
 _OFF = 0.35  # largest deviation from a level, as a share of the contrast; beyond any noise
 _FEWEST = 3
+_COLOURS = {True: "white", False: "black"}
 _SPREAD_SHARE = 0.15  # largest spread of readings of one shade, as a share of the range
 _AROUND_MM = np.stack(
     [
@@ -63,7 +65,7 @@ _AROUND_MM = np.stack(
 def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     """Take the plan's readings, each kept on disk at once; a person or the bench lays the sheets."""
     out = checked_output_file(arguments.out, *([] if arguments.plan in SHIPPED else [Path(arguments.plan)]))
-    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    chosen = None if arguments.arm is None else _bench.parse_arm(arguments.arm)
     is_own = chosen is not None and chosen.kind == "file"
     plan = _plan_for_arm(arguments, geometry, is_own=is_own)
     width, height = (0.0, 0.0) if is_own else geometry.field_mm
@@ -83,7 +85,6 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
     start_s = taken[-1].time_s if taken else 0.0
     instrument, bench = open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
-    confirm_lowering(arguments, instrument, geometry)
     with reporting_what_is_kept(kept_message), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not is_own)
         ask: Callable[[RequestToPerson], None]
@@ -97,13 +98,10 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
             emulated = not is_own and os.path.realpath(nxt_port(arguments.arm)).startswith(("/dev/pts/", "/dev/ttys"))
             ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
-            print_result(
-                f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
-                f"each step by hand",
-                quiet=arguments.quiet,
-            )
+            about = f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes"
+            say(arguments, f"{about}; including {BY_HAND_S:g} s for each step by hand")
         readings = carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
-        with progress_shown(quiet=arguments.quiet, beat=False) as progress:
+        with progress_of(arguments, beat=False) as progress:
             progress("readings", len(taken), len(plan))
             for reading in readings:
                 wrong = check.complaint_about_reading(len(taken), reading.value)
@@ -116,7 +114,7 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     if not arguments.dry_run:
         if at_end:
             write_recording(recording_of_readings(plan, taken), out)
-        print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
+        say(arguments, f"{len(taken)} readings: {out}")
 
 
 def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: bool) -> Plan:
@@ -125,8 +123,6 @@ def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: 
     if is_own:
         return _bench.plan_for_own_instrument(plan, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     if arguments.sensor is not None:
-        from probewise.calibration import read_sensor
-
         return _bench.without_measured_covariates(plan, read_sensor(arguments.sensor).instrumentation)
     refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
     return _bench.plan_for_lego_arm(plan, geometry)
@@ -273,7 +269,7 @@ class SheetCheck:
             return None
         self._reported.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
-        return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {_COLOURS[is_white]}, and {wrong}"
 
     def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
         """Return a complaint about readings over a sheet's white (True) and black (False), else keep them as levels."""
@@ -284,7 +280,7 @@ class SheetCheck:
                 wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
             told = self._complaint_against_earlier(is_white, value)
-            wrong = wrong or (None if told is None else f"where it should be {_colour_in_words(is_white)} {told}")
+            wrong = wrong or (None if told is None else f"where it should be {_COLOURS[is_white]} {told}")
         if wrong is not None:
             return f"sheet {name!r} contradicts its pattern: {wrong}"
         for is_white, value in values.items():
@@ -322,16 +318,16 @@ class SheetCheck:
         if own and other:
             level, opposite = float(np.median(own)), float(np.median(other))
             if abs(value - level) > max(_OFF * abs(opposite - level), self._least_contrast(level, opposite)):
-                colour, other_colour = _colour_in_words(is_white), _colour_in_words(not is_white)
-                return f"reads {value:g}; {colour} read {level:g} so far, {other_colour} {opposite:g}"
+                of_other = f"{_COLOURS[not is_white]} {opposite:g}"
+                return f"reads {value:g}; {_COLOURS[is_white]} read {level:g} so far, {of_other}"
         elif len(own) >= _FEWEST:
             level = float(np.median(own))
             if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
-                return f"reads {value:g}; {_colour_in_words(is_white)} read {level:g} so far"
+                return f"reads {value:g}; {_COLOURS[is_white]} read {level:g} so far"
         elif other and self._bright:
             opposite = float(np.median(other))
             if (value - opposite) * (1 if is_white else -1) < self._least_contrast(value, opposite):
-                return f"reads {value:g}, where {_colour_in_words(not is_white)} read {opposite:g}"
+                return f"reads {value:g}, where {_COLOURS[not is_white]} read {opposite:g}"
         return None
 
     def _least_contrast(self, *levels: float) -> float:
@@ -344,7 +340,3 @@ def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatAr
     albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
     low, high = albedo.min(axis=1), albedo.max(axis=1)
     return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)
-
-
-def _colour_in_words(is_white: bool) -> str:
-    return "white" if is_white else "black"

@@ -158,17 +158,18 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
         return
     first = plan.take(np.arange(len(before)))
+    names_before, names = (np.array(each.pattern_names)[each.pattern] for each in (before, first))
     rows = {
         "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
         "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
         "orientation": np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad)) > off_rad,
         "scan": before.scan != first.scan,
-        "pattern": np.array(_pattern_names_by_row(before)) != np.array(_pattern_names_by_row(first)),
+        "pattern": names_before != names,
     }
     for name, differs in rows.items():
         if differs.any():
             yield f"readings of another plan: the {name} of reading {1 + int(differs.argmax())} differs"
-    for name in dict.fromkeys(_pattern_names_by_row(before)):
+    for name in dict.fromkeys(names_before.tolist()):
         there, here = before.patterns[name], plan.patterns[name]
         if not have_same_albedo(there, here):
             yield f"readings of another plan: pattern {name!r} is {shown(there)} there, {shown(here)} here"
@@ -176,10 +177,6 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         values = [getattr(each.instrumentation, field.name) for each in (before, plan)]
         if values[0] != values[1] and field.name != "description":
             yield f"{field.name} is {values[0]!r} there, {values[1]!r} here"
-
-
-def _pattern_names_by_row(plan: Plan) -> list[str]:
-    return [plan.pattern_names[code] for code in plan.pattern]
 
 
 # Sheets that a person lays
@@ -215,13 +212,12 @@ def person_at_bench(
 
     def complaint_about_sheet(name: str) -> str | None:
         """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
-        origin = np.array(origin_mm)
-        chosen = sheet_check.white_and_black_places(name, lambda places: arm.reach.contains(places + origin))
+        chosen = sheet_check.white_and_black_places(name, lambda places: arm.reach.contains(places + origin_mm))
         values = {}
         for is_white, place in chosen.items():
-            x_mm, y_mm = (np.array(place) + origin).tolist()
-            standing = float(arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
-            values[is_white] = arm.measure(Pose(x_mm, y_mm, standing)).value
+            there = place + np.array(origin_mm)
+            standing = float(arm.orientation_rad(there[None, :])[0])
+            values[is_white] = arm.measure(Pose(*there.tolist(), standing)).value
         return sheet_check.complaint_about_levels(name, values)
 
     def ask(request: RequestToPerson) -> None:
@@ -274,10 +270,8 @@ class SheetCheck:
     def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
         """Return a complaint about readings over a sheet's white (True) and black (False), else keep them as levels."""
         wrong = None
-        if len(values) == 2:
-            contrast = values[True] - values[False]
-            if self._bright and contrast < self._least_contrast(*values.values()):
-                wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
+        if len(values) == 2 and self._bright and values[True] - values[False] < self._least_contrast(*values.values()):
+            wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
             told = self._complaint_against_earlier(is_white, value)
             wrong = wrong or (None if told is None else f"where it should be {_COLOURS[is_white]} {told}")
@@ -287,9 +281,7 @@ class SheetCheck:
             self._read[is_white].append(value)
         return None
 
-    def white_and_black_places(
-        self, name: str, allowed: Callable[[FloatArray], BoolArray]
-    ) -> dict[bool, tuple[float, float]]:
+    def white_and_black_places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, FloatArray]:
         """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
 
         Return (x, y) in mm in the plan's frame by these keys, if there is such a place; `allowed` returns the mask
@@ -297,20 +289,17 @@ class SheetCheck:
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
-        beside = there.mean(axis=0) + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+        middle = there.mean(axis=0)
+        beside = middle + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
         candidates = np.concatenate([there, beside])
         candidates = candidates[allowed(candidates)]
-        if not len(candidates):
-            return {}
         found = uniform_shades_at_places(self._plan.patterns[name], candidates)
-        middle = there.mean(axis=0)
-        out = {}
-        for is_white in (True, False):
-            fitting = candidates[found == float(is_white)]
-            if len(fitting):
-                x, y = fitting[np.argmin(((fitting - middle) ** 2).sum(axis=-1))].tolist()
-                out[is_white] = (x, y)
-        return out
+        by_shade = {is_white: candidates[found == float(is_white)] for is_white in (True, False)}
+        return {
+            is_white: places[np.argmin(((places - middle) ** 2).sum(axis=-1))]
+            for is_white, places in by_shade.items()
+            if len(places)
+        }
 
     def _complaint_against_earlier(self, is_white: bool, value: float) -> str | None:
         """Return a complaint if a reading over white or black contradicts earlier readings of the sheets, else None."""
@@ -337,6 +326,6 @@ class SheetCheck:
 def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
     """Return the shade that the sensor sees at each place, (n, 2), as (n,): 1 all white, 0 all black, else NaN."""
     seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
-    albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
+    albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), len(_AROUND_MM))
     low, high = albedo.min(axis=1), albedo.max(axis=1)
     return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)

@@ -159,9 +159,8 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
         what = "is no directory" if nearest.is_symlink() else "is a file"
-        raise ParameterError(
-            "--out", str(path), f"a directory, existing or new; {'this' if nearest == path else nearest} {what}"
-        )
+        here = "this" if nearest == path else nearest
+        raise ParameterError("--out", str(path), f"a directory, existing or new; {here} {what}")
     _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=nearest))

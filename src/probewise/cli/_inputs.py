@@ -113,11 +113,8 @@ def is_journal(path: Path) -> bool:
 def refuse_journal(path: Path) -> None:
     """Raise FileError for a journal where a plan or recording is needed: the shape below its sensor is unknown."""
     if is_journal(path):
-        raise FileError(
-            path,
-            "the journal of a run over a shape that is not known",
-            f"a plan or recording, CSV; a journal is for: probewise diagnose {path} --sensor S.json --out DIR",
-        )
+        allowed = f"a plan or recording, CSV; a journal is for: probewise diagnose {path} --sensor S.json --out DIR"
+        raise FileError(path, "the journal of a run over a shape that is not known", allowed)
 
 
 def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[recordings.Recording, Shape]:

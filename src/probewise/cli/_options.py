@@ -152,12 +152,6 @@ def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> Non
             raise ParameterError(f"--{name.replace('_', '-')}", str(value), f"none with {what}")
 
 
-def refuse_nested_stop(arguments: argparse.Namespace) -> None:
-    """Raise ParameterError if --nested-stop is given without --method paper."""
-    if arguments.nested_stop is not None and arguments.method != "paper":
-        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
-
-
 # Options that several verbs have
 
 _FILE: dict[str, Any] = {"type": parse_path}

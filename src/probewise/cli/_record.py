@@ -216,8 +216,9 @@ def person_at_bench(
         values = {}
         for is_white, place in chosen.items():
             there = place + np.array(origin_mm)
+            x_mm, y_mm = there.tolist()
             standing = float(arm.orientation_rad(there[None, :])[0])
-            values[is_white] = arm.measure(Pose(*there.tolist(), standing)).value
+            values[is_white] = arm.measure(Pose(x_mm, y_mm, standing)).value
         return sheet_check.complaint_about_levels(name, values)
 
     def ask(request: RequestToPerson) -> None:

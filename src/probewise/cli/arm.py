@@ -42,6 +42,7 @@ _Opened: TypeAlias = tuple[LegoArm | OwnInstrument | SimulatedArm, _bench.Simula
 _UNITS = "LEGO units (1 dark to 100 bright)"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
 _WHITE = "uniform:1"
+_NO_ARM = "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0"
 _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
 _STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
 STEP_MM = 5.0
@@ -79,9 +80,7 @@ def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s
     if arguments.dry_run:
         return LegoArm(DryRun(geometry, print_result), geometry, start_s=start_s)
     if arguments.arm is None:
-        raise CommandError(
-            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
-        )
+        raise CommandError(f"{_NO_ARM}; or --dry-run prints the moves only")
     return _bench.open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
 
 
@@ -318,9 +317,7 @@ def _fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) ->
     out = checked_output_file(arguments.out, arguments.geometry)
     require(not arguments.dry_run, "--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
-        raise CommandError(
-            "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or fit existing marks, --marks MARKS.csv"
-        )
+        raise CommandError(f"{_NO_ARM}; or fit existing marks, --marks MARKS.csv")
     if arguments.marks is None and is_device_or_pipe(out):
         raise ParameterError("--out", str(out), "a file, beside which the marks are kept; or name them with --marks")
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks

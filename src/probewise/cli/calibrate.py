@@ -10,7 +10,6 @@ from probewise._writing import Drawings, checked_output_directory
 from probewise.calibration import predict, write_sensor
 from probewise.cli._common import finish, progress_of
 from probewise.cli._inputs import refuse_journal, tables_and_descriptions
-from probewise.cli._options import refuse_nested_stop
 from probewise.errors import ParameterError
 from probewise.nested import LIVE_PER_PARAM, least_live
 from probewise.recordings import read_recording
@@ -19,7 +18,8 @@ from probewise.report import calibration as report
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate a sensor model; write sensor.json, report.html and the figures; return the exit status."""
-    refuse_nested_stop(arguments)
+    if arguments.nested_stop is not None and arguments.method != "paper":
+        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
     refuse_journal(arguments.recording)
     drawings = Drawings(checked_output_directory(arguments.out, main="sensor.json"))
     orders = tuple(sorted(set(arguments.orders)))

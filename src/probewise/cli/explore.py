@@ -24,7 +24,7 @@ from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
 from probewise.cli._common import finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descriptions
-from probewise.cli._options import DEFAULT_SEED, parse_numbers, refuse_nested_stop
+from probewise.cli._options import DEFAULT_SEED, parse_numbers
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.experiment import Experiment, Exploration, HiddenShape, Model, Step, read_journal
@@ -131,22 +131,16 @@ class Search:
         self.frames: list[bytes] = []
         self.truth_mm: FloatArray | None = None
         self.known: Mapping[str, float] | None = None
-        if self.arm.kind == "file" and arguments.geometry is not None:
-            allowed = "none with FILE.py, which defines its own reach"
-            raise ParameterError("--geometry", str(arguments.geometry), allowed)
-        with_geometry = self.arm.is_lego or arguments.geometry is not None
+        with_geometry = self.arm.is_lego or (arguments.geometry is not None and self.arm.kind != "file")
         self.geometry = read_or_shipped_geometry(arguments) if with_geometry else None
+        _refuse_contradictions(arguments, self.arm, self.geometry)
         self.field = _checked_field(arguments.field, self.geometry)
         self.sensor = self._shipped_sensor() if arguments.sensor is None else read_sensor(arguments.sensor)
         if self.arm.is_lego and self.sensor.instrumentation.unit not in ("", "LEGO"):
             raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
         self.streams = experiments.RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
         shape = experiments.as_shape(arguments.shape, self.field)
-        _refuse_settings_that_the_arm_lacks(arguments, self.geometry)
         cards = parse_cards(arguments.reference, self.field)
-        if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
-            allowed = "none with --both-models, --model naive or --method paper"
-            raise ParameterError("--reference", arguments.reference[0], allowed)
         levels = self._naive_levels()
         pose = partial(
             experiments.experiment_for,
@@ -191,11 +185,7 @@ class Search:
     def _naive_levels(self) -> Naive | None:
         """Return the paper's naive model's readings over black and white, with sds; None if it is not used."""
         arguments = self.arguments
-        refuse_nested_stop(arguments)
-        wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
-        if arguments.levels is not None and not wanted:
-            raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
-        if not wanted:
+        if arguments.method != "paper" or not (arguments.model == "naive" or arguments.both_models):
             return None
         if arguments.levels is None and self.arm.is_real:
             allowed = "a recording of readings over a black and a white sheet, for the naive model of the paper"
@@ -207,8 +197,6 @@ class Search:
         """Open the arm, to continue after the readings `taken`; return it and what a journal says of a true shape."""
         arguments, start_s = self.arguments, taken[-1].time_s if taken else 0.0
         if self.arm.is_real:
-            unknown = "none with a real arm, whose target is unknown"
-            require(arguments.truth is None, "--truth", arguments.truth, unknown)
             if self.geometry is None:
                 return OwnInstrument.from_file(self.arm.where, start_s=start_s), {}
             return _bench.open_nxt_arm(self.arm.where, self.geometry, start_s=start_s), {}
@@ -316,20 +304,26 @@ class Search:
             yield f"error        {report.errors_text(result, self.known)}"
 
 
-def _refuse_settings_that_the_arm_lacks(arguments: argparse.Namespace, geometry: Geometry | None) -> None:
-    """Raise ParameterError if the arm, or the naive model, has not these orientations or heights."""
-    refused = {}
-    if geometry is not None:
-        refused["orientations"] = "none with the LEGO arm, no joint of which turns its sensor"
-        if arguments.heights != (geometry.read_height_mm,):
-            refused["heights"] = (
-                f"none with the LEGO arm but {geometry.read_height_mm:g}: it reads that many mm above the surface"
-            )
-    elif arguments.both_models:
-        refused["heights"] = "none with --both-models, since the naive model has no height"
-    for option, allowed in refused.items():
-        if (values := getattr(arguments, option)) is not None:
-            raise ParameterError(f"--{option}", ",".join(f"{value:g}" for value in values), allowed)
+def _refuse_contradictions(arguments: argparse.Namespace, arm: _bench.ArmName, geometry: Geometry | None) -> None:
+    """Raise ParameterError for an option that does not go with the arm (with the geometry of a LEGO arm) or another."""
+    paper, both, lego = arguments.method == "paper", arguments.both_models, geometry is not None
+    naive, read_mm = both or arguments.model == "naive", math.nan if geometry is None else geometry.read_height_mm
+    at_one_height = f"none with the LEGO arm but {read_mm:g}: it reads that many mm above the surface"
+    for name, refused, allowed in (
+        ("geometry", arm.kind == "file", "none with FILE.py, which defines its own reach"),
+        ("orientations", lego, "none with the LEGO arm, no joint of which turns its sensor"),
+        ("heights", lego and arguments.heights != (read_mm,), at_one_height),
+        ("heights", both and not lego, "none with --both-models, since the naive model has no height"),
+        ("reference", naive or paper, "none with --both-models, --model naive or --method paper"),
+        ("nested_stop", not paper, "only with --method paper"),
+        ("levels", not (naive and paper), "only with --method paper and --model naive"),
+        ("truth", arm.is_real, "none with a real arm, whose target is unknown"),
+    ):
+        value = getattr(arguments, name)
+        if refused and value not in (None, []):
+            listed = value[0] if name == "reference" else value
+            said = ",".join(f"{number:g}" for number in listed) if isinstance(listed, tuple) else str(listed)
+            raise ParameterError(f"--{name.replace('_', '-')}", said, allowed)
 
 
 def _checked_field(text: str | None, geometry: Geometry | None) -> Field:

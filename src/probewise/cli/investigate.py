@@ -114,9 +114,8 @@ def _first_plan(arguments: argparse.Namespace, chosen: benches.ArmName) -> Plan:
     if chosen.kind == "simulated":
         return plan
     if arguments.no_hands and len(set(plan.pattern.tolist())) > 1:
-        raise ParameterError(
-            "--no-hands", True, f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
-        )
+        allowed = f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
+        raise ParameterError("--no-hands", True, allowed)
     if chosen.kind == "file":
         return benches.plan_for_own_instrument(plan)
     return benches.plan_for_lego_arm(plan, read_or_shipped_geometry(arguments))

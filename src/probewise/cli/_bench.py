@@ -111,10 +111,22 @@ def open_arm(
         return OwnInstrument.from_file(chosen.where, start_s=start_s), None
     if chosen.kind == "nxt":
         return open_nxt_arm(chosen.where, geometry, start_s=start_s), None
-    bench = SimulatedBench(*world_and_scale(sensor, lego=chosen.is_lego), scene, seed=seed, n_taken=n_taken)
+    world, scale = world_and_scale(sensor, lego=chosen.is_lego)
+    table = emulator.Tabletop(emulator.parse_scene(scene))
     if chosen.is_lego:
-        return bench.open_emulated_arm(geometry, chosen.where or geometry_file, start_s=start_s), bench
-    return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
+        built, seed = chosen.where or geometry_file, seed + n_taken
+        arm, bench = open_emulated_arm_and_bench(geometry, built, world, table.surface, seed=seed, start_s=start_s)
+        return arm, SimulatedBench(bench.table, bench.arm.sensor_pose)
+    number = itertools.count(n_taken)
+
+    def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
+        rng = np.random.default_rng([seed, next(number)])
+        place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
+        return world.read(table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
+
+    reach = None if geometry_file is None else geometry
+    make = partial(SimulatedArm, read_world, reach=reach, scale=scale, height_mm=world.height_mm)
+    return make(last=Reading(math.nan, make().pose, start_s)), SimulatedBench(table)
 
 
 def open_emulated_arm_and_bench(
@@ -185,44 +197,21 @@ class InstrumentWithCallbacks:
         return reading
 
 
+@dataclasses.dataclass(frozen=True)
 class SimulatedBench:
-    """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
+    """The table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
-    `scene` is the initial target, in the format of `emulate-nxt`; `scale` that of the simulated arm's readings; `seed`
-    that of the noise, which continues after the `n_taken` readings of an earlier session.
+    `stand` returns where an emulated arm's sensor truly is; a simulated one (None) is where it was commanded.
     """
 
-    def __init__(self, world: World, scale: ReadingScale, scene: str, *, seed: int, n_taken: int = 0) -> None:
-        self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
-        self._table = emulator.Tabletop(emulator.parse_scene(scene))
-        self._stand: Callable[[], emulator.SensorPose] | None = None
-
-    def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
-        """Return the simulated arm over the table; its sensor takes any orientation."""
-        number = itertools.count(self._n_taken)
-
-        def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
-            rng = np.random.default_rng([self._seed, next(number)])
-            place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
-            return self._world.read(self._table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
-
-        make = partial(SimulatedArm, read_world, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
-        return make(last=Reading(math.nan, make().pose, start_s))
-
-    def open_emulated_arm(
-        self, geometry: Geometry, geometry_file: str | Path | None, *, start_s: float = 0.0
-    ) -> LegoArm:
-        """Return the LEGO arm over the table, on an emulated brick."""
-        on_table, seed = (self._world, self._table.surface), self._seed + self._n_taken
-        arm, bench = open_emulated_arm_and_bench(geometry, geometry_file, *on_table, seed=seed, start_s=start_s)
-        self._table, self._stand = bench.table, bench.arm.sensor_pose
-        return arm
+    table: emulator.Tabletop
+    stand: Callable[[], emulator.SensorPose] | None = None
 
     def answer_at_mark(self, mark_mm: tuple[float, float], block_mm: float) -> str:
         """Answer like a person who watches an emulated arm's sensor over a mark: "ok", or moves, "x 5 down 2"."""
-        if self._stand is None:
+        if self.stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
-        stand = self._stand()
+        stand = self.stand()
         across = (mark_mm[0] - stand.x_mm, mark_mm[1] - stand.y_mm)
         gap_mm = stand.height_mm - block_mm
         words = [
@@ -241,9 +230,9 @@ class SimulatedBench:
     ) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if request.pattern is not None:
-            self._table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
+            self.table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
         if request.turned_rad is not None:
-            self._table.turned_rad = request.turned_rad
+            self.table.turned_rad = request.turned_rad
 
 
 def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> Surface:

@@ -56,8 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
         out.mkdir(parents=True, exist_ok=True)
         write_sensor(search.sensor, arguments.sensor)
     _bench.confirm_lowering(search.arm, instrument, search.geometry)
-    if search.is_as_built and search.geometry is not None:
-        _bench.warn_if_place_sd_large(search.geometry, search.experiment.stop_sd_mm)
+    if search.as_built is not None:
+        _bench.warn_if_place_sd_large(search.as_built, search.experiment.stop_sd_mm)
     steps, n_before = search.steps, 0 if before is None else len(before.entries)
 
     def kept_message() -> str:
@@ -116,8 +116,9 @@ class Search:
     """One search: its checked options, its arm, the pictures of its steps, which the report shows.
 
     `other` is the experiment under the sensor model `other_model`, which --both-models shows too; otherwise None.
-    `geometry` is that of a LEGO arm, or the one that --geometry gives a simulated arm; otherwise None. With a simulated
-    arm, `truth_mm` is the true outline, (n_points, 2), and `known` the true parameters by the hypotheses' names.
+    `geometry` is that of a LEGO arm, or the one that --geometry gives a simulated arm; otherwise None; `as_built` that
+    of an arm that may be built otherwise, None for any other. With a simulated arm, `truth_mm` is the true outline,
+    (n_points, 2), and `known` the true parameters by the hypotheses' names.
     `shadows` are the other model's steps on the same readings; `frames` has a PNG of each step, b"" where it could not
     be drawn.
     """
@@ -142,35 +143,37 @@ class Search:
         shape = experiments.as_shape(arguments.shape, self.field)
         cards = parse_cards(arguments.reference, self.field)
         levels = self._naive_levels()
-        pose = partial(
-            experiments.experiment_for,
-            self.sensor,
-            shape,
-            self.field,
-            method=arguments.method,
-            utility=arguments.utility,
-            nested_stop=arguments.nested_stop,
-            orientations_rad=tuple(math.radians(turn) for turn in arguments.orientations or (0.0,)),
-            repeats=arguments.repeats or (1,),
-            cards=cards,
-        )
+
+        def pose(model: Model, **more: Any) -> Experiment:
+            return experiments.experiment_for(
+                self.sensor,
+                shape,
+                self.field,
+                method=arguments.method,
+                model=model,
+                naive=levels if model == "naive" else None,
+                utility=arguments.utility,
+                nested_stop=arguments.nested_stop,
+                orientations_rad=tuple(math.radians(turn) for turn in arguments.orientations or (0.0,)),
+                repeats=arguments.repeats or (1,),
+                cards=cards,
+                **more,
+            )
+
         self.model: Model = arguments.model
-        self.experiment: Experiment = pose(
-            model=self.model,
-            naive=levels if self.model == "naive" else None,
+        self.experiment = pose(
+            self.model,
             learn_sensor=arguments.learn_sensor,
             batch=arguments.batch,
             heights_mm=arguments.heights or (),
             trust=arguments.trust,
         )
-        self.is_as_built = self.geometry is not None and self.arm.may_differ_from_geometry
-        if self.is_as_built and self.geometry is not None and self.geometry.accuracy is not None:
-            fitted_arm = experiments.FittedArm.from_geometry_and_sensor(self.geometry, self.sensor)
+        self.as_built = self.geometry if self.arm.may_differ_from_geometry else None
+        if self.as_built is not None and self.as_built.accuracy is not None:
+            fitted_arm = experiments.FittedArm.from_geometry_and_sensor(self.as_built, self.sensor)
             self.experiment = replace(self.experiment, fitted_arm=fitted_arm)
-        self.other: Experiment | None = None
         self.other_model: Model = "naive" if self.model == "ssf" else "ssf"
-        if arguments.both_models:
-            self.other = pose(model=self.other_model, naive=levels if self.other_model == "naive" else None, trust=1.0)
+        self.other = pose(self.other_model, trust=1.0) if arguments.both_models else None
 
     def _shipped_sensor(self) -> FittedSensor:
         """Calibrate the sensor of the recording that ships, and say so; a resumed run reads the one it began with."""
@@ -208,10 +211,8 @@ class Search:
         arm: Instrument
         if self.arm.is_lego and self.geometry is not None:
             seed = noise + len(taken)  # a resumed run draws no noise a second time
-            built = self.arm.where or arguments.geometry
-            arm, _ = _bench.open_emulated_arm_and_bench(
-                self.geometry, built, world, surface, seed=seed, start_s=start_s
-            )
+            setting = (self.geometry, self.arm.where or arguments.geometry, world, surface)
+            arm, _ = _bench.open_emulated_arm_and_bench(*setting, seed=seed, start_s=start_s)
         else:
             scale = experiments.scale_of(self.sensor.instrumentation)
             arm = experiments.arm_over(
@@ -289,7 +290,7 @@ class Search:
     def closing_lines(self, result: Exploration, journal: Path) -> Iterator[str]:
         """Yield the closing lines: the shape, what its sds leave out, probable sensor faults, and errors if known."""
         yield result.summary()
-        if self.is_as_built and self.geometry is not None and self.geometry.accuracy is None:
+        if self.as_built is not None and self.as_built.accuracy is None:
             yield "arm          nobody has fitted its geometry: its own error is not in these sds"
         if self.sensor.effects and not self.arm.is_real:
             effects = ", ".join(map(spoken_name, self.sensor.effects))

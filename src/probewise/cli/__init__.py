@@ -46,29 +46,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             with stoppable():
                 return int(importlib.import_module(f"probewise.cli.{verb.replace('-', '_')}").run(arguments))
         except Stopped as stop:
-            _write_complaint(verb, f"stopped; {str(stop) or 'nothing was written'}")
-            _discard_unwritable_output()
-            return stop.status
+            status, said = stop.status, f"stopped; {str(stop) or 'nothing was written'}"
         except OutputError as error:
             out = getattr(arguments, "out", None)
             kept = "" if out is None or not out.exists() else f"; what was written is kept: {out}"
-            _write_complaint(verb, f"{error}{kept}")
-            _discard_unwritable_output()
-            return 2
+            status, said = 2, f"{error}{kept}"
         except (NotConvergedError, LinkError, NotDrawnError) as error:
-            _write_complaint(verb, str(error))
-            return 1
+            status, said = 1, str(error)
         except BrokenPipeError:  # the reader of a pipe has closed it; written files are complete
-            _discard_unwritable_output()
-            return 1
+            status, said = 1, ""
         except (ProbewiseError, OSError) as error:
-            _write_complaint(verb, error_in_one_line(error))
-            _discard_unwritable_output()
-            return 2
-
-
-def _write_complaint(verb: str, text: str) -> None:
-    print_complaint(f"probewise {verb}: {text}")
+            status, said = 2, error_in_one_line(error)
+        if said:
+            print_complaint(f"probewise {verb}: {said}")
+        _discard_unwritable_output()
+        return status
 
 
 def _replace_closed_streams() -> None:

@@ -11,20 +11,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from probewise import emulator
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file
 from probewise.cli._bench import world_and_scale
 from probewise.cli._common import print_result, say
-from probewise.emulator import (
-    EmulatedBench,
-    Faults,
-    SensorPose,
-    Trace,
-    parse_scene,
-    read_geometry,
-    set_up_bench,
-    shipped_geometry_path,
-)
 from probewise.errors import LinkError, ParameterError
 
 
@@ -35,12 +26,12 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.emulator.pty import Terminal, serve
 
     log = arguments.log and checked_output_file(arguments.log, arguments.sensor, arguments.geometry, option="--log")
-    geometry = read_geometry(shipped_geometry_path() if arguments.geometry is None else arguments.geometry)
-    surface = parse_scene(arguments.scene)
-    faults = Faults.parse(arguments.fault)
+    geometry = emulator.read_geometry(arguments.geometry or emulator.shipped_geometry_path())
+    surface = emulator.parse_scene(arguments.scene)
+    faults = emulator.Faults.parse(arguments.fault)
     world, _ = world_and_scale(arguments.sensor)
     with _telegram_log(log) as trace, Terminal(arguments.link) as terminal:
-        bench = set_up_bench(
+        bench = emulator.set_up_bench(
             geometry,
             world,
             surface,
@@ -63,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
 class _TypedCommands:
     """The typed commands of the bench (a scene, `turn DEGREES`, `where`), and a watch on the sensor's height."""
 
-    def __init__(self, bench: EmulatedBench) -> None:
+    def __init__(self, bench: emulator.EmulatedBench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
         self._is_in_table = False
 
@@ -87,7 +78,7 @@ class _TypedCommands:
                     print_result(str(error))
 
 
-def _position_in_words(stand: SensorPose) -> str:
+def _position_in_words(stand: emulator.SensorPose) -> str:
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
 
@@ -99,7 +90,7 @@ def _is_foreground() -> bool:
 
 
 @contextlib.contextmanager
-def _telegram_log(path: Path | None) -> Iterator[Trace]:
+def _telegram_log(path: Path | None) -> Iterator[emulator.Trace]:
     """Yield a function that writes a line per telegram or fault to the file, or nowhere without one."""
     began_s = time.monotonic()
     with open(path or os.devnull, "w", encoding="utf-8", buffering=1) as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 import math
@@ -12,7 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from tqdm import tqdm
@@ -20,6 +21,7 @@ from tqdm import tqdm
 from probewise import emulator, recordings
 from probewise._signals import raise_if_stopped
 from probewise.arm import (
+    DryRun,
     Geometry,
     Instrument,
     LegoArm,
@@ -31,8 +33,8 @@ from probewise.arm import (
     SimulatedArm,
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.cli._common import CommandError, print_warning, write_to_terminal
-from probewise.cli._options import ARMS, DEFAULT_SEED, SCENE, parse_finite_numbers
+from probewise.cli._common import CommandError, print_result, print_warning, say, write_to_terminal
+from probewise.cli._options import ARMS, DEFAULT_SEED, SCENE, parse_finite_numbers, refuse_options
 from probewise.errors import ParameterError, did_you_mean, require
 
 if TYPE_CHECKING:
@@ -40,6 +42,10 @@ if TYPE_CHECKING:
 
 _WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-alives of the brick
 _SEEN_MM = 0.5  # least offset of the sensor from a mark, and gap above the block, that a simulated person notices
+Opened: TypeAlias = "tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]"
+"""An arm with its simulated bench, None for a real arm."""
+
+NO_ARM = "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0"
 
 
 # Opening an arm
@@ -100,7 +106,7 @@ def open_arm(
     seed: int = DEFAULT_SEED,
     start_s: float = 0.0,
     n_taken: int = 0,
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
+) -> Opened:
     """Open an arm; return it with its simulated bench, None for a real arm.
 
     A user's instrument is connected when it is entered. With a `geometry_file`, the simulated arm has the geometry's
@@ -127,6 +133,57 @@ def open_arm(
     reach = None if geometry_file is None else geometry
     make = partial(SimulatedArm, read_world, reach=reach, scale=scale, height_mm=world.height_mm)
     return make(last=Reading(math.nan, make().pose, start_s)), SimulatedBench(table)
+
+
+def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    """Open the arm of --arm, or for --dry-run one that only prints its moves."""
+    if arguments.dry_run:
+        return LegoArm(DryRun(geometry, print_result), geometry, start_s=start_s)
+    if arguments.arm is None:
+        raise CommandError(f"{NO_ARM}; or --dry-run prints the moves only")
+    return open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
+
+
+def open_instrument(
+    arguments: argparse.Namespace, geometry: Geometry, *, scene: str = SCENE, watched: bool = False, **taken: Any
+) -> Opened:
+    """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm.
+
+    Unless a person watches all its moves, its first lowering is confirmed. `taken` says, by `start_s` and `n_taken`,
+    what an earlier session has read.
+    """
+    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    if chosen is None or chosen.kind == "nxt":
+        refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
+        opened: Opened = open_lego_arm(arguments, geometry, start_s=taken.get("start_s", 0.0)), None
+    else:
+        require(not arguments.dry_run, "--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
+        if chosen.kind == "file":
+            refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
+        options: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
+        given = {name: getattr(arguments, name, None) for name in options}
+        options |= {name: value for name, value in given.items() if value is not None}
+        opened = open_arm(chosen, geometry, arguments.geometry, **options, **taken)
+        if opened[1] is not None and arguments.task != "scan":
+            say(arguments, f"seed {options['seed']}")
+    if chosen is not None and not arguments.dry_run and not watched:
+        confirm_lowering(chosen, opened[0], geometry)
+    return opened
+
+
+def nxt_port(name: str) -> str:
+    """Return the port of "nxt:PORT"; raise ParameterError for any other arm."""
+    chosen = parse_arm(name)
+    require(chosen.kind != "file", "--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
+    if chosen.kind != "nxt":
+        allowed = "nxt:PORT, also that of `probewise emulate-nxt`, a brick in software; --dry-run prints the moves"
+        raise ParameterError("--arm", name, allowed)
+    return chosen.where
+
+
+def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
+    """Return a function that prompts the person; in a dry run, it only prints the request."""
+    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
 
 
 def open_emulated_arm_and_bench(

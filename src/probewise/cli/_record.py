@@ -35,7 +35,6 @@ from probewise.cli import _bench
 from probewise.cli._common import message_to_resume, print_warning, progress_of, say
 from probewise.cli._inputs import read_or_shipped_plan
 from probewise.cli._options import SHIPPED, parse_place, refuse_options
-from probewise.cli.arm import nxt_port, open_instrument, prompter_unless_dry_run
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
@@ -84,18 +83,20 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         return message_to_resume(out, n_kept, "reading", arguments, "--resume", of=len(plan))
 
     start_s = taken[-1].time_s if taken else 0.0
-    instrument, bench = open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
+    instrument, bench = _bench.open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     with reporting_what_is_kept(kept_message), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not is_own)
         ask: Callable[[RequestToPerson], None]
         if bench is not None:
             ask = partial(bench.carry_out_request, plan.patterns, origin)
         elif arguments.dry_run:
-            ask = prompter_unless_dry_run(arguments, arm)
+            ask = _bench.prompter_unless_dry_run(arguments, arm)
         else:
             arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
             # A pseudo-terminal is an emulator's.
-            emulated = not is_own and os.path.realpath(nxt_port(arguments.arm)).startswith(("/dev/pts/", "/dev/ttys"))
+            emulated = not is_own and os.path.realpath(_bench.nxt_port(arguments.arm)).startswith(
+                ("/dev/pts/", "/dev/ttys")
+            )
             ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             about = f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes"

@@ -7,20 +7,15 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import (
-    DryRun,
     Geometry,
-    Instrument,
     LegoArm,
-    OwnInstrument,
     Pose,
-    SimulatedArm,
     percent_to_lego_units,
     read_geometry,
     require_within_reach,
@@ -31,18 +26,16 @@ from probewise.arm.geometry import JOINTS
 from probewise.arm.geometry_file import text_with_fitted_values
 from probewise.arm.height_check import LEAST_P, check_heights
 from probewise.arm.nxt import percent_from_counts
-from probewise.cli import _bench
+from probewise.cli import _bench, _record
 from probewise.cli._common import CommandError, message_to_resume, print_result, print_warning, say
 from probewise.cli._inputs import read_or_shipped_geometry
-from probewise.cli._options import DEFAULT_SEED, SCENE, parse_finite_numbers, parse_place, refuse_options
+from probewise.cli._options import parse_finite_numbers, parse_place
 from probewise.errors import FileError, LinkError, ParameterError, ReachError, require
 from probewise.recordings import write_bytes_atomically, write_text_atomically
 
-_Opened: TypeAlias = tuple[LegoArm | OwnInstrument | SimulatedArm, _bench.SimulatedBench | None]
 _UNITS = "LEGO units (1 dark to 100 bright)"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
 _WHITE = "uniform:1"
-_NO_ARM = "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0"
 _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of reading upwards
 _STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
 STEP_MM = 5.0
@@ -56,8 +49,6 @@ _MOVES = {"x": (1, 0, 0), "y": (0, 1, 0), "up": (0, 0, 1), "down": (0, 0, -1)}
 
 def run(arguments: argparse.Namespace) -> int:
     """Run one task of `probewise arm`; return the exit status."""
-    from probewise.cli import _record
-
     tasks = {
         "check": _report_geometry_and_reach,
         "jog": _jog_joint_or_sensor,
@@ -72,60 +63,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-# Opening the arm of a task
-
-
-def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
-    """Open the arm of --arm, or for --dry-run one that only prints its moves."""
-    if arguments.dry_run:
-        return LegoArm(DryRun(geometry, print_result), geometry, start_s=start_s)
-    if arguments.arm is None:
-        raise CommandError(f"{_NO_ARM}; or --dry-run prints the moves only")
-    return _bench.open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
-
-
-def open_instrument(
-    arguments: argparse.Namespace, geometry: Geometry, *, scene: str = SCENE, watched: bool = False, **taken: Any
-) -> _Opened:
-    """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm.
-
-    Unless a person watches all its moves, its first lowering is confirmed. `taken` says, by `start_s` and `n_taken`,
-    what an earlier session has read.
-    """
-    chosen = None if arguments.arm is None else _bench.parse_arm(arguments.arm)
-    if chosen is None or chosen.kind == "nxt":
-        refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
-        opened: _Opened = _open_lego_arm(arguments, geometry, start_s=taken.get("start_s", 0.0)), None
-    else:
-        require(not arguments.dry_run, "--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
-        if chosen.kind == "file":
-            refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
-        options: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
-        given = {name: getattr(arguments, name, None) for name in options}
-        options |= {name: value for name, value in given.items() if value is not None}
-        opened = _bench.open_arm(chosen, geometry, arguments.geometry, **options, **taken)
-        if opened[1] is not None and arguments.task != "scan":
-            say(arguments, f"seed {options['seed']}")
-    if chosen is not None and not arguments.dry_run and not watched:
-        _bench.confirm_lowering(chosen, opened[0], geometry)
-    return opened
-
-
-def nxt_port(name: str) -> str:
-    """Return the port of "nxt:PORT"; raise ParameterError for any other arm."""
-    chosen = _bench.parse_arm(name)
-    require(chosen.kind != "file", "--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
-    if chosen.kind != "nxt":
-        allowed = "nxt:PORT, also that of `probewise emulate-nxt`, a brick in software; --dry-run prints the moves"
-        raise ParameterError("--arm", name, allowed)
-    return chosen.where
-
-
-def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
-    """Return a function that prompts the person; in a dry run, it only prints the request."""
-    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else _bench.prompter(arm)
-
-
 # The tasks
 
 
@@ -138,7 +75,7 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
     out, drawing, own = arguments.out, arguments.drawing, arguments.geometry
     out = out and checked_output_file(out, own)
     drawing = drawing and checked_output_file(drawing, own, option="--drawing")
-    port = None if arguments.arm is None else nxt_port(arguments.arm)
+    port = None if arguments.arm is None else _bench.nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
     reached = geometry.contains(places)
@@ -185,16 +122,18 @@ def _jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> N
                 raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
             if arguments.down and not arguments.dry_run and not arguments.steps:
                 _bench.warn_if_clearance_doubtful(geometry)
-            with _open_lego_arm(arguments, geometry) as arm:
+            with _bench.open_lego_arm(arguments, geometry) as arm:
                 if arguments.steps and not arguments.dry_run:
                     _bench.confirm_each_step_down(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _print_position(arguments, arm)
                 if arguments.down:
-                    prompter_unless_dry_run(arguments, arm)("check the sensor's position; it will be raised again")
+                    _bench.prompter_unless_dry_run(arguments, arm)(
+                        "check the sensor's position; it will be raised again"
+                    )
         case [joint, text] if joint in JOINTS:
             (degrees,) = parse_finite_numbers("WHERE", text, 1, "a number of degrees")
-            with _open_lego_arm(arguments, geometry) as arm:
+            with _bench.open_lego_arm(arguments, geometry) as arm:
                 arm.turn_joint(JOINTS.index(joint), math.radians(degrees))
                 _print_position(arguments, arm)
         case _:
@@ -203,11 +142,11 @@ def _jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> N
 
 def _bring_home(arguments: argparse.Namespace, geometry: Geometry) -> None:
     """Bring all joints home, by themselves or by hand."""
-    with _open_lego_arm(arguments, geometry) as arm:
+    with _bench.open_lego_arm(arguments, geometry) as arm:
         if arguments.here:
             angles = [f"{name} {math.degrees(j.home_rad):g}" for name, j in zip(JOINTS, geometry.joints, strict=True)]
             arm.release()
-            prompter_unless_dry_run(arguments, arm)(f"bring the arm home by hand, {', '.join(angles)} degrees")
+            _bench.prompter_unless_dry_run(arguments, arm)(f"bring the arm home by hand, {', '.join(angles)} degrees")
             arm.set_home()
         else:
             arm.home()
@@ -221,7 +160,7 @@ def _print_position(arguments: argparse.Namespace, arm: LegoArm) -> None:
 
 
 def _print_light_and_battery(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    with _open_lego_arm(arguments, geometry) as arm:
+    with _bench.open_lego_arm(arguments, geometry) as arm:
         value, battery_mv = arm.read_here(), arm.battery_mv()
         if not arguments.dry_run:
             print_result(f"{value:g} {_UNITS}, battery {battery_mv:.0f} mV")
@@ -233,7 +172,7 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     places = np.linspace(start, end, arguments.readings)
     if arguments.arm is None or _bench.parse_arm(arguments.arm).is_lego:  # before connecting to the brick
         require_within_reach(geometry, places, "reading of the scan")
-    instrument, _ = open_instrument(arguments, geometry)
+    instrument, _ = _bench.open_instrument(arguments, geometry)
     with instrument as arm:
         require_within_reach(arm.reach, places, "reading of the scan")
         names = ["battery_mv"] if isinstance(arm, LegoArm) else None  # an own instrument's are those of its readings
@@ -260,12 +199,12 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
     places = places or [(width / 2, height / 2), *((x, y) for x, y in spread_mark_places(geometry).tolist())]
     require(len(places) >= 2, "X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_within_reach(geometry, np.array(places), "place")
-    instrument, bench = open_instrument(arguments, geometry, scene=_WHITE)
+    instrument, bench = _bench.open_instrument(arguments, geometry, scene=_WHITE)
     assert isinstance(instrument, LegoArm)
     with instrument as arm:
         if bench is None:
             paper = "lay white matt paper, the same everywhere, over the field, or under each place"
-            prompter_unless_dry_run(arguments, arm)(paper)
+            _bench.prompter_unless_dry_run(arguments, arm)(paper)
 
         def height_reading_at(place: tuple[float, float], height_mm: float) -> tuple[float, float, float]:
             arm.go_down(*place, height_mm)
@@ -317,7 +256,7 @@ def _fit_geometry_to_marks(arguments: argparse.Namespace, geometry: Geometry) ->
     out = checked_output_file(arguments.out, arguments.geometry)
     require(not arguments.dry_run, "--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
-        raise CommandError(f"{_NO_ARM}; or fit existing marks, --marks MARKS.csv")
+        raise CommandError(f"{_bench.NO_ARM}; or fit existing marks, --marks MARKS.csv")
     if arguments.marks is None and is_device_or_pipe(out):
         raise ParameterError("--out", str(out), "a file, beside which the marks are kept; or name them with --marks")
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
@@ -341,7 +280,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     taken = np.concatenate(read_turns_and_places(kept), axis=1).tolist() if kept.exists() else []
     done = {(x, y) for *_, x, y, _ in taken}
     marks = [(x, y) for x, y in spread_mark_places(geometry).tolist()]
-    instrument, bench = open_instrument(arguments, geometry, watched=True)
+    instrument, bench = _bench.open_instrument(arguments, geometry, watched=True)
     assert isinstance(instrument, LegoArm)
 
     def kept_message() -> str:

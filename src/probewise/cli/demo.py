@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from probewise import diagnosis as engine
 from probewise._words import count_with_noun
 from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
@@ -20,7 +21,7 @@ from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
 from probewise.cli import diagnose as diagnose_verb
 from probewise.cli._common import progress_of, say
 from probewise.cli._executor import worker_pool
-from probewise.diagnosis import Diagnosis, diagnose
+from probewise.diagnosis import Diagnosis
 from probewise.experiment import (
     Exploration,
     HiddenShape,
@@ -185,4 +186,4 @@ def _search(
 
 def diagnose_shipped_recording(seed: int) -> Diagnosis:
     """Diagnose the second recording, with the same result as `probewise diagnose`."""
-    return diagnose(read_recording(shipped("concealed")), rng=diagnose_verb.generators_of_diagnosis(seed)[0])
+    return engine.diagnose(read_recording(shipped("concealed")), rng=diagnose_verb.generators_of_diagnosis(seed)[0])

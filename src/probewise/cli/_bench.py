@@ -374,13 +374,12 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
             write_to_terminal(sys.stderr, text)
             # Reading a line cannot be interrupted, so it runs in a daemon thread.
             threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
-            while True:
+            answer = None
+            while answer is None:
                 try:
                     answer = answers.get(timeout=_WAIT_S)
                 except queue.Empty:
                     keep_awake()
-                else:
-                    break
         if not answer:
             raise CommandError("nobody is there to press Enter: standard input has ended; run it in a terminal")
         return answer.strip()

@@ -7,10 +7,10 @@ import contextlib
 import glob
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from probewise import recordings
 from probewise.arm import Geometry, read_geometry, shipped_geometry_path
@@ -126,7 +126,9 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[recor
     if not journal.entries:
         raise FileError(path, "no reading", "a journal with at least one measurement")
     with _key_errors_of(path, "options", "options as explore writes them"):
-        step, low, high = _declared(journal.settings["options"])
+        options = journal.settings["options"]
+        low, high = options["reading_range"]
+        step, low, high = (None if value is None else float(value) for value in (options["step"], low, high))
     if not all(value is None or math.isfinite(value) for value in (step, low, high)) or (
         step is not None and step <= 0
     ):
@@ -141,12 +143,6 @@ def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[recor
     if shape is None:
         raise FileError(path, f"shape {written}", allowed, row=1, column="shape")
     return replace(recording, notes=(*recording.notes, *journal.notes)), shape
-
-
-def _declared(options: Mapping[str, Any]) -> tuple[float | None, ...]:
-    """Return step and range of the readings that a run declared; None: none."""
-    low, high = options["reading_range"]
-    return tuple(None if value is None else float(value) for value in (options["step"], low, high))
 
 
 @contextlib.contextmanager

@@ -18,12 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of_readings, shipped_geometry_path
-from probewise.cli._bench import SimulatedBench, plan_for_lego_arm
+from probewise.arm import carry_out, read_geometry, recording_of_readings, shipped_geometry_path
+from probewise.cli._bench import ArmName, open_arm, plan_for_lego_arm
 from probewise.diagnosis import diagnose
 from probewise.proof.estimates import estimated_share
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
-from probewise.world.shipped import true_world
 
 
 def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.ndarray]:
@@ -31,10 +30,9 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     geometry = read_geometry(file)
     plan = plan_for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
-    bench = SimulatedBench(true_world("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
-    arm = bench.open_emulated_arm(geometry, file)
+    arm, bench = open_arm(ArmName("emulator"), geometry, file, seed=seed)
     stands, read = [], arm.read_here
-    arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]
+    arm.read_here = lambda: (stands.append(bench.stand()), read())[1]  # type: ignore[method-assign,misc]
     with arm:
         readings = list(
             carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.carry_out_request, plan.patterns, origin_mm))

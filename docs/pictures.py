@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.cli._common import DEFAULT_SEED
+from probewise.cli._options import DEFAULT_SEED
 from probewise.cli.diagnose import generators_of_diagnosis
 from probewise.diagnosis import diagnose_system
 from probewise.report.diagnosis_figures import before_and_after

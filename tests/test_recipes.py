@@ -108,7 +108,7 @@ def test_a_system(tmp_path):
 
 
 def test_a_verb(capsys):
-    define_options = example("add_arguments", "probewise.cli.arm", "probewise.cli._common")
+    define_options = example("_tally", "probewise.cli._options", "probewise.cli.predict")
     parser = argparse.ArgumentParser()
     define_options(parser)
     assert define_options.__globals__["run"](parser.parse_args([str(files("probewise.data") / "paper.csv")])) == 0

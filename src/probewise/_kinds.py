@@ -161,9 +161,8 @@ def checked_text(name: str, value: object, allowed: str = "a text") -> str:
 def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
     """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text."""
     if isinstance(value, str) or not isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping):
-        raise ParameterError(
-            name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
-        )
+        shown = f": [{value!r}]" if isinstance(value, str) else ""
+        raise ParameterError(name, value, f"{allowed}, in a list{shown}")
     return tuple(checked_text(name, each, allowed) for each in value)
 
 

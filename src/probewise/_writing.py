@@ -159,9 +159,8 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
         what = "is no directory" if nearest.is_symlink() else "is a file"
-        raise ParameterError(
-            "--out", str(path), f"a directory, existing or new; {'this' if nearest == path else nearest} {what}"
-        )
+        here = "this" if nearest == path else nearest
+        raise ParameterError("--out", str(path), f"a directory, existing or new; {here} {what}")
     _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=nearest))
@@ -323,10 +322,13 @@ class NotDrawnError(ProbewiseError):
 
 
 class Drawings:
-    """Figures and pages of a run, drawn after its results were written: if one fails, only that one is missing."""
+    """Figures and pages of a run, drawn after its results were written: if one fails, only that one is missing.
+
+    `notes` are lines to print, on inputs that got another name, and on results that were replaced.
+    """
 
     def __init__(self, out: Path) -> None:
-        self.out = out
+        self.out, self.notes = out, list[str]()
         self._failed: dict[str, str] = {}
 
     def draw(self, name: str, drawer: Callable[[], bytes]) -> bytes:
@@ -372,18 +374,17 @@ class Drawings:
         inputs: Sequence[Path] = (),
         outdated: Sequence[str] = (),
         progress: Progress = silent,
-    ) -> list[str]:
+    ) -> None:
         """Write the files of a run, all or none, by a function of the `StagedFiles`; then figures and page.
 
-        Files of an earlier run, of the patterns `outdated`, are removed. Return lines on inputs that got another name,
-        and on results that were replaced.
+        Files of an earlier run, of the patterns `outdated`, are removed.
         """
         progress("writing the results")
         with staged_output(self.out, inputs=inputs, outdated=(*outdated, *drawers, PAGE)) as stage:
             files(stage)
         self.write_report(drawers, page, inputs=inputs, progress=progress)
-        replaced = ["note: the results of an earlier run there were replaced"] * stage.replaces
-        return [f"note: what was {path} is now {now}" for path, now in stage.kept.items()] + replaced
+        self.notes = [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
+        self.notes += ["note: the results of an earlier run there were replaced"] * stage.replaces
 
     def raise_if_any_failed(self) -> None:
         """Raise NotDrawnError, in one line, if something could not be drawn."""

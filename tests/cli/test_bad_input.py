@@ -8,7 +8,7 @@ import pytest
 
 from probewise.arm import shipped_geometry_path
 from probewise.cli import VERBS, main
-from probewise.cli._explore import parse_truth
+from probewise.cli.explore import parse_truth
 from probewise.scene import Field
 
 

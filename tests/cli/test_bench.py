@@ -5,7 +5,7 @@ import pytest
 from command import run
 
 from probewise.calibration import predict, read_sensor
-from probewise.cli._bench import shifted_pattern, world_and_instrumentation
+from probewise.cli._bench import shifted_pattern, world_and_scale
 from probewise.errors import ParameterError
 from probewise.recordings import (
     Disc,
@@ -36,7 +36,7 @@ PATTERNS = [
 
 @pytest.mark.parametrize("pattern", PATTERNS, ids=lambda pattern: type(pattern).__name__)
 def test_a_pattern_that_was_moved_reads_at_its_new_place_as_it_did_at_its_old(pattern):
-    world, _ = world_and_instrumentation(None)
+    world, _ = world_and_scale(None)
     for x_mm, y_mm, turned_rad in ((0.0, 0.0, 0.0), (4.0, 1.0, 1.0), (-3.0, 6.0, 2.0)):
         here = world.read(pattern, x_mm, y_mm, turned_rad, time_s=0.0, rng=None)
         there = world.read(

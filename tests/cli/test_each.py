@@ -36,7 +36,7 @@ def test_each_recording_has_a_row_and_a_folder_and_is_diagnosed_once(tmp_path, m
     assert not (out / "1.10").exists()
     page = (out / "report.html").read_text()
     assert page.index("b/report.html") < page.index("a/report.html")
-    monkeypatch.setattr("probewise.cli._each._diagnosed", lambda words: pytest.fail("diagnosed again"))
+    monkeypatch.setattr("probewise.cli.diagnose._diagnosed", lambda words: pytest.fail("diagnosed again"))
     assert main([*given[:3], *given[4:]]) == 0  # without the one that was refused
     assert main(["diagnose", files[0], "--out", str(out), "--workers", "2"]) == 2
     assert "for --each" in capsys.readouterr().err

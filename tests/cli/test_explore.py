@@ -12,7 +12,7 @@ from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main, parser
 from probewise.cli._bench import InstrumentWithCallbacks
-from probewise.cli._explore import Run
+from probewise.cli.explore import Search
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -101,7 +101,7 @@ def test_how_the_sensor_stands_and_how_often_it_reads_may_be_chosen_and_are_kept
 @pytest.mark.usefixtures("at_14_mm")
 def test_the_lego_arms_own_height_may_be_named(sensor_file, tmp_path):
     words = ("explore", "--sensor", sensor_file, "--out", tmp_path, "--heights", "14", "--arm", "nxt:/dev/null")
-    assert Run(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
+    assert Search(parser().parse_args([str(word) for word in words])).experiment.heights_mm == (14.0,)
 
 
 def test_what_is_found_wrong_when_the_first_place_is_chosen_leaves_nothing_behind(sensor_file, tmp_path, capsys):
@@ -181,7 +181,7 @@ def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships
     given = ["explore", "--out", str(out), "--trust", "1", "--max-readings"]
     assert main([*given, "2", "--quiet"]) == 0
     assert json.loads((out / "journal.jsonl").read_text().splitlines()[0])["sensor_file"] == "shipped_sensor.json"
-    monkeypatch.setattr("probewise.cli._explore.calibrate", lambda *_, **__: pytest.fail("calibrated again"))
+    monkeypatch.setattr("probewise.cli.explore.calibrate", lambda *_, **__: pytest.fail("calibrated again"))
     monkeypatch.setattr("probewise._progress._PATIENCE_S", 0.0)
     assert main([*given, "3", "--resume"]) == 0
     assert "going through the journal, 0 of 2" in capsys.readouterr().err.splitlines()[0]

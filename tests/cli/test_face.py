@@ -15,7 +15,7 @@ import pytest
 import probewise
 from probewise import verbs
 from probewise.arm import SimulatedArm
-from probewise.cli import main
+from probewise.cli import VERBS, main
 from probewise.diagnosis import audit_plan
 from probewise.effects import VOCABULARY
 from probewise.errors import ParameterError
@@ -80,7 +80,7 @@ OPTIONS = [
 @pytest.mark.parametrize(("verb", "parameter", "option"), OPTIONS)
 def test_the_command_line_and_python_have_the_same_defaults(verb, parameter, option):
     parser = argparse.ArgumentParser()
-    importlib.import_module(f"probewise.cli.{verb}").add_arguments(parser)
+    VERBS[verb][1](parser)
     theirs = parser.get_default(option)
     own = inspect.signature(getattr(verbs, verb)).parameters[parameter].default
     assert own == (tuple(theirs) if parameter == "orders" else theirs[0] if parameter == "shape" else theirs)
@@ -208,7 +208,7 @@ def test_the_verbs_take_a_table_and_a_simulator_too(tmp_path, sensor):
 
 
 def test_the_recordings_that_ship_are_called_by_their_names():
-    from probewise.cli._common import SHIPPED_RECORDINGS
+    from probewise.cli._options import SHIPPED_RECORDINGS
     from probewise.recordings.io import SHIPPED, shipped
 
     assert SHIPPED_RECORDINGS.keys() == set(SHIPPED)

@@ -9,7 +9,7 @@ from command import run
 from mixtures import fixed_mixture
 
 from probewise.calibration import read_sensor, write_sensor
-from probewise.cli._journal import find_journal_sensor_file
+from probewise.cli._inputs import find_journal_sensor_file
 from probewise.errors import FileError
 from probewise.experiment import experiment_for, sensor_entry
 from probewise.recordings import Disc, Plan

@@ -12,8 +12,8 @@ from probewise.arm import DryRun, LegoArm, RequestToPerson, read_geometry, shipp
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._bench import warn_if_place_sd_large
-from probewise.cli._fit_geometry import bring_to_mark, place_after_moves
 from probewise.cli._record import SheetCheck, person_at_bench, uniform_shades_at_places
+from probewise.cli.arm import bring_to_mark, place_after_moves
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}

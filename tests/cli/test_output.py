@@ -12,7 +12,7 @@ import pytest
 from probewise._writing import Drawings, staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._common import holds_readings
+from probewise.cli._inputs import holds_readings
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_recording, write_text_atomically
 
@@ -70,7 +70,9 @@ def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
             stage.write(other, "{}")
 
         tell = lambda *told: stages.append(told)  # noqa: E731
-        said.append(Drawings(tmp_path).write_results(write, {}, lambda drawn: "", progress=tell))
+        drawings = Drawings(tmp_path)
+        drawings.write_results(write, {}, lambda drawn: "", progress=tell)
+        said.append(drawings.notes)
     assert said == [[], ["note: the results of an earlier run there were replaced"]]
     assert stages[0] == ("writing the results",)
 

@@ -23,7 +23,7 @@ from probewise._signals import (
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import main
-from probewise.cli._explore import remove_earlier_results
+from probewise.cli.explore import remove_earlier_results
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
@@ -266,7 +266,7 @@ def test_a_sensor_file_without_results_beside_it_is_no_earlier_result(sensor_fil
 def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
     import resource
 
-    monkeypatch.setattr("probewise.cli._explore.animated_gif", lambda _: bytes(5_000_000))
+    monkeypatch.setattr("probewise.cli.explore.animated_gif", lambda _: bytes(5_000_000))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     out = tmp_path / "out"

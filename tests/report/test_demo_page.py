@@ -11,7 +11,7 @@ from PIL import Image
 import probewise
 from probewise.arm import Pose, SimulatedArm
 from probewise.cli import main
-from probewise.cli._demo import diagnose_shipped_recording
+from probewise.cli.demo import diagnose_shipped_recording
 from probewise.errors import ParameterError
 from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown

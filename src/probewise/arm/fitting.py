@@ -141,13 +141,12 @@ def fit_geometry(
     fitted = _geometry_with_values(geometry, values)
     accuracy = _accuracy_of_fit(fitted, covariance, len(marks))
     if accuracy.height_sd_mm > MOST_HEIGHT_SD_MM or accuracy.place_sd_mm > MOST_PLACE_SD_MM:
-        raise ParameterError(
-            "marks",
-            f"{len(marks)} that leave the height open to {accuracy.height_sd_mm:.1f} mm and the place to "
-            f"{accuracy.place_sd_mm:.1f} mm",
+        left_open = f"the height open to {accuracy.height_sd_mm:.1f} mm and the place to {accuracy.place_sd_mm:.1f} mm"
+        allowed = (
             f"marks that determine them to {MOST_HEIGHT_SD_MM:g} and {MOST_PLACE_SD_MM:g} mm all over the field: "
-            "more of them, touched, near and far from the base and on both sides",
+            "more of them, touched, near and far from the base and on both sides"
         )
+        raise ParameterError("marks", f"{len(marks)} that leave {left_open}", allowed)
     before, sds = fitted_parameter_values(geometry), np.sqrt(np.diagonal(covariance))
     return FittedGeometry(replace(fitted, accuracy=accuracy), before, values, sds, residuals, p_value)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Side
-from probewise.errors import ParameterError, ShapeError, require
+from probewise.errors import ShapeError, require
 
 JOINTS = ("base", "shoulder", "elbow")
 """The joints in the order of the columns of all arrays of angles."""
@@ -37,27 +37,20 @@ class Joint:
     stop_rad: float | None = None  # angle of a mechanical stop, at or beyond a limit, used to find home
 
     def __post_init__(self) -> None:
+        low, high = _rounded_degrees(self.low_rad, self.high_rad)
         require(self.port in (0, 1, 2), "port", self.port, "0 to 2, for A to C")
-        if not (math.isfinite(self.gear_ratio) and abs(self.gear_ratio) >= 0.1):
-            raise ParameterError("gear_ratio", self.gear_ratio, "a finite number, 0.1 or more in magnitude")
-        if not -2 * math.pi <= self.low_rad < self.high_rad <= 2 * math.pi:
-            raise ParameterError(
-                "low_deg, high_deg",
-                _rounded_degrees(self.low_rad, self.high_rad),
-                "-360 to 360, the low one below the high",
-            )
-        if not self.low_rad <= self.home_rad <= self.high_rad:
-            low, high = _rounded_degrees(self.low_rad, self.high_rad)
-            allowed = f"an angle between low_deg and high_deg, {low:g} to {high:g}"
-            raise ParameterError("home_deg", math.degrees(self.home_rad), allowed)
-        if not 0 <= self.play_rad < self.high_rad - self.low_rad:
-            raise ParameterError("play_deg", math.degrees(self.play_rad), "0 or more, less than the joint's range")
-        if self.stop_rad is not None and not (
-            -2 * math.pi <= self.stop_rad <= self.low_rad or self.high_rad <= self.stop_rad <= 2 * math.pi
-        ):
-            raise ParameterError(
-                "stop_deg", math.degrees(self.stop_rad), "low_deg or less, or high_deg or more, within -360 to 360"
-            )
+        usable = math.isfinite(self.gear_ratio) and abs(self.gear_ratio) >= 0.1
+        require(usable, "gear_ratio", self.gear_ratio, "a finite number, 0.1 or more in magnitude")
+        ordered = -2 * math.pi <= self.low_rad < self.high_rad <= 2 * math.pi
+        require(ordered, "low_deg, high_deg", (low, high), "-360 to 360, the low one below the high")
+        within = self.low_rad <= self.home_rad <= self.high_rad
+        allowed = f"an angle between low_deg and high_deg, {low:g} to {high:g}"
+        require(within, "home_deg", math.degrees(self.home_rad), allowed)
+        small = 0 <= self.play_rad < self.high_rad - self.low_rad
+        require(small, "play_deg", math.degrees(self.play_rad), "0 or more, less than the joint's range")
+        if (stop := self.stop_rad) is not None:
+            beyond = -2 * math.pi <= stop <= self.low_rad or self.high_rad <= stop <= 2 * math.pi
+            require(beyond, "stop_deg", math.degrees(stop), "low_deg or less, or high_deg or more, within -360 to 360")
 
     @property
     def counts_per_rad(self) -> float:
@@ -112,15 +105,14 @@ class Accuracy:
         require(self.marks >= 1, "marks", self.marks, "1 or more")
         for name in ("place_sd_mm", "height_sd_mm", "scale_sd"):
             require(0 <= getattr(self, name) < math.inf, name, getattr(self, name), "0 or more")
-        shape = [len(row) for row in self.covariance]
-        if shape != [N_FITTED] * N_FITTED:
-            raise ParameterError("covariance", f"rows of {shape}", f"{N_FITTED} rows of {N_FITTED} numbers")
+        shape, square = [len(row) for row in self.covariance], [N_FITTED] * N_FITTED
+        require(shape == square, "covariance", f"rows of {shape}", f"{N_FITTED} rows of {N_FITTED} numbers")
         matrix = np.array(self.covariance)
-        if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12):
-            raise ParameterError("covariance", "a matrix that differs from its transpose", "a symmetric matrix")
+        symmetric = np.isfinite(matrix).all() and np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12)
+        require(symmetric, "covariance", "a matrix that differs from its transpose", "a symmetric matrix")
         sds = np.sqrt(np.maximum(np.diagonal(matrix), np.finfo(np.float64).tiny))
-        if np.linalg.eigvalsh(matrix / np.outer(sds, sds)).min() < -1e-6:
-            raise ParameterError("covariance", "a matrix with negative eigenvalues", "a covariance: none is negative")
+        positive = np.linalg.eigvalsh(matrix / np.outer(sds, sds)).min() >= -1e-6
+        require(positive, "covariance", "a matrix with negative eigenvalues", "a covariance: none is negative")
 
 
 @dataclass(frozen=True)
@@ -150,27 +142,22 @@ class Geometry:
         require(all(math.isfinite(number) for number in finite), "geometry", finite, "finite numbers")
         for name, value in (("field_mm", min(self.field_mm)), ("links_mm", min(self.links_mm))):
             require(value > 0, name, value, "greater than 0")
-        if not 0 < self.lowest_mm < self.read_height_mm < self.travel_height_mm < math.inf:
-            raise ParameterError(
-                "lowest_mm, read_height_mm, travel_height_mm",
-                (self.lowest_mm, self.read_height_mm, self.travel_height_mm),
-                "heights above 0, each above the one before",
-            )
-        if self.light_per_mm is not None and not 0 <= self.light_per_mm < 1:
-            raise ParameterError("light_per_mm", self.light_per_mm, "0 or more, less than 1")
+        heights = lowest, read, travel = self.lowest_mm, self.read_height_mm, self.travel_height_mm
+        names, rising = "lowest_mm, read_height_mm, travel_height_mm", 0 < lowest < read < travel < math.inf
+        require(rising, names, heights, "heights above 0, each above the one before")
+        falls = self.light_per_mm is None or 0 <= self.light_per_mm < 1
+        require(falls, "light_per_mm", self.light_per_mm, "0 or more, less than 1")
         require(self.sensor_port in range(4), "sensor port", self.sensor_port, "0 to 3, for 1 to 4")
-        if len({joint.port for joint in self.joints}) < len(self.joints):
-            raise ParameterError("ports", tuple("ABC"[j.port] for j in self.joints), "a port of its own for each joint")
+        ports = tuple("ABC"[joint.port] for joint in self.joints)
+        require(len({*ports}) == len(ports), "ports", ports, "a port of its own for each joint")
         if any(joint.stop_rad is not None for joint in (self.shoulder, self.elbow)):
             ends = [[joint.home_rad if joint.stop_rad is None else joint.stop_rad for joint in self.joints]]
             height_mm = float(self.position_mm(np.array(ends))[0, 2])
-            if height_mm < self.travel_height_mm:
-                raise ParameterError(
-                    "stop_deg",
-                    _rounded_degrees(*ends[0]),
-                    f"stops of the links at which the sensor is {self.travel_height_mm:g} mm up or more, "
-                    f"not {height_mm:.0f} mm: on the way there nothing else guards it",
-                )
+            allowed = (
+                f"stops of the links at which the sensor is {travel:g} mm up or more, not {height_mm:.0f} mm: on the "
+                "way there nothing else guards it"
+            )
+            require(height_mm >= travel, "stop_deg", _rounded_degrees(*ends[0]), allowed)
 
     @property
     def joints(self) -> tuple[Joint, Joint, Joint]:
@@ -303,7 +290,6 @@ def wrapped_to_pi(angle_rad: FloatArray) -> FloatArray:
 
 
 def _checked_rows(values: FloatArray, n: int) -> FloatArray:
-    """Return values as an array; raise ShapeError unless it has shape (any, n)."""
     rows = np.asarray(values, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != n:
         raise ShapeError(f"the rows have shape {rows.shape}; allowed: (n, {n})")

@@ -195,12 +195,11 @@ class Reach:
             raise ParameterError("nearest_mm", self.nearest_mm, f"less than farthest_mm, {self.farthest_mm:g}")
         corner = math.hypot(width / 2, height + self.axis_beyond_mm)
         if self.axis_beyond_mm > self.farthest_mm or corner < self.nearest_mm:
-            raise ReachError(
-                "field_mm",
-                self.field_mm,
+            allowed = (
                 f"a field that comes within {self.nearest_mm:g} to {self.farthest_mm:g} mm of the axis, which stands "
-                f"{self.axis_beyond_mm:g} mm beyond its upper side; move the arm or choose another field",
+                f"{self.axis_beyond_mm:g} mm beyond its upper side; move the arm or choose another field"
             )
+            raise ReachError("field_mm", self.field_mm, allowed)
 
     @property
     def axis_mm(self) -> tuple[float, float]:

@@ -130,16 +130,12 @@ class LegoArm:
         place = np.array([[pose.x_mm, pose.y_mm]])
         require_within_reach(self.geometry, place, "pose")
         if pose.height_mm not in (None, self.geometry.read_height_mm):
-            raise ReachError(
-                "height_mm", pose.height_mm, f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
-            )
+            allowed = f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
+            raise ReachError("height_mm", pose.height_mm, allowed)
         stands = float(self.orientation_rad(place)[0])
         if not abs(float(wrapped_to_pi(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
-            raise ReachError(
-                "orientation_rad",
-                pose.orientation_rad,
-                f"{stands:.4f} at this place: this arm has no wrist, its sensor turns with the base",
-            )
+            allowed = f"{stands:.4f} at this place: this arm has no wrist, its sensor turns with the base"
+            raise ReachError("orientation_rad", pose.orientation_rad, allowed)
         self.go_down(pose.x_mm, pose.y_mm)
         battery_mv = self._machine.battery_mv()  # first, so that no failure loses the reading
         value = self.read_here()
@@ -195,13 +191,9 @@ class LegoArm:
         self._lower_to(x_mm, y_mm, end_mm)
 
     def _lower_to(self, x_mm: float, y_mm: float, height_mm: float) -> None:
-        """Raise the sensor, turn the base, then lower the sensor over a place to a height."""
         goals = self._goals_at_place(x_mm, y_mm, height_mm)
         self.raise_sensor()
-        self._turn_joint_to(BASE, goals[BASE])
-        self._is_down = True
-        for joint in self._choose_link_order(goals):
-            self._turn_joint_to(joint, goals[joint])
+        self._turn_all_to(goals, lowers=True)
 
     def raise_sensor(self) -> None:
         """Raise the sensor, if lower, to about travel height by the link that needs less turn; else ReachError."""
@@ -231,13 +223,9 @@ class LegoArm:
                 self._arrived[joint] = side
                 stopped.append(joint)
         self.raise_sensor()
-        goals = [
-            JointTarget(0, side)
-            for side in self._approach_sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))
-        ]
-        self._turn_joint_to(BASE, goals[BASE])
-        for joint in self._choose_link_order(goals):
-            self._turn_joint_to(joint, goals[joint])
+        homes = np.array([joint.home_rad for joint in self.geometry.joints])
+        goals = [JointTarget(0, side) for side in self._approach_sides_of(homes)]
+        self._turn_all_to(goals)
         if stopped:
             self._machine.reset(stopped)
 
@@ -281,12 +269,9 @@ class LegoArm:
         return self._goals_at_angles(angles)
 
     def _goals_at_angles(self, angles_rad: FloatArray) -> list[JointTarget]:
-        return [
-            JointTarget(joint.counts_at(float(angle), side), side)
-            for joint, angle, side in zip(
-                self.geometry.joints, angles_rad, self._approach_sides_of(angles_rad), strict=True
-            )
-        ]
+        sides = self._approach_sides_of(angles_rad)
+        rows = zip(self.geometry.joints, angles_rad, sides, strict=True)
+        return [JointTarget(joint.counts_at(float(angle), side), side) for joint, angle, side in rows]
 
     def _approach_sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
         """Return for each joint whether it approaches these angles, (3,), with its angle rising (1) or falling (-1).
@@ -334,6 +319,12 @@ class LegoArm:
         far = int(math.copysign(max(abs(way), ROOM_COUNTS), way))
         end = sorted(mechanics.counts_at(angle) - here for angle in (mechanics.low_rad, mechanics.high_rad))
         return abs(way), joint, here + min(max(far, end[0]), end[1])
+
+    def _turn_all_to(self, goals: Sequence[JointTarget], *, lowers: bool = False) -> None:
+        self._turn_joint_to(BASE, goals[BASE])
+        self._is_down = self._is_down or lowers
+        for joint in self._choose_link_order(goals):
+            self._turn_joint_to(joint, goals[joint])
 
     def _turn_joint_to(self, joint: int, goal: JointTarget) -> None:
         side: Side = 1 if (goal.side > 0) == (self.geometry.joints[joint].gear_ratio > 0) else -1

@@ -55,18 +55,13 @@ class SoftLimits:
         angle, start = mechanics.angle_at(to), mechanics.angle_at(here)
         low, high = min(mechanics.low_rad, start), max(mechanics.high_rad, start)
         if not low <= angle <= high:
-            raise ReachError(
-                JOINTS[joint],
-                f"{math.degrees(angle):.1f} degrees",
-                f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees",
-            )
+            allowed = f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees"
+            raise ReachError(JOINTS[joint], f"{math.degrees(angle):.1f} degrees", allowed)
         heights = self.heights_along_move_mm(self.last_counts, joint, to, here)
         if heights.min() < min(geometry.lowest_mm, float(heights[0])):
-            raise ReachError(
-                f"the sensor's height while the {JOINTS[joint]} moves",
-                f"{heights.min():.0f} mm",
-                f"{geometry.lowest_mm:g} mm or more; is the arm where its counters say? home it",
-            )
+            moving = f"the sensor's height while the {JOINTS[joint]} moves"
+            allowed = f"{geometry.lowest_mm:g} mm or more; is the arm where its counters say? home it"
+            raise ReachError(moving, f"{heights.min():.0f} mm", allowed)
 
 
 class Machine(Protocol):

@@ -1,4 +1,4 @@
-"""The command line `probewise`: one file per verb.
+"""The command line `probewise`: the options of all verbs are in `_options`, what a verb does in the file of its name.
 
 The steps of the paper as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
 (sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can detect), `diagnose` (what the model leaves out),
@@ -18,56 +18,15 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
-from types import ModuleType
+from collections.abc import Sequence
 
 from probewise._signals import Stopped, stoppable
 from probewise._writing import NotDrawnError
-from probewise.cli._common import OneLineParser, OutputError, error_in_one_line, print_complaint, print_warning
+from probewise.cli._common import OutputError, error_in_one_line, print_complaint, print_warning
+from probewise.cli._options import VERBS, parser
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
-
-VERBS: Mapping[str, str] = {
-    "demo": "Run everything: calibrate, find a hidden circle with two models, diagnose.",
-    "calibrate": "Fit the sensor model of a recording; choose the number of Gaussians.",
-    "predict": "Predict the readings of a plan: mean, sd and log density of each row.",
-    "explore": "Let the robot find a shape, choosing each measurement itself.",
-    "study": "Measure how many readings the robot needs, over many circles.",
-    "audit": "List, before any data, the effects that a plan cannot detect or tell apart.",
-    "diagnose": "Find which physics a sensor model, or a simulator of your own, leaves out of recordings.",
-    "investigate": "Record, diagnose, take the readings that the diagnosis advises, until it is settled.",
-    "fit": "Fit a simulator of your own to a table: posterior, evidence, residuals; no diagnosis.",
-    "challenge": "Measure how good a diagnosis is, on recordings with concealed effects.",
-    "sheets": "Draw the patterns for a bench at true scale, to print.",
-    "arm": "Check, move and read the LEGO arm; record a plan with it or another arm.",
-    "emulate-nxt": "Emulate a LEGO brick with the arm, behind a serial device.",
-}
-"""Each verb with its summary; `add_arguments` and `run` are in the module of its name."""
-
-
-def parser(words: Sequence[str] | None = None) -> OneLineParser:
-    """Build the parser of the whole command line; given `words`, only verbs among them get their options.
-
-    Other verbs need not be imported then.
-    """
-    from probewise import __version__
-
-    top = OneLineParser(
-        prog="probewise",
-        description="Model a sensor, let it choose its own measurements, find the physics its model leaves out.",
-    )
-    top.add_argument("--version", action="version", version=f"probewise {__version__}")
-    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=OneLineParser)
-    for name, summary in VERBS.items():
-        added = verbs.add_parser(name, help=summary, description=summary)
-        if words is None or name in words:
-            _module_of(name).add_arguments(added)
-    return top
-
-
-def _module_of(verb: str) -> ModuleType:
-    return importlib.import_module(f"probewise.cli.{verb.replace('-', '_')}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     _replace_closed_streams()
     try:
-        arguments = parser(words).parse_args(words)
+        arguments = parser().parse_args(words)
     except SystemExit as stop:  # argparse exits this way after --help, --version and errors
         return stop.code if isinstance(stop.code, int) else 2
     arguments.words = words
@@ -85,31 +44,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _write_warning
         try:
             with stoppable():
-                return int(_module_of(verb).run(arguments))
+                return int(importlib.import_module(f"probewise.cli.{verb.replace('-', '_')}").run(arguments))
         except Stopped as stop:
-            _write_complaint(verb, f"stopped; {str(stop) or 'nothing was written'}")
-            _discard_unwritable_output()
-            return stop.status
+            status, said = stop.status, f"stopped; {str(stop) or 'nothing was written'}"
         except OutputError as error:
             out = getattr(arguments, "out", None)
             kept = "" if out is None or not out.exists() else f"; what was written is kept: {out}"
-            _write_complaint(verb, f"{error}{kept}")
-            _discard_unwritable_output()
-            return 2
+            status, said = 2, f"{error}{kept}"
         except (NotConvergedError, LinkError, NotDrawnError) as error:
-            _write_complaint(verb, str(error))
-            return 1
+            status, said = 1, str(error)
         except BrokenPipeError:  # the reader of a pipe has closed it; written files are complete
-            _discard_unwritable_output()
-            return 1
+            status, said = 1, ""
         except (ProbewiseError, OSError) as error:
-            _write_complaint(verb, error_in_one_line(error))
-            _discard_unwritable_output()
-            return 2
-
-
-def _write_complaint(verb: str, text: str) -> None:
-    print_complaint(f"probewise {verb}: {text}")
+            status, said = 2, error_in_one_line(error)
+        if said:
+            print_complaint(f"probewise {verb}: {said}")
+        _discard_unwritable_output()
+        return status
 
 
 def _replace_closed_streams() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 import math
@@ -12,7 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from tqdm import tqdm
@@ -20,6 +21,7 @@ from tqdm import tqdm
 from probewise import emulator, recordings
 from probewise._signals import raise_if_stopped
 from probewise.arm import (
+    DryRun,
     Geometry,
     Instrument,
     LegoArm,
@@ -31,39 +33,70 @@ from probewise.arm import (
     SimulatedArm,
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.cli._arm import SCENE, ArmName
-from probewise.cli._common import DEFAULT_SEED, CommandError, parse_finite_numbers, print_warning, write_to_terminal
-from probewise.errors import ParameterError, require
+from probewise.cli._common import CommandError, print_result, print_warning, say, write_to_terminal
+from probewise.cli._options import ARMS, DEFAULT_SEED, SCENE, parse_finite_numbers, refuse_options
+from probewise.errors import ParameterError, did_you_mean, require
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World
 
 _WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-alives of the brick
 _SEEN_MM = 0.5  # least offset of the sensor from a mark, and gap above the block, that a simulated person notices
+Opened: TypeAlias = "tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]"
+"""An arm with its simulated bench, None for a real arm."""
+
+NO_ARM = "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0"
 
 
 # Opening an arm
 
 
+@dataclasses.dataclass(frozen=True)
+class ArmName:
+    """An arm as chosen by --arm: its `kind`, and `where`: its port or file, or an emulated arm's true geometry file.
+
+    A real one is a brick or a user's own instrument; the reach of a LEGO arm, real or emulated, follows from its
+    geometry, from which the arm as built may differ.
+    """
+
+    kind: str
+    where: str = ""
+
+    @property
+    def is_real(self) -> bool:
+        return self.kind in ("nxt", "file")
+
+    @property
+    def is_lego(self) -> bool:
+        return self.kind in ("nxt", "emulator")
+
+    @property
+    def may_differ_from_geometry(self) -> bool:
+        return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
+
+
+def parse_arm(text: str) -> ArmName:
+    """Parse the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py"."""
+    if text in ("simulated", "emulator"):
+        return ArmName(text)
+    kind, _, where = text.partition(":")
+    if kind in ("emulator", "nxt") and where:
+        return ArmName(kind, where)
+    if text.endswith(".py"):
+        return ArmName("file", text)
+    meant = "; its port is missing" if kind == "nxt" else did_you_mean(kind, ("simulated", "emulator", "nxt"))
+    raise ParameterError("--arm", text, ARMS + meant)
+
+
 def open_brick(port: str) -> Brick:
-    """Connect to the LEGO brick at a port."""
     return Brick.open(port)
 
 
 def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
-    """Connect to the LEGO brick at a port; return its arm."""
     return LegoArm(BrickMachine(open_brick(port), geometry), geometry, start_s=start_s)
 
 
-def open_real_arm(chosen: ArmName, geometry: Geometry | None, *, start_s: float) -> LegoArm | OwnInstrument:
-    """Open a brick's arm, or a user's instrument, whose `connect()` is called when the instrument is entered."""
-    if chosen.kind == "file":
-        return OwnInstrument.from_file(chosen.where, start_s=start_s)
-    assert geometry is not None
-    return open_nxt_arm(chosen.where, geometry, start_s=start_s)
-
-
-def open_arm_and_bench(
+def open_arm(
     chosen: ArmName,
     geometry: Geometry,
     geometry_file: Path | None,
@@ -73,36 +106,101 @@ def open_arm_and_bench(
     seed: int = DEFAULT_SEED,
     start_s: float = 0.0,
     n_taken: int = 0,
-) -> tuple[LegoArm | OwnInstrument | SimulatedArm, SimulatedBench | None]:
-    """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
+) -> Opened:
+    """Open an arm; return it with its simulated bench, None for a real arm.
 
-    With a `geometry_file`, the simulated arm has the geometry's reach. A simulated or emulated arm has the sensor of
-    the file `sensor`, the initial target `scene`, and noise of this `seed`, after the `n_taken` readings of an earlier
-    session.
+    A user's instrument is connected when it is entered. With a `geometry_file`, the simulated arm has the geometry's
+    reach. A simulated or emulated arm has the sensor of the file `sensor`, the initial target `scene`, and noise of
+    this `seed`, after the `n_taken` readings of an earlier session.
     """
-    if chosen.is_real:
-        return open_real_arm(chosen, geometry, start_s=start_s), None
-    from probewise.experiment import scale_of
-
-    world, instrumentation = world_and_instrumentation(sensor)
-    if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
-        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
-    scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
-    bench = SimulatedBench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
+    if chosen.kind == "file":
+        return OwnInstrument.from_file(chosen.where, start_s=start_s), None
+    if chosen.kind == "nxt":
+        return open_nxt_arm(chosen.where, geometry, start_s=start_s), None
+    world, scale = world_and_scale(sensor, lego=chosen.is_lego)
+    table = emulator.Tabletop(emulator.parse_scene(scene))
     if chosen.is_lego:
-        return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
-    return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
+        built, seed = chosen.where or geometry_file, seed + n_taken
+        arm, bench = open_emulated_arm_and_bench(geometry, built, world, table.surface, seed=seed, start_s=start_s)
+        return arm, SimulatedBench(bench.table, bench.arm.sensor_pose)
+    number = itertools.count(n_taken)
+
+    def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
+        rng = np.random.default_rng([seed, next(number)])
+        place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
+        return world.read(table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
+
+    reach = None if geometry_file is None else geometry
+    make = partial(SimulatedArm, read_world, reach=reach, scale=scale, height_mm=world.height_mm)
+    return make(last=Reading(math.nan, make().pose, start_s)), SimulatedBench(table)
+
+
+def open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    """Open the arm of --arm, or for --dry-run one that only prints its moves."""
+    if arguments.dry_run:
+        return LegoArm(DryRun(geometry, print_result), geometry, start_s=start_s)
+    if arguments.arm is None:
+        raise CommandError(f"{NO_ARM}; or --dry-run prints the moves only")
+    return open_nxt_arm(nxt_port(arguments.arm), geometry, start_s=start_s)
+
+
+def open_instrument(
+    arguments: argparse.Namespace, geometry: Geometry, *, scene: str = SCENE, watched: bool = False, **taken: Any
+) -> Opened:
+    """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm.
+
+    Unless a person watches all its moves, its first lowering is confirmed. `taken` says, by `start_s` and `n_taken`,
+    what an earlier session has read.
+    """
+    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    if chosen is None or chosen.kind == "nxt":
+        refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
+        opened: Opened = open_lego_arm(arguments, geometry, start_s=taken.get("start_s", 0.0)), None
+    else:
+        require(not arguments.dry_run, "--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
+        if chosen.kind == "file":
+            refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
+        options: dict[str, Any] = {"sensor": None, "scene": scene, "seed": DEFAULT_SEED}
+        given = {name: getattr(arguments, name, None) for name in options}
+        options |= {name: value for name, value in given.items() if value is not None}
+        opened = open_arm(chosen, geometry, arguments.geometry, **options, **taken)
+        if opened[1] is not None and arguments.task != "scan":
+            say(arguments, f"seed {options['seed']}")
+    if chosen is not None and not arguments.dry_run and not watched:
+        confirm_lowering(chosen, opened[0], geometry)
+    return opened
+
+
+def nxt_port(name: str) -> str:
+    """Return the port of "nxt:PORT"; raise ParameterError for any other arm."""
+    chosen = parse_arm(name)
+    require(chosen.kind != "file", "--arm", name, "nxt:PORT; FILE.py is for `arm scan`, `arm record` and `explore`")
+    if chosen.kind != "nxt":
+        allowed = "nxt:PORT, also that of `probewise emulate-nxt`, a brick in software; --dry-run prints the moves"
+        raise ParameterError("--arm", name, allowed)
+    return chosen.where
+
+
+def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
+    """Return a function that prompts the person; in a dry run, it only prints the request."""
+    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
 
 
 def open_emulated_arm_and_bench(
-    geometry: Geometry, geometry_file: Path | None, world: World, surface: Surface, *, seed: int, start_s: float = 0.0
+    geometry: Geometry,
+    geometry_file: str | Path | None,
+    world: World,
+    surface: Surface,
+    *,
+    seed: int,
+    start_s: float = 0.0,
 ) -> tuple[LegoArm, emulator.EmulatedBench]:
     """Open the LEGO arm on an emulated brick, built as `geometry_file` says, over a simulated table; and its bench.
 
     The clock runs as fast as possible. When the arm's `with` block ends, it warns if the sensor hit the table.
     """
     clock = emulator.VirtualClock()
-    numbers = emulator.read_geometry(geometry_file or emulator.shipped_geometry_path())
+    numbers = emulator.read_geometry(Path(geometry_file or emulator.shipped_geometry_path()))
     bench = emulator.set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(emulator.VirtualLine(bench.radio, clock), clock=clock), clock=clock)
 
@@ -121,17 +219,22 @@ def open_emulated_arm_and_bench(
     return TableContactReporter(BrickMachine(brick, geometry), geometry, clock=clock, start_s=start_s), bench
 
 
-def world_and_instrumentation(sensor: Path | None) -> tuple[World, recordings.Instrumentation | None]:
-    """Return the world and instrumentation of a sensor.json; for None the shipped recordings' world, and None."""
+def world_and_scale(sensor: Path | None, *, lego: bool = False) -> tuple[World, ReadingScale]:
+    """Return the world of a sensor.json and the scale of its readings; for None those of the shipped recordings.
+
+    Raises ParameterError if the sensor of a LEGO arm reads in another unit.
+    """
     if sensor is None:
         from probewise.world.shipped import true_world
 
-        return true_world("paper"), None
+        return true_world("paper"), ReadingScale()
     from probewise.calibration import read_sensor
-    from probewise.experiment import world_like
+    from probewise.experiment import scale_of, world_like
 
     fitted = read_sensor(sensor)
-    return world_like(fitted), fitted.instrumentation
+    if lego and fitted.instrumentation.unit not in ("", "LEGO"):
+        raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
+    return world_like(fitted), scale_of(fitted.instrumentation)
 
 
 class InstrumentWithCallbacks:
@@ -151,44 +254,21 @@ class InstrumentWithCallbacks:
         return reading
 
 
+@dataclasses.dataclass(frozen=True)
 class SimulatedBench:
-    """A table under a simulated or an emulated arm, on which the program itself lays the patterns.
+    """The table under a simulated or an emulated arm, on which the program itself lays the patterns.
 
-    `scene` is the initial target, in the format of `emulate-nxt`; `scale` that of the simulated arm's readings; `seed`
-    that of the noise, which continues after the `n_taken` readings of an earlier session.
+    `stand` returns where an emulated arm's sensor truly is; a simulated one (None) is where it was commanded.
     """
 
-    def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
-        self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
-        self._table = emulator.Tabletop(emulator.parse_scene(scene))
-        self._stand: Callable[[], emulator.SensorPose] | None = None
-
-    def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
-        """Return the simulated arm over the table; its sensor takes any orientation."""
-        number = itertools.count(self._n_taken)
-
-        def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
-            rng = np.random.default_rng([self._seed, next(number)])
-            place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
-            return self._world.read(self._table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
-
-        make = partial(SimulatedArm, read_world, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
-        return make(last=Reading(math.nan, make().pose, start_s))
-
-    def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
-        """Return the LEGO arm over the table, on an emulated brick."""
-        surface, seed = self._table.surface, self._seed + self._n_taken
-        arm, bench = open_emulated_arm_and_bench(
-            geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s
-        )
-        self._table, self._stand = bench.table, bench.arm.sensor_pose
-        return arm
+    table: emulator.Tabletop
+    stand: Callable[[], emulator.SensorPose] | None = None
 
     def answer_at_mark(self, mark_mm: tuple[float, float], block_mm: float) -> str:
         """Answer like a person who watches an emulated arm's sensor over a mark: "ok", or moves, "x 5 down 2"."""
-        if self._stand is None:
+        if self.stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
-        stand = self._stand()
+        stand = self.stand()
         across = (mark_mm[0] - stand.x_mm, mark_mm[1] - stand.y_mm)
         gap_mm = stand.height_mm - block_mm
         words = [
@@ -207,9 +287,9 @@ class SimulatedBench:
     ) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if request.pattern is not None:
-            self._table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
+            self.table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
         if request.turned_rad is not None:
-            self._table.turned_rad = request.turned_rad
+            self.table.turned_rad = request.turned_rad
 
 
 def shifted_pattern(pattern: recordings.Pattern, by_mm: tuple[float, float]) -> Surface:
@@ -294,13 +374,12 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
             write_to_terminal(sys.stderr, text)
             # Reading a line cannot be interrupted, so it runs in a daemon thread.
             threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
-            while True:
+            answer = None
+            while answer is None:
                 try:
                     answer = answers.get(timeout=_WAIT_S)
                 except queue.Empty:
                     keep_awake()
-                else:
-                    break
         if not answer:
             raise CommandError("nobody is there to press Enter: standard input has ended; run it in a terminal")
         return answer.strip()
@@ -309,30 +388,26 @@ def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
 
 
 def _read_line() -> str:
-    """Read a line of standard input; "" if it has ended or cannot be read."""
     try:
         return "" if sys.stdin is None else sys.stdin.readline()
     except (OSError, ValueError):
         return ""
 
 
-def enable_confirmed_lowering(arm: LegoArm) -> None:
-    """Make the arm ask a person, at its first lowering, to confirm each step."""
-    ask = prompter(arm)
-
-    def confirm(height_mm: float) -> None:
-        ask(f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further")
-
-    arm.first_down = confirm
-
-
-def warn_and_confirm_lowering(chosen: ArmName, instrument: Instrument, geometry: Geometry | None) -> None:
+def confirm_lowering(chosen: ArmName, arm: Instrument, geometry: Geometry | None) -> None:
     """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
-    if geometry is None or not chosen.may_differ_from_geometry or not isinstance(instrument, LegoArm):
+    if geometry is None or not chosen.may_differ_from_geometry or not isinstance(arm, LegoArm):
         return
     warn_if_clearance_doubtful(geometry)
     if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
-        enable_confirmed_lowering(instrument)
+        confirm_each_step_down(arm)
+
+
+def confirm_each_step_down(arm: LegoArm) -> None:
+    ask = prompter(arm)
+    arm.first_down = lambda height_mm: ask(
+        f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further"
+    )
 
 
 def warn_if_clearance_doubtful(geometry: Geometry) -> None:

@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import multiprocessing
 import os
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import Drawings
-from probewise.cli._common import add, count_up_to, finish, message_to_resume
+from probewise.cli._common import finish, message_to_resume, progress_of
 from probewise.errors import DoubtfulResultWarning, LinkError
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor, ProcessPoolExecutor
-
     from probewise.proof.campaign import Campaign, Result
     from probewise.proof.pages import CampaignPage
 
 K = TypeVar("K")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-def add_executor(parser: argparse.ArgumentParser) -> None:
-    """Add --workers and --scheduler."""
-    where = parser.add_mutually_exclusive_group()
-    add(where, "--workers N", "processes here (default 1)", type=count_up_to(1024), default=1)
-    add(where, "--scheduler HOST:PORT", "a dask scheduler whose workers do it (extra `cluster`)")
 
 
 def open_executor(arguments: argparse.Namespace) -> AbstractContextManager[Executor | None]:
@@ -51,7 +45,6 @@ def run_and_report(
     said: str = "",
 ) -> int:
     """Run what a campaign's `file` in --out lacks; write table and report; the last line printed begins with `said`."""
-    from probewise._progress import progress_shown
     from probewise.proof.campaign import read_campaign
 
     out: Path = arguments.out
@@ -63,19 +56,15 @@ def run_and_report(
         n_done = len(read_campaign(out / file).results)
         return message_to_resume(out / file, n_done, campaign.noun.removesuffix("s"), arguments)
 
-    with (
-        reporting_what_is_kept(kept),
-        progress_shown(quiet=arguments.quiet) as progress,
-        open_executor(arguments) as executor,
-    ):
+    with reporting_what_is_kept(kept), progress_of(arguments) as progress, open_executor(arguments) as executor:
         results = campaign.run(path=out / file, executor=executor, progress=progress)
     drawings = Drawings(out)
-    with reporting_what_is_kept(kept, results=True), progress_shown(quiet=arguments.quiet) as progress:
+    with reporting_what_is_kept(kept, results=True), progress_of(arguments) as progress:
         page = page_of(results)
         drawings.write_results(
             lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw), progress=progress
         )
-    return finish(drawings, page.sentence, f"{said}written to {out}", quiet=arguments.quiet)
+    return finish(arguments, drawings, page.sentence, f"{said}written to {out}")
 
 
 @contextlib.contextmanager
@@ -106,9 +95,6 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
 
     They are spawned, not forked, for the same behaviour on every system.
     """
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
     _start_tracker_without_hangups()
@@ -125,8 +111,6 @@ def worker_pool(n: int) -> Iterator[ProcessPoolExecutor]:
 
 def _start_tracker_without_hangups() -> None:
     """Start the process that tracks shared resources so that it outlives a closed terminal, without complaints."""
-    from multiprocessing import resource_tracker
-
     if hasattr(signal, "SIGHUP") and threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         resource_tracker.ensure_running()

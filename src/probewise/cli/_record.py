@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._progress import progress_shown
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import (
@@ -31,10 +30,11 @@ from probewise.arm import (
 )
 from probewise.arm.carry_out import BY_HAND_S, duration_s
 from probewise.arm.geometry import wrapped_to_pi
+from probewise.calibration import read_sensor
 from probewise.cli import _bench
-from probewise.cli._arm import SHIPPED, parse_arm, parse_place, read_or_shipped_plan
-from probewise.cli._arm_tasks import confirm_lowering, nxt_port, open_instrument, prompter_unless_dry_run
-from probewise.cli._common import message_to_resume, print_result, print_warning, refuse_options
+from probewise.cli._common import message_to_resume, print_warning, progress_of, say
+from probewise.cli._inputs import read_or_shipped_plan
+from probewise.cli._options import SHIPPED, parse_place, refuse_options
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
@@ -50,6 +50,7 @@ _LOOK_MM = 25.0  # margin around the plan's places within which a sheet shows it
 _SHARE = 0.05  # least contrast of white and black, as a share of the range of readings
 _OFF = 0.35  # largest deviation from a level, as a share of the contrast; beyond any noise
 _FEWEST = 3
+_COLOURS = {True: "white", False: "black"}
 _SPREAD_SHARE = 0.15  # largest spread of readings of one shade, as a share of the range
 _AROUND_MM = np.stack(
     [
@@ -63,7 +64,7 @@ _AROUND_MM = np.stack(
 def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     """Take the plan's readings, each kept on disk at once; a person or the bench lays the sheets."""
     out = checked_output_file(arguments.out, *([] if arguments.plan in SHIPPED else [Path(arguments.plan)]))
-    chosen = None if arguments.arm is None else parse_arm(arguments.arm)
+    chosen = None if arguments.arm is None else _bench.parse_arm(arguments.arm)
     is_own = chosen is not None and chosen.kind == "file"
     plan = _plan_for_arm(arguments, geometry, is_own=is_own)
     width, height = (0.0, 0.0) if is_own else geometry.field_mm
@@ -82,28 +83,26 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         return message_to_resume(out, n_kept, "reading", arguments, "--resume", of=len(plan))
 
     start_s = taken[-1].time_s if taken else 0.0
-    instrument, bench = open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
-    confirm_lowering(arguments, instrument, geometry)
+    instrument, bench = _bench.open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     with reporting_what_is_kept(kept_message), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not is_own)
         ask: Callable[[RequestToPerson], None]
         if bench is not None:
             ask = partial(bench.carry_out_request, plan.patterns, origin)
         elif arguments.dry_run:
-            ask = prompter_unless_dry_run(arguments, arm)
+            ask = _bench.prompter_unless_dry_run(arguments, arm)
         else:
             arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
             # A pseudo-terminal is an emulator's.
-            emulated = not is_own and os.path.realpath(nxt_port(arguments.arm)).startswith(("/dev/pts/", "/dev/ttys"))
+            emulated = not is_own and os.path.realpath(_bench.nxt_port(arguments.arm)).startswith(
+                ("/dev/pts/", "/dev/ttys")
+            )
             ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
-            print_result(
-                f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
-                f"each step by hand",
-                quiet=arguments.quiet,
-            )
+            about = f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes"
+            say(arguments, f"{about}; including {BY_HAND_S:g} s for each step by hand")
         readings = carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
-        with progress_shown(quiet=arguments.quiet, beat=False) as progress:
+        with progress_of(arguments, beat=False) as progress:
             progress("readings", len(taken), len(plan))
             for reading in readings:
                 wrong = check.complaint_about_reading(len(taken), reading.value)
@@ -116,7 +115,7 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     if not arguments.dry_run:
         if at_end:
             write_recording(recording_of_readings(plan, taken), out)
-        print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
+        say(arguments, f"{len(taken)} readings: {out}")
 
 
 def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: bool) -> Plan:
@@ -125,8 +124,6 @@ def _plan_for_arm(arguments: argparse.Namespace, geometry: Geometry, *, is_own: 
     if is_own:
         return _bench.plan_for_own_instrument(plan, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     if arguments.sensor is not None:
-        from probewise.calibration import read_sensor
-
         return _bench.without_measured_covariates(plan, read_sensor(arguments.sensor).instrumentation)
     refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
     return _bench.plan_for_lego_arm(plan, geometry)
@@ -162,17 +159,18 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         yield f"readings of another plan: it has {len(before)} rows, this plan {len(plan)}"
         return
     first = plan.take(np.arange(len(before)))
+    names_before, names = (np.array(each.pattern_names)[each.pattern] for each in (before, first))
     rows = {
         "x_mm": np.abs(before.x_mm - first.x_mm) > _OFF_PLAN_MM,
         "y_mm": np.abs(before.y_mm - first.y_mm) > _OFF_PLAN_MM,
         "orientation": np.abs(wrapped_to_pi(before.orientation_rad - first.orientation_rad)) > off_rad,
         "scan": before.scan != first.scan,
-        "pattern": np.array(_pattern_names_by_row(before)) != np.array(_pattern_names_by_row(first)),
+        "pattern": names_before != names,
     }
     for name, differs in rows.items():
         if differs.any():
             yield f"readings of another plan: the {name} of reading {1 + int(differs.argmax())} differs"
-    for name in dict.fromkeys(_pattern_names_by_row(before)):
+    for name in dict.fromkeys(names_before.tolist()):
         there, here = before.patterns[name], plan.patterns[name]
         if not have_same_albedo(there, here):
             yield f"readings of another plan: pattern {name!r} is {shown(there)} there, {shown(here)} here"
@@ -180,10 +178,6 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
         values = [getattr(each.instrumentation, field.name) for each in (before, plan)]
         if values[0] != values[1] and field.name != "description":
             yield f"{field.name} is {values[0]!r} there, {values[1]!r} here"
-
-
-def _pattern_names_by_row(plan: Plan) -> list[str]:
-    return [plan.pattern_names[code] for code in plan.pattern]
 
 
 # Sheets that a person lays
@@ -219,12 +213,12 @@ def person_at_bench(
 
     def complaint_about_sheet(name: str) -> str | None:
         """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
-        origin = np.array(origin_mm)
-        chosen = sheet_check.white_and_black_places(name, lambda places: arm.reach.contains(places + origin))
+        chosen = sheet_check.white_and_black_places(name, lambda places: arm.reach.contains(places + origin_mm))
         values = {}
         for is_white, place in chosen.items():
-            x_mm, y_mm = (np.array(place) + origin).tolist()
-            standing = float(arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
+            there = place + np.array(origin_mm)
+            x_mm, y_mm = there.tolist()
+            standing = float(arm.orientation_rad(there[None, :])[0])
             values[is_white] = arm.measure(Pose(x_mm, y_mm, standing)).value
         return sheet_check.complaint_about_levels(name, values)
 
@@ -273,27 +267,23 @@ class SheetCheck:
             return None
         self._reported.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
-        return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {_COLOURS[is_white]}, and {wrong}"
 
     def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
         """Return a complaint about readings over a sheet's white (True) and black (False), else keep them as levels."""
         wrong = None
-        if len(values) == 2:
-            contrast = values[True] - values[False]
-            if self._bright and contrast < self._least_contrast(*values.values()):
-                wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
+        if len(values) == 2 and self._bright and values[True] - values[False] < self._least_contrast(*values.values()):
+            wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
             told = self._complaint_against_earlier(is_white, value)
-            wrong = wrong or (None if told is None else f"where it should be {_colour_in_words(is_white)} {told}")
+            wrong = wrong or (None if told is None else f"where it should be {_COLOURS[is_white]} {told}")
         if wrong is not None:
             return f"sheet {name!r} contradicts its pattern: {wrong}"
         for is_white, value in values.items():
             self._read[is_white].append(value)
         return None
 
-    def white_and_black_places(
-        self, name: str, allowed: Callable[[FloatArray], BoolArray]
-    ) -> dict[bool, tuple[float, float]]:
+    def white_and_black_places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, FloatArray]:
         """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
 
         Return (x, y) in mm in the plan's frame by these keys, if there is such a place; `allowed` returns the mask
@@ -301,20 +291,17 @@ class SheetCheck:
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
-        beside = there.mean(axis=0) + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+        middle = there.mean(axis=0)
+        beside = middle + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
         candidates = np.concatenate([there, beside])
         candidates = candidates[allowed(candidates)]
-        if not len(candidates):
-            return {}
         found = uniform_shades_at_places(self._plan.patterns[name], candidates)
-        middle = there.mean(axis=0)
-        out = {}
-        for is_white in (True, False):
-            fitting = candidates[found == float(is_white)]
-            if len(fitting):
-                x, y = fitting[np.argmin(((fitting - middle) ** 2).sum(axis=-1))].tolist()
-                out[is_white] = (x, y)
-        return out
+        by_shade = {is_white: candidates[found == float(is_white)] for is_white in (True, False)}
+        return {
+            is_white: places[np.argmin(((places - middle) ** 2).sum(axis=-1))]
+            for is_white, places in by_shade.items()
+            if len(places)
+        }
 
     def _complaint_against_earlier(self, is_white: bool, value: float) -> str | None:
         """Return a complaint if a reading over white or black contradicts earlier readings of the sheets, else None."""
@@ -322,16 +309,16 @@ class SheetCheck:
         if own and other:
             level, opposite = float(np.median(own)), float(np.median(other))
             if abs(value - level) > max(_OFF * abs(opposite - level), self._least_contrast(level, opposite)):
-                colour, other_colour = _colour_in_words(is_white), _colour_in_words(not is_white)
-                return f"reads {value:g}; {colour} read {level:g} so far, {other_colour} {opposite:g}"
+                of_other = f"{_COLOURS[not is_white]} {opposite:g}"
+                return f"reads {value:g}; {_COLOURS[is_white]} read {level:g} so far, {of_other}"
         elif len(own) >= _FEWEST:
             level = float(np.median(own))
             if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
-                return f"reads {value:g}; {_colour_in_words(is_white)} read {level:g} so far"
+                return f"reads {value:g}; {_COLOURS[is_white]} read {level:g} so far"
         elif other and self._bright:
             opposite = float(np.median(other))
             if (value - opposite) * (1 if is_white else -1) < self._least_contrast(value, opposite):
-                return f"reads {value:g}, where {_colour_in_words(not is_white)} read {opposite:g}"
+                return f"reads {value:g}, where {_COLOURS[not is_white]} read {opposite:g}"
         return None
 
     def _least_contrast(self, *levels: float) -> float:
@@ -341,10 +328,6 @@ class SheetCheck:
 def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
     """Return the shade that the sensor sees at each place, (n, 2), as (n,): 1 all white, 0 all black, else NaN."""
     seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
-    albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
+    albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), len(_AROUND_MM))
     low, high = albedo.min(axis=1), albedo.max(axis=1)
     return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)
-
-
-def _colour_in_words(is_white: bool) -> str:
-    return "white" if is_white else "black"

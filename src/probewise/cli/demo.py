@@ -1,31 +1,189 @@
-"""`probewise demo`: the paper end to end, on the recordings that ship with the package."""
+"""`probewise demo`: the paper end to end, on the recordings that ship, in two processes; then all files."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import time
+from collections.abc import Iterable, Mapping
+from concurrent.futures import as_completed
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
-from probewise._writing import Drawings, checked_output_directory
-from probewise.cli._common import add, add_out, add_seed_and_quiet, print_result
+import numpy as np
 
+from probewise import diagnosis as engine
+from probewise._words import count_with_noun
+from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
+from probewise.arm import Pose, read_geometry, shipped_geometry_path
+from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
+from probewise.cli import diagnose as diagnose_verb
+from probewise.cli._common import progress_of, say
+from probewise.cli._executor import worker_pool
+from probewise.diagnosis import Diagnosis
+from probewise.experiment import (
+    Exploration,
+    HiddenShape,
+    Model,
+    Step,
+    arm_over,
+    experiment_for,
+    explore,
+    run_from_place,
+)
+from probewise.inquiry import ReadingEntropy
+from probewise.progress import Progress
+from probewise.recordings import read_recording, shipped
+from probewise.report import demo as report
+from probewise.report import diagnosis as diagnosis_report
+from probewise.report.plots.canvas import axes_of_frame, png
+from probewise.scene import Circle, Field, outlines
+from probewise.world import saturation
+from probewise.world.shipped import true_world as world_behind
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the options of `probewise demo`."""
-    add_out(parser)
-    add(parser, "--full", "compare one to four Gaussians with 300 live points, as in the paper")
-    add_seed_and_quiet(parser)
+DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
+_MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
+_TRUSTS = {"trusting": 1.0, "doubting": 0.9}
+N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
+N_LIVE_ROBOT = 100
+MAX_READINGS = 80
+MAX_READINGS_DOUBT = 20  # bounds the time of the demo
+_CIRCLE = Circle(radius_mm=(50.0, 150.0), inside=True)
+"""The hypothesised shape: a circle entirely on the field."""
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo, print its summary, and return the exit status."""
     out = checked_output_directory(arguments.out)
-    from probewise._progress import progress_shown
-    from probewise.cli._demo import DIAGNOSIS, run_demo
-
     drawings = (Drawings(out), Drawings(out / DIAGNOSIS))
-    with progress_shown(quiet=arguments.quiet) as progress:
+    with progress_of(arguments) as progress:
         lines = run_demo(*drawings, seed=arguments.seed, full=arguments.full, progress=progress)
-    for line in lines:
-        print_result(line, quiet=arguments.quiet)
+    say(arguments, *lines)
     for each in drawings:
         each.raise_if_any_failed()
     return 0
+
+
+def run_demo(
+    drawings: Drawings, drawings_of_diagnosis: Drawings, *, seed: int, full: bool, progress: Progress
+) -> tuple[str, ...]:
+    """Calibrate, search and diagnose, write all files, and return the lines to print."""
+    started, out = time.monotonic(), drawings.out
+    drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
+    truth, doing = tuple(drawn_truth.tolist()), "calibrating, searching and diagnosing"
+    with worker_pool(2) as pool:
+        progress(doing, 0, 8)
+        diagnosing = pool.submit(diagnose_shipped_recording, seed)
+        orders, n_live = ((1, 2, 3, 4), 300) if full else ((1, 2), N_LIVE)
+        recording, rng = read_recording(shipped("paper")), np.random.default_rng([seed, 1])
+        calibration = calibrate(recording, orders=orders, n_live=n_live, rng=rng, executor=pool)
+        sensor = calibration.sensor
+
+        def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
+            return pool.submit(_search, sensor, truth, seed, stream, max_readings=max_readings, **options)
+
+        doubting = {name: seek(7, MAX_READINGS_DOUBT, trust=trust, saturating=True) for name, trust in _TRUSTS.items()}
+        starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
+        searching = {name: seek(2, model=model, on_circle=False) for model, name in _MODELS.items()}
+        parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
+        progress(doing, 1, 8)
+        for done, future in enumerate(as_completed(parts), start=2):
+            future.result()
+            progress(doing, done, 8)
+    progress("writing the results")
+    diagnosis, prediction = diagnosing.result(), predict(sensor, recording.plan, recording.readings)
+    searches, started_alike, doubted = (
+        _searches_with_true_circle(sensor, ((name, run.result()) for name, run in runs.items()), truth)
+        for runs in (searching, starting, doubting)
+    )
+    concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
+    geometry = read_geometry(shipped_geometry_path())
+    of_searches = (searches, started_alike, doubted)
+    found = report.DemoRun(calibration, recording, prediction, *of_searches, diagnosis, geometry, concealed, seed)
+    figures, figures_of_diagnosis = report.figure_drawers(found), diagnosis_report.figure_drawers(diagnosis)
+    seconds = time.monotonic() - started
+    of_diagnosis = (f"{DIAGNOSIS}/{name}" for name in (*figures_of_diagnosis, PAGE))
+    with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
+        write_sensor(sensor, stage / "sensor.json")
+        (stage / DIAGNOSIS).mkdir()
+        *_, files_rng = diagnose_verb.generators_of_diagnosis(seed)
+        diagnose_verb.write_files(diagnosis, StagedFiles(stage / DIAGNOSIS), rng=files_rng)
+        answers = report.main_findings_by_key(found)
+        stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
+
+    def page(drawn: Mapping[str, bytes]) -> str:
+        n, frames = sum(search.n for search in searches), list[list[bytes]]()
+        for search in searches:
+            frames.append([])
+            for step in search.run.steps:
+                progress("drawing every step", sum(map(len, frames)), n, search.model)
+                name = f"{search.model}, step {step.number}"
+                frames[-1].append(drawings.draw(name, partial(_frame_png, search, step)))
+        return report.page_html(found, drawn, frames=frames, seconds=seconds)
+
+    drawings_of_diagnosis.write_report(
+        figures_of_diagnosis,
+        lambda drawn: diagnosis_report.page_html(diagnosis, drawn, source="concealed.csv", seed=seed),
+        progress=progress,
+    )
+    drawings.write_report(figures, page, progress=progress)
+    return (
+        *report.search_comparison_lines(searches),
+        report.summary_sentence(started_alike),
+        f"diagnosis of the second recording: {diagnosis.verdict}, "
+        f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {found.concealed}",
+        f"a concealed saturation: {report.doubt_sentence(doubted)}",
+        f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
+    )
+
+
+def _searches_with_true_circle(
+    sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
+) -> list[report.RobotSearch]:
+    """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
+    means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
+    outline_mm = outlines(_CIRCLE.region(np.array([truth])))[0]
+    return [report.RobotSearch(name, run, known, outline_mm, (means["I_min"], means["I_max"])) for name, run in runs]
+
+
+def _frame_png(search: report.RobotSearch, step: Step) -> bytes:
+    title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
+    ax = axes_of_frame((6.6, 3.45), (0.7, 0.55, 0.9, 0.3))
+    return png(search.draw_view(step.number, title=title, ax=ax), dpi=90, tight=False)
+
+
+def _search(
+    sensor: FittedSensor,
+    truth: tuple[float, ...],
+    seed: int,
+    stream: int,
+    *,
+    max_readings: int,
+    on_circle: bool = True,
+    saturating: bool = False,
+    **options: Any,
+) -> Exploration:
+    """Search for the circle with a simulated arm and a model by the `options` of `experiment_for`.
+
+    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. With `saturating` the
+    sensor saturates, which its model leaves out.
+    """
+    field, world = Field(), world_behind("paper")
+    if saturating:
+        world = replace(world, concealed=(saturation(report.SATURATION),))
+    experiment = experiment_for(sensor, _CIRCLE, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
+    rng = np.random.default_rng([seed, stream])
+    with arm_over(world, HiddenShape("circle", _CIRCLE, np.array(truth)).surface, field, seed=seed) as arm:
+        if not on_circle:
+            return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=max_readings)))
+        x_mm, y_mm, radius_mm = truth
+        away, turn = np.random.default_rng([seed, 5]).random(2)
+        away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn
+        first = Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
+        return run_from_place(first, arm, experiment, rng=rng, max_readings=max_readings)
+
+
+def diagnose_shipped_recording(seed: int) -> Diagnosis:
+    """Diagnose the second recording, with the same result as `probewise diagnose`."""
+    return engine.diagnose(read_recording(shipped("concealed")), rng=diagnose_verb.generators_of_diagnosis(seed)[0])

@@ -1,88 +1,76 @@
-"""`probewise diagnose`: which physics a sensor model, or a user's simulator, leaves out."""
+"""`probewise diagnose`: which physics a sensor model, or a user's simulator, leaves out.
+
+With --each many recordings, of many sensors or days, are diagnosed one by one; one page sorts them.
+"""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import hashlib
+import json
+import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from probewise._writing import Drawings, StagedFiles, checked_output_directory
-from probewise.cli import _common as common
-from probewise.cli._executor import add_executor
-from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._simulator import add_simulator, open_simulator, read_joined_table
-from probewise.errors import ParameterError
+import numpy as np
+
+from probewise import diagnosis as engine
+from probewise._signals import reporting_what_is_kept
+from probewise._tasks import results_as_tasks_end
+from probewise._version import __version__
+from probewise._writing import Drawings, StagedFiles, checked_output_directory, staged_output
+from probewise.calibration import read_sensor, write_sensor
+from probewise.cli._common import CommandError, error_in_one_line, finish, message_to_resume, progress_of
+from probewise.cli._executor import open_executor
+from probewise.cli._inputs import (
+    find_journal_sensor_file,
+    inputs_and_filled_in_plan,
+    is_journal,
+    journal_recording_and_shape,
+    open_simulator,
+    read_joined_table,
+)
+from probewise.cli._options import parser, refuse_options
+from probewise.diagnosis import NEXT_PLAN, Diagnosis, PlanAudit
+from probewise.errors import ParameterError, ProbewiseError, require
+from probewise.progress import Progress
+from probewise.recordings import Recording, read_recording, write_plan
+from probewise.recordings.table import csv_text
+from probewise.systems import RunTable, run_table_csv, write_fitted_system
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from probewise.calibration import FittedSensor
-    from probewise.diagnosis import Diagnosis, PlanAudit
-    from probewise.progress import Progress
-    from probewise.recordings import Recording
+    from probewise.report.each import DeviceRow
     from probewise.scene import Shape
-    from probewise.systems import RunTable
 
 OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 _OF_ONE_RUN_OF_SIMULATOR = ("witness_*.svg", "gain.svg", "next.csv")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the options of `probewise diagnose`."""
-    about = (
-        "recording, its JSON beside it, or paper or concealed, which ship, or the journal.jsonl of an explore "
-        "run; with --simulator any table; several are diagnosed together"
-    )
-    common.add(parser, "recordings REC.csv", about, type=common.parse_recording, nargs="+")
-    about = "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)"
-    common.add(parser, "--sensor S.json", about, type=common.parse_path)
-    add_simulator(parser)
-    common.add(
-        parser,
-        "--thorough",
-        "compute the evidence of the leading hypotheses by nested sampling too; it replaces the Laplace "
-        "approximation where they differ by more than one nat plus its standard error and no run gives a warning",
-    )
-    common.add(
-        parser,
-        "--each",
-        "diagnose each recording by itself, into a folder of its name; table.csv and report.html sort them by "
-        "what ails them; the same command resumes",
-    )
-    add_executor(parser)
-    common.add_out(parser)
-    common.add_seed_and_quiet(parser)
+_INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simulator, and the options
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
-    if arguments.each:
-        from probewise.cli._each import diagnose_each
-
-        return diagnose_each(arguments, run)
-    of_simulator = arguments.simulator is not None and arguments.scheduler is None
-    if of_simulator:
-        common.refuse_options(arguments, "--simulator, which replaces it", "sensor")
-    elif arguments.workers > 1 or arguments.scheduler is not None:
-        raise common.CommandError(
-            "--workers and --scheduler are for --each, which diagnoses several recordings one by one"
-        )
-    from probewise import diagnosis as engine
-    from probewise._progress import progress_shown
     from probewise.report import diagnosis as report
 
+    if arguments.each:
+        return _diagnose_each(arguments)
+    of_simulator = arguments.simulator is not None and arguments.scheduler is None
+    if of_simulator:
+        refuse_options(arguments, "--simulator, which replaces it", "sensor")
+    elif arguments.workers > 1 or arguments.scheduler is not None:
+        raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     source = ", ".join(path.name for path in arguments.recordings)
     rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
     outdated: tuple[str, ...] = OF_ONE_RUN
-    audited: Callable[[], PlanAudit] | None = None
+    audited: Callable[[], PlanAudit | None] = lambda: None  # noqa: E731
     with contextlib.ExitStack() as stack:
-        simulator = (
-            stack.enter_context(open_simulator(arguments.simulator, arguments.workers)) if of_simulator else None
-        )
-        progress = stack.enter_context(progress_shown(quiet=arguments.quiet))
+        simulator = stack.enter_context(open_simulator(arguments)) if of_simulator else None
+        progress = stack.enter_context(progress_of(arguments))
         weigh_again = partial(engine.weigh_thoroughly, rng=nested_rng, progress=progress)
         options: dict[str, Any] = {"thorough": weigh_again if arguments.thorough else None, "rng": rng}
         if simulator is not None:
@@ -108,19 +96,17 @@ def run(arguments: argparse.Namespace) -> int:
                 audited = partial(engine.audit_plan_of_diagnosis, diagnosis, sensor=sensor)
             files, notes = partial(write_files, diagnosis, rng=files_rng), joined.notes
             read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
-            advised, column = engine.NEXT_PLAN, "reading"
-        renamed = drawings.write_results(
+            advised, column = NEXT_PLAN, "reading"
+        drawings.write_results(
             files,
             report.figure_drawers(diagnosis),
-            lambda drawn: report.page_html(
-                diagnosis, drawn, source=source, seed=arguments.seed, audit=None if audited is None else audited()
-            ),
-            inputs=common.inputs_and_filled_in_plan(read, drawings.out / advised, column),
+            lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audited()),
+            inputs=inputs_and_filled_in_plan(read, drawings.out / advised, column),
             outdated=outdated,
             progress=progress,
         )
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return common.finish(drawings, *(f"note: {n}" for n in notes), *renamed, summary, quiet=arguments.quiet)
+    return finish(arguments, drawings, *(f"note: {n}" for n in notes), *drawings.notes, summary)
 
 
 def _read_inputs(
@@ -130,9 +116,6 @@ def _read_inputs(
 
     Without --sensor, that of the journal's run is read, and `arguments.sensor` is set to its file.
     """
-    from probewise.calibration import read_sensor
-    from probewise.recordings import read_recording
-
     journals = [path for path in arguments.recordings if is_journal(path)]
     if arguments.sensor is None and journals:
         arguments.sensor = find_journal_sensor_file(journals[0])
@@ -151,18 +134,12 @@ def _read_inputs(
 
 def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
     """Return the generators of a diagnosis, of its nested sampling, and of the samples in its files."""
-    import numpy as np
-
     return np.random.default_rng(seed).spawn(3)
 
 
 def write_files(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
     """Write diagnosis.json, both sensor models and the next plan."""
-    from probewise.calibration import write_sensor
-    from probewise.diagnosis import NEXT_PLAN, diagnosis_json
-    from probewise.recordings import write_plan
-
-    stage.write_json("diagnosis.json", diagnosis_json(diagnosis))
+    stage.write_json("diagnosis.json", engine.diagnosis_json(diagnosis))
     write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), stage / "sensor.json")
     write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
@@ -171,12 +148,118 @@ def write_files(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Gene
 
 def _write_files_of_simulator(diagnosis: Diagnosis, stage: StagedFiles) -> None:
     """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
-    from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
-    from probewise.systems import run_table_csv, write_fitted_system
-
-    stage.write_json("diagnosis.json", diagnosis_json(diagnosis))
-    write_fitted_system(repaired_of(diagnosis), stage / "repaired.json")
-    write_fitted_system(calibrated_of(diagnosis), stage / "calibrated.json")
+    stage.write_json("diagnosis.json", engine.diagnosis_json(diagnosis))
+    write_fitted_system(engine.repaired_of(diagnosis), stage / "repaired.json")
+    write_fitted_system(engine.calibrated_of(diagnosis), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
         rows = cast("RunTable", diagnosis.next_measurement.plan)
         stage.write(diagnosis.apparatus.words.next_plan, run_table_csv(rows))
+
+
+# --each
+
+
+def _diagnose_each(arguments: argparse.Namespace) -> int:
+    """Diagnose each recording into a folder of its own; write table.csv and a page of all.
+
+    One that cannot be diagnosed is a row of the table; folders that are complete, of the same files and options, stay.
+    """
+    from probewise.report import each as report
+
+    out = checked_output_directory(arguments.out)
+    files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
+    fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
+
+    def is_done(name: str) -> bool:
+        with contextlib.suppress(OSError):
+            return (out / name / _INPUTS).read_text() == fingerprints[name]
+        return False
+
+    given = ((name, getattr(arguments, name)) for name in ("sensor", "simulator"))
+    options = [word for name, path in given if path is not None for word in (f"--{name}", str(path.absolute()))]
+    options += ["--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
+    words = {name: [str(file.absolute()), *options] for name, file in files.items() if not is_done(name)}
+    n_before, refused = len(files) - len(words), dict[str, str]()
+
+    def kept() -> str:
+        return message_to_resume(out, sum(map(is_done, files)), "recording", arguments, of=len(files))
+
+    with (
+        reporting_what_is_kept(kept),
+        progress_of(arguments) as progress,
+        open_executor(arguments) as executor,
+        results_as_tasks_end(_diagnosed, words, executor) as ended,
+    ):
+        progress("diagnosing", n_before, len(files))
+        for done, (name, (message, results)) in enumerate(ended, start=n_before + 1):
+            if results:
+                results[_INPUTS] = fingerprints[name].encode()
+                with staged_output(out / name, outdated=("*.svg", "next*.csv", "next*.json")) as stage:
+                    for file, content in results.items():
+                        stage.write(file, content)
+            if message:
+                refused[name] = message
+            progress("diagnosing", done, len(files), name)
+    rows = [
+        _row(name, out / name) if is_done(name) else report.DeviceRow(name, "refused", says=refused[name])
+        for name in files
+    ]
+    drawings = Drawings(out)
+    drawings.write_results(
+        lambda stage: stage.write("table.csv", csv_text(report.columns_of(rows))),
+        {"counts.svg": partial(report.counts_svg, rows)},
+        partial(report.page_html, rows, seed=arguments.seed),
+        inputs=arguments.recordings,
+    )
+    return finish(arguments, drawings, report.summary(rows), f"seed {arguments.seed}; written to {out}")
+
+
+def _device_names(files: Sequence[Path]) -> list[str]:
+    """Return a name for each file: its own without the ending, with its folder's in front where two are the same."""
+    names = [file.stem for file in files]
+    names = [
+        f"{file.absolute().parent.name}_{name}" if names.count(name) > 1 else name
+        for file, name in zip(files, names, strict=True)
+    ]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    require(twice is None, "recordings", twice, "files of different names, which name their folders")
+    return names
+
+
+def _fingerprint(arguments: argparse.Namespace, file: Path) -> str:
+    digest = hashlib.sha256(f"{__version__} {arguments.seed} {arguments.thorough}".encode())
+    for path in (file, file.with_suffix(".json"), arguments.sensor, arguments.simulator):
+        digest.update(path.read_bytes() if path is not None and path.is_file() else b"-")
+    return digest.hexdigest()
+
+
+def _diagnosed(words: Sequence[str]) -> tuple[str, dict[str, bytes]]:
+    """Diagnose one recording in a temporary folder; return a message, "" if all went well, and the files written."""
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the page of each recording has them
+        given = ["diagnose", *words, "--out", folder, "--quiet"]
+        arguments = parser().parse_args(given)
+        arguments.words, message = given, ""
+        try:
+            run(arguments)
+        except (ProbewiseError, OSError) as error:
+            message = error_in_one_line(error)
+        return message, {
+            path.name: path.read_bytes() for path in Path(folder).iterdir() if path.is_file() and path.name[0] != "."
+        }
+
+
+def _row(name: str, folder: Path) -> DeviceRow:
+    from probewise.report.each import DeviceRow
+
+    found = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    named = [effect for effect in found["effects"] if effect["name"] in found["combination"]]
+    return DeviceRow(
+        name,
+        found["verdict"],
+        " + ".join(found["combination"]) if found["verdict"] not in ("clean", "unknown") else "",
+        max((effect["size_lambda"] for effect in named), default=None),
+        found["hypotheses"][0]["probability"] if found["hypotheses"] else None,
+        found["p_value"],
+        found["reason"],
+    )

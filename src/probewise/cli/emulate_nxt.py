@@ -10,64 +10,28 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from probewise import emulator
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file
-from probewise.cli._arm import SCENE, add_geometry
-from probewise.cli._common import add, add_seed_and_quiet, parse_path, print_result
+from probewise.cli._bench import world_and_scale
+from probewise.cli._common import print_result, say
 from probewise.errors import LinkError, ParameterError
-
-if TYPE_CHECKING:
-    from probewise.emulator import EmulatedBench, SensorPose, Trace
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the options of `probewise emulate-nxt`."""
-    add(
-        parser,
-        "--scene X,Y,R",
-        f"the circle on the field, in mm (default {SCENE}), or ellipse:X,Y,A,B,ANGLE, "
-        "polygon:X,Y,X,Y,..., edge:ANGLE,OFFSET, corner:X,Y,DX,DY, uniform:ALBEDO",
-        default=SCENE,
-    )
-    about = "the light sensor, as calibrate writes it (default: that of the shipped recordings)"
-    add(parser, "--sensor S.json", about, type=parse_path)
-    add_geometry(parser)
-    add(
-        parser,
-        "--fault NAME[=RATE]",
-        "a fault and its probability per telegram, 0 to 1: fragment, merge, double, corrupt, half, error, "
-        "silence, deaf, unasked, disconnect; drop, per byte; late=RATE,SECONDS; sag=MV, by which the battery falls per "
-        "minute; may be given several times",
-        action="append",
-        default=[],
-    )
-    add(parser, "--name", "the brick's name, up to 14 characters (default NXT)", default="NXT")
-    about = "minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)"
-    add(parser, "--sleep MIN", about, type=int, default=10)
-    about = "a symbolic link to keep on the device, also after a disconnection"
-    add(parser, "--link PATH", about, type=parse_path)
-    add(parser, "--log FILE", "write every telegram and fault to a file", type=parse_path)
-    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Emulate the LEGO brick until Ctrl-C, or until it goes to sleep; return the exit status."""
     if not hasattr(os, "openpty"):
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
-
-    from probewise.cli._bench import world_and_instrumentation
-    from probewise.emulator import Faults, parse_scene, read_geometry, set_up_bench, shipped_geometry_path
     from probewise.emulator.pty import Terminal, serve
 
     log = arguments.log and checked_output_file(arguments.log, arguments.sensor, arguments.geometry, option="--log")
-    geometry = read_geometry(shipped_geometry_path() if arguments.geometry is None else arguments.geometry)
-    surface = parse_scene(arguments.scene)
-    faults = Faults.parse(arguments.fault)
-    world, _ = world_and_instrumentation(arguments.sensor)
+    geometry = emulator.read_geometry(arguments.geometry or emulator.shipped_geometry_path())
+    surface = emulator.parse_scene(arguments.scene)
+    faults = emulator.Faults.parse(arguments.fault)
+    world, _ = world_and_scale(arguments.sensor)
     with _telegram_log(log) as trace, Terminal(arguments.link) as terminal:
-        bench = set_up_bench(
+        bench = emulator.set_up_bench(
             geometry,
             world,
             surface,
@@ -79,20 +43,18 @@ def run(arguments: argparse.Namespace) -> int:
             trace=trace,
         )
         print_result(terminal.path)
-        print_result(
-            f"seed {arguments.seed}, scene {arguments.scene}; type another, `turn DEGREES` or `where`; end with Ctrl-C",
-            quiet=arguments.quiet,
-        )
+        scene = f"seed {arguments.seed}, scene {arguments.scene}"
+        say(arguments, f"{scene}; type another, `turn DEGREES` or `where`; end with Ctrl-C")
         with reporting_what_is_kept(lambda: "the device is gone"):
             serve(terminal, bench.radio, time.monotonic, on_move=print_result, meanwhile=_TypedCommands(bench).poll)
-    print_result(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
+    say(arguments, f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE")
     return 0
 
 
 class _TypedCommands:
     """The typed commands of the bench (a scene, `turn DEGREES`, `where`), and a watch on the sensor's height."""
 
-    def __init__(self, bench: EmulatedBench) -> None:
+    def __init__(self, bench: emulator.EmulatedBench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
         self._is_in_table = False
 
@@ -116,7 +78,7 @@ class _TypedCommands:
                     print_result(str(error))
 
 
-def _position_in_words(stand: SensorPose) -> str:
+def _position_in_words(stand: emulator.SensorPose) -> str:
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
 
@@ -128,7 +90,7 @@ def _is_foreground() -> bool:
 
 
 @contextlib.contextmanager
-def _telegram_log(path: Path | None) -> Iterator[Trace]:
+def _telegram_log(path: Path | None) -> Iterator[emulator.Trace]:
     """Yield a function that writes a line per telegram or fault to the file, or nowhere without one."""
     began_s = time.monotonic()
     with open(path or os.devnull, "w", encoding="utf-8", buffering=1) as file:

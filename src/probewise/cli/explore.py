@@ -4,100 +4,387 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import webbrowser
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-from probewise.cli._arm import add_arm, add_geometry
-from probewise.cli._common import (
-    MOST_BATCH,
-    add,
-    add_nested_stop,
-    add_out,
-    add_seed_and_quiet,
-    count_up_to,
-    parse_count,
-    parse_numbers,
-    parse_path,
-)
-from probewise.errors import shown
-from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, SHAPES, UTILITY
+import numpy as np
 
+from probewise import experiment as experiments
+from probewise._arrays import FloatArray
+from probewise._signals import reporting_what_is_kept
+from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise.arm import Geometry, Instrument, OwnInstrument, Reading
+from probewise.calibration import FittedSensor, read_sensor, write_sensor
+from probewise.cli import _bench
+from probewise.cli._common import finish, message_to_resume, progress_of, say
+from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descriptions
+from probewise.cli._options import DEFAULT_SEED, parse_numbers
+from probewise.effects import spoken_name
+from probewise.errors import FileError, ParameterError, did_you_mean, require
+from probewise.experiment import Experiment, Exploration, HiddenShape, Model, Step, read_journal
+from probewise.inference import Naive
+from probewise.progress import Progress
+from probewise.recordings import read_recording, shipped, write_bytes_atomically
+from probewise.report import exploration as report
+from probewise.report.pictures import animated_gif
+from probewise.scene import SHAPES, Card, Field
+from probewise.verbs import calibrate, naive_levels
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Define the options of `probewise explore`."""
-    about = "sensor model (default in a simulated run: that of the recording that ships)"
-    add(parser, "--sensor S.json", about, type=parse_path)
-    add_out(parser)
-    add(parser, "--model", "the robot's sensor model", choices=("ssf", "naive"), default=MODEL)
-    add(
-        parser,
-        "--method",
-        "method of inference and choice: posterior samples reweighted after each reading (particles, default), or "
-        "the paper's: a new nested sampling run after each reading, 50 diversified samples, entropy of their "
-        "predictions, a Student-t or naive likelihood",
-        choices=("particles", "paper"),
-        default=METHOD,
-    )
-    add_nested_stop(parser)
-    about = (
-        "recording with readings over black and over white, from which the naive model of --method paper takes "
-        "its levels and sds (a simulated arm reads both before it starts)"
-    )
-    add(parser, "--levels REC.csv", about, type=parse_path)
-    about = f"possible shapes on the field, one or several of %(choices)s (default {SHAPE})"
-    add(parser, "--shape SHAPE", about, nargs="+", choices=SHAPES, default=[SHAPE])
-    about = "the true shape in the simulated world, a circle as X,Y,R in mm (default: drawn from the seed)"
-    add(parser, "--truth [SHAPE:]V,V,...", about)
-    add(parser, "--field W,H", "width and height of the field in mm (default: the geometry's, or 1048,520)")
-    add_arm(parser)
-    default = "the file that ships; the simulated arm has its reach, and a sensor that turns with --orientations alone"
-    add_geometry(parser, default)
-    about = f"largest number of readings (default {MAX_READINGS})"
-    add(parser, "--max-readings N", about, type=parse_count, default=MAX_READINGS)
-    add(parser, "--live", "show the robot's view in a browser while it works (DIR/live.html)")
-    add(parser, "--both-models", "also show the posterior of the other sensor model from the same readings")
-    add(
-        parser,
-        "--utility NAME",
-        f"acquisition function: {UTILITY} (default), information and, near the end, the probability that the "
-        f"reading ends the run; information alone; the paper's entropy; information per-second of arm time, "
-        f"information about:PARAMETER such as about:radius_mm, or on which-shape of several is present",
-    )
-    about = "infer the SSF's size and place and both levels together with the shape, with sensor.json as prior"
-    add(parser, "--learn-sensor", about)
-    about = (
-        "prior probability that the sensor model leaves nothing out; below 1 the robot also infers which effects "
-        "it leaves out (default 0.9; 1 with --model naive, --method paper, --learn-sensor, any --utility but "
-        "finishing, or several shapes)"
-    )
-    add(parser, "--trust P", about, type=float)
-    about = (
-        "a card that lies on the field, its centre and size in mm, its albedo from 0 (as the field) to 1 (as the "
-        "shape); may be given again"
-    )
-    add(parser, "--reference X,Y,W,H,ALBEDO", about, action="append", default=[])
-    add(parser, "--batch N", "choose N readings at a time", type=count_up_to(MOST_BATCH), default=1)
-    more = parser.add_argument_group("more than a place", "further choices, for an arm that supports them")
-    add(more, "--orientations DEG,...", "orientations to choose from, such as 0,45,90", type=_parse_finite_numbers)
-    add(more, "--heights MM,...", "reading heights to choose from, such as 10,14", type=_parse_finite_numbers)
-    add(more, "--repeats N,...", "numbers of repeated readings to choose from, such as 1,2,4", type=_parse_counts)
-    add(parser, "--resume", "resume from the journal in DIR")
-    add_seed_and_quiet(parser)
+_SHIPPED = "shipped_sensor.json"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Let the robot search; return the exit status."""
-    from probewise.cli._explore import explore
+    """Let the robot search; keep a journal and a picture of every step; write the report; return the exit status."""
+    out = checked_output_directory(arguments.out, "journal.jsonl", "live.html", "frames")
+    search = Search(arguments)
+    journal = out / "journal.jsonl"
+    if arguments.resume and not journal.exists():
+        raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
+    if journal.exists() and not arguments.resume:
+        raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
+    before = read_journal(journal) if arguments.resume else None
+    instrument, about_truth = search.open_arm(() if before is None else before.readings)
+    say(arguments, f"seed {arguments.seed}")
+    if arguments.sensor is None:
+        arguments.sensor = out / _SHIPPED
+        out.mkdir(parents=True, exist_ok=True)
+        write_sensor(search.sensor, arguments.sensor)
+    _bench.confirm_lowering(search.arm, instrument, search.geometry)
+    if search.as_built is not None:
+        _bench.warn_if_place_sd_large(search.as_built, search.experiment.stop_sd_mm)
+    steps, n_before = search.steps, 0 if before is None else len(before.entries)
 
-    return explore(arguments)
+    def kept_message() -> str:
+        if not journal.exists():
+            return "nothing was read"
+        return message_to_resume(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
+
+    def report_activity(doing: str) -> None:
+        believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
+        progress("exploring", note=f"reading {len(steps) + 1} of at most {arguments.max_readings}, {doing}{believed}")
+
+    about = {
+        **experiments.sensor_entry(search.sensor, _path_relative_to_folder(out, arguments.sensor)),
+        **experiments.geometry_entry(search.geometry),
+        **about_truth,
+        "arm": arguments.arm.partition(":")[0],
+    }
+    with (
+        reporting_what_is_kept(kept_message),
+        progress_of(arguments) as progress,
+        instrument as arm,
+        closing(
+            experiments.explore(
+                _bench.InstrumentWithCallbacks(
+                    arm,
+                    lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
+                    lambda reading: report_activity(f"thinking about a reading of {reading.value:g}"),
+                ),
+                search.experiment,
+                rng=search.streams.run,
+                max_readings=arguments.max_readings,
+                journal=before or journal,
+                about=about,
+            )
+        ) as found,
+    ):
+        if n_before:
+            progress("going through the journal", 0, n_before)
+        else:
+            report_activity("choosing its place")
+        pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in found)
+        if search.other is not None:
+            pairs = experiments.shadow_run(found, search.other, instrument, rng=search.streams.shadow)
+        for step, shadow in pairs:
+            search.draw_and_write(step, shadow)
+            if step.replayed:
+                progress("going through the journal", step.number, n_before)
+    result = Exploration(search.experiment, tuple(steps))
+    with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
+        search.write_results(result, progress=progress)
+    lines = search.closing_lines(result, journal)
+    return finish(arguments, search.drawings, *lines, *search.drawings.notes, f"written to {out}")
 
 
-def _parse_finite_numbers(text: str) -> tuple[float, ...]:
-    """Parse "A,B,..." to finite numbers, each once, for argparse."""
-    values = parse_numbers(text)
-    if not values or not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f"{shown(text)} is not a list of numbers such as 0,45,90")
-    return tuple(dict.fromkeys(values))
+class Search:
+    """One search: its checked options, its arm, the pictures of its steps, which the report shows.
+
+    `other` is the experiment under the sensor model `other_model`, which --both-models shows too; otherwise None.
+    `geometry` is that of a LEGO arm, or the one that --geometry gives a simulated arm; otherwise None; `as_built` that
+    of an arm that may be built otherwise, None for any other. With a simulated arm, `truth_mm` is the true outline,
+    (n_points, 2), and `known` the true parameters by the hypotheses' names.
+    `shadows` are the other model's steps on the same readings; `frames` has a PNG of each step, b"" where it could not
+    be drawn.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        """Read the files that the options name, check the options against each other, and build the experiment."""
+        self.arguments, self.arm = arguments, _bench.parse_arm(arguments.arm)
+        self.out, self.drawings = arguments.out, Drawings(arguments.out)
+        self.steps: list[Step] = []
+        self.shadows: list[Step] = []
+        self.frames: list[bytes] = []
+        self.truth_mm: FloatArray | None = None
+        self.known: Mapping[str, float] | None = None
+        with_geometry = self.arm.is_lego or (arguments.geometry is not None and self.arm.kind != "file")
+        self.geometry = read_or_shipped_geometry(arguments) if with_geometry else None
+        _refuse_contradictions(arguments, self.arm, self.geometry)
+        self.field = _checked_field(arguments.field, self.geometry)
+        self.sensor = self._shipped_sensor() if arguments.sensor is None else read_sensor(arguments.sensor)
+        if self.arm.is_lego and self.sensor.instrumentation.unit not in ("", "LEGO"):
+            raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
+        self.streams = experiments.RandomStreams.spawned_from(np.random.default_rng(arguments.seed))
+        shape = experiments.as_shape(arguments.shape, self.field)
+        cards = parse_cards(arguments.reference, self.field)
+        levels = self._naive_levels()
+
+        def pose(model: Model, **more: Any) -> Experiment:
+            return experiments.experiment_for(
+                self.sensor,
+                shape,
+                self.field,
+                method=arguments.method,
+                model=model,
+                naive=levels if model == "naive" else None,
+                utility=arguments.utility,
+                nested_stop=arguments.nested_stop,
+                orientations_rad=tuple(math.radians(turn) for turn in arguments.orientations or (0.0,)),
+                repeats=arguments.repeats or (1,),
+                cards=cards,
+                **more,
+            )
+
+        self.model: Model = arguments.model
+        self.experiment = pose(
+            self.model,
+            learn_sensor=arguments.learn_sensor,
+            batch=arguments.batch,
+            heights_mm=arguments.heights or (),
+            trust=arguments.trust,
+        )
+        self.as_built = self.geometry if self.arm.may_differ_from_geometry else None
+        if self.as_built is not None and self.as_built.accuracy is not None:
+            fitted_arm = experiments.FittedArm.from_geometry_and_sensor(self.as_built, self.sensor)
+            self.experiment = replace(self.experiment, fitted_arm=fitted_arm)
+        self.other_model: Model = "naive" if self.model == "ssf" else "ssf"
+        self.other = pose(self.other_model, trust=1.0) if arguments.both_models else None
+
+    def _shipped_sensor(self) -> FittedSensor:
+        """Calibrate the sensor of the recording that ships, and say so; a resumed run reads the one it began with."""
+        arguments, allowed = self.arguments, "the sensor model of this arm, as `probewise calibrate` writes it"
+        require(not self.arm.is_real, "--sensor", "none", allowed)
+        if arguments.resume and (arguments.out / _SHIPPED).exists():
+            return read_sensor(arguments.out / _SHIPPED)
+        say(arguments, "no --sensor: that of the recording that ships is calibrated")
+        rng = np.random.default_rng(DEFAULT_SEED)
+        return calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
+
+    def _naive_levels(self) -> Naive | None:
+        """Return the paper's naive model's readings over black and white, with sds; None if it is not used."""
+        arguments = self.arguments
+        if arguments.method != "paper" or not (arguments.model == "naive" or arguments.both_models):
+            return None
+        if arguments.levels is None and self.arm.is_real:
+            allowed = "a recording of readings over a black and a white sheet, for the naive model of the paper"
+            raise ParameterError("--levels", "none", allowed)
+        levels = None if arguments.levels is None else read_recording(arguments.levels)
+        return naive_levels(self.sensor, levels, rng=self.streams.levels)
+
+    def open_arm(self, taken: tuple[Reading, ...]) -> tuple[Instrument, Mapping[str, Any]]:
+        """Open the arm, to continue after the readings `taken`; return it and what a journal says of a true shape."""
+        arguments, start_s = self.arguments, taken[-1].time_s if taken else 0.0
+        if self.arm.is_real:
+            if self.geometry is None:
+                return OwnInstrument.from_file(self.arm.where, start_s=start_s), {}
+            return _bench.open_nxt_arm(self.arm.where, self.geometry, start_s=start_s), {}
+        hidden = parse_truth(arguments.truth, arguments.shape, self.field, rng=self.streams.truth)
+        self.truth_mm = hidden.outline_mm
+        self.known = hidden.parameters_by_hypothesis_name(self.experiment.names)
+        world, noise = experiments.world_like(self.sensor), self.streams.noise
+        surface = experiments.with_cards(hidden.surface, self.experiment.cards)
+        arm: Instrument
+        if self.arm.is_lego and self.geometry is not None:
+            seed = noise + len(taken)  # a resumed run draws no noise a second time
+            setting = (self.geometry, self.arm.where or arguments.geometry, world, surface)
+            arm, _ = _bench.open_emulated_arm_and_bench(*setting, seed=seed, start_s=start_s)
+        else:
+            scale = experiments.scale_of(self.sensor.instrumentation)
+            arm = experiments.arm_over(
+                world, surface, self.field, seed=noise, taken=taken, workspace=self.geometry, scale=scale
+            )
+        return arm, {"hidden": hidden.journal_entry}
+
+    @property
+    def files(self) -> list[Path]:
+        """The run's input files, which stay where they are when results of an earlier run are removed."""
+        levels = self.arguments.levels
+        return [self.arguments.sensor, *([] if levels is None else tables_and_descriptions([levels]))]
+
+    def draw_and_write(self, step: Step, shadow: Step | None) -> None:
+        """Draw a step, with the other sensor model's (`shadow`), if any; write a PNG and, with --live, the page."""
+        self.steps.append(step)
+        if shadow is not None:
+            self.shadows.append(shadow)
+        name = f"{step.number:03d}.png"
+        self.frames.append(self.drawings.draw(f"frames/{name}", partial(self._draw_frame, step, shadow)))
+        if step.number == 1 and not step.replayed:
+            remove_earlier_results(self.out, self.files)
+        folder, live = self.out / "frames", self.out / "live.html"
+        folder.mkdir(exist_ok=True)
+        if self.frames[-1]:
+            write_bytes_atomically(folder / name, self.frames[-1])
+        if self.arguments.live and (page := self.drawings.draw("live.html", partial(self._live_page, step))):
+            write_bytes_atomically(live, page)
+            if len(self.frames) == 1:
+                webbrowser.open(live.absolute().as_uri())
+
+    def _live_page(self, step: Step) -> bytes:
+        trust, earlier = self.experiment.trust, self.steps[:-1]
+        page = report.live_page_html(step, self.frames[-1], earlier=earlier, trust=trust, draw=self.drawings.draw)
+        return page.encode("utf-8", "backslashreplace")
+
+    def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
+        means = self.sensor.mean()
+        readings = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in (each.reading for each in self.steps)]
+        levels = (means["I_min"], means["I_max"])
+        if shadow is None or self.other is None:
+            return report.robot_view_png(step, self.experiment, readings, levels=levels, truth_mm=self.truth_mm)
+        views = {self.model: (step, self.experiment), self.other_model: (shadow, self.other)}
+        titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
+        return report.robot_views_by_model_png(titled, readings, levels=levels, truth_mm=self.truth_mm)
+
+    def write_results(self, result: Exploration, *, progress: Progress) -> None:
+        """Write result.json, posterior samples and sensor.json, then animation and report.
+
+        The sensor is the one given, with the effect that the run found in it, if any; not what --learn-sensor learnt.
+        """
+        seed = self.arguments.seed
+
+        def write_files(stage: StagedFiles) -> None:
+            stage.write("result.json", experiments.result_json(result))
+            stage.write("samples.csv", experiments.samples_csv(result))
+            rng = np.random.default_rng(seed)
+            stage.write("sensor.json", experiments.repaired_sensor(self.sensor, result.last, rng=rng).to_json())
+
+        def page(_: Mapping[str, bytes]) -> str:
+            return report.page_html(
+                result,
+                self.frames,
+                seed=seed,
+                model=self.model,
+                truth=self.known,
+                beside={self.other_model: self.shadows} if self.shadows else None,
+                unit=self.sensor.instrumentation.unit,
+                draw=self.drawings.draw,
+            )
+
+        animation = {"run.gif": lambda: animated_gif([frame for frame in self.frames if frame])}
+        self.drawings.write_results(write_files, animation, page, inputs=self.files, progress=progress)
+
+    def closing_lines(self, result: Exploration, journal: Path) -> Iterator[str]:
+        """Yield the closing lines: the shape, what its sds leave out, probable sensor faults, and errors if known."""
+        yield result.summary()
+        if self.as_built is not None and self.as_built.accuracy is None:
+            yield "arm          nobody has fitted its geometry: its own error is not in these sds"
+        if self.sensor.effects and not self.arm.is_real:
+            effects = ", ".join(map(spoken_name, self.sensor.effects))
+            yield f"note: the simulated arm has the sensor's SSF, levels and noise, but not its effects: {effects}"
+        trust = self.experiment.trust
+        missing = experiments.left_out_after_step(result.last, trust)
+        if trust < 1:
+            yield missing.sentence
+        if missing.leading != experiments.CLEAN:
+            yield f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS"
+        if self.known is not None:
+            yield f"error        {report.errors_text(result, self.known)}"
 
 
-def _parse_counts(text: str) -> tuple[int, ...]:
-    """Parse "N,M,...", integers above zero, each once, for argparse."""
-    return tuple(dict.fromkeys(map(count_up_to(1000), text.split(","))))
+def _refuse_contradictions(arguments: argparse.Namespace, arm: _bench.ArmName, geometry: Geometry | None) -> None:
+    """Raise ParameterError for an option that does not go with the arm (with the geometry of a LEGO arm) or another."""
+    paper, both, lego = arguments.method == "paper", arguments.both_models, geometry is not None
+    naive, read_mm = both or arguments.model == "naive", math.nan if geometry is None else geometry.read_height_mm
+    at_one_height = f"none with the LEGO arm but {read_mm:g}: it reads that many mm above the surface"
+    for name, refused, allowed in (
+        ("geometry", arm.kind == "file", "none with FILE.py, which defines its own reach"),
+        ("orientations", lego, "none with the LEGO arm, no joint of which turns its sensor"),
+        ("heights", lego and arguments.heights != (read_mm,), at_one_height),
+        ("heights", both and not lego, "none with --both-models, since the naive model has no height"),
+        ("reference", naive or paper, "none with --both-models, --model naive or --method paper"),
+        ("nested_stop", not paper, "only with --method paper"),
+        ("levels", not (naive and paper), "only with --method paper and --model naive"),
+        ("truth", arm.is_real, "none with a real arm, whose target is unknown"),
+    ):
+        value = getattr(arguments, name)
+        if refused and value not in (None, []):
+            listed = value[0] if name == "reference" else value
+            said = ",".join(f"{number:g}" for number in listed) if isinstance(listed, tuple) else str(listed)
+            raise ParameterError(f"--{name.replace('_', '-')}", said, allowed)
+
+
+def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
+    """Return the field given as "WIDTH,HEIGHT" (mm), else the geometry's, with which it agrees, else the paper's."""
+    of_arm = None if geometry is None else Field(*geometry.field_mm)
+    if text is None:
+        return of_arm or Field()
+    numbers = parse_numbers(text)
+    require(len(numbers) == 2, "--field", text, "WIDTH,HEIGHT in mm, such as 1048,520")
+    field = Field(*numbers)
+    if of_arm not in (None, field):
+        raise ParameterError("--field", text, f"{of_arm.width_mm:g},{of_arm.height_mm:g}, the geometry's; or none")
+    return field
+
+
+def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
+    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card on the field, of known albedo, centred at (X, Y) in mm."""
+    cards = []
+    for text in texts:
+        numbers = parse_numbers(text)
+        allowed = "X,Y,WIDTH,HEIGHT,ALBEDO: centre and size in mm, albedo from 0 to 1, such as 100,80,60,40,1"
+        require(len(numbers) == 5, "--reference", text, allowed)
+        card = Card(*numbers)
+        low, high = card.corners_mm.min(axis=0), card.corners_mm.max(axis=0)
+        on_field = min(low) >= 0 and high[0] <= field.width_mm and high[1] <= field.height_mm
+        allowed = f"a card on the field of {field.width_mm:g} x {field.height_mm:g} mm"
+        require(on_field, "--reference", text, allowed)
+        cards.append(card)
+    return tuple(cards)
+
+
+def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> HiddenShape:
+    """Parse the true shape from "[SHAPE:]V,V,...", without SHAPE the first of `names`; None: draw it from the prior."""
+    if text is None:
+        return HiddenShape.drawn_from_prior({name: SHAPES[name](field) for name in names}, rng=rng)
+    name, _, listed = text.rpartition(":")
+    name = name or names[0]
+    if name not in SHAPES:
+        allowed = f"a shape of {', '.join(SHAPES)} before the colon{did_you_mean(name, SHAPES)}"
+        raise ParameterError("--truth", text, allowed)
+    shape, theta = SHAPES[name](field), np.array(parse_numbers(listed))
+    wanted = shape.prior.names
+    require(len(theta) == len(wanted), "--truth", text, f"{len(wanted)} numbers, {','.join(wanted)}")
+    return HiddenShape.from_parameters(name, shape, theta, called=f"--truth {text}")
+
+
+def remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
+    """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix."""
+    # Without a result.json, a sensor.json is none of these results, but perhaps somebody's calibration.
+    of_machine = ("result.json", "samples.csv", "sensor.json") if (out / "result.json").exists() else ()
+    spared = {os.path.realpath(path) for path in files}
+    for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", *of_machine):
+        for path in out.glob(pattern):
+            if os.path.realpath(path) not in spared:
+                path.unlink()
+
+
+def _path_relative_to_folder(folder: Path, path: Path) -> str:
+    """Return a file's path relative to a folder; the absolute path if it is on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return str(path.absolute())

@@ -134,15 +134,10 @@ class Motor:
             ahead = side * (goal - here)
             if abs(ahead) <= self.drive.tolerance_counts and self._arrived == side:
                 return here
-            here = (
-                self._approach_goal(goal, side, here)
-                if ahead >= self.drive.lead_counts
-                else self._back_off_behind_goal(goal, side, here)
-            )
-        raise MotorError(
-            f"motor {self.letter} stands at {here} counts, not within {self.drive.tolerance_counts} of {goal}, after "
-            f"{self.drive.n_moves} moves; is something in its way, or a gear slipping?"
-        )
+            move = self._approach_goal if ahead >= self.drive.lead_counts else self._back_off_behind_goal
+            here = move(goal, side, here)
+        missed = f"stands at {here} counts, not within {self.drive.tolerance_counts} of {goal}"
+        raise self._error(f"{missed}, after {self.drive.n_moves} moves; is something in its way, or a gear slipping?")
 
     def move_near(self, goal: int) -> int:
         """Turn near a count by one fast move (none if it would overrun); return the count at rest."""
@@ -165,15 +160,12 @@ class Motor:
         gently = SetOutputState(self.port, power, BRAKED, run_state=RUNNING, limit_counts=farthest)
         while not self._try_to_start_limited_move(start + side * farthest, side, gently):
             start = self._find_firmware_target()
-        trouble = self._await_idle_or_trouble(
-            start, side * (farthest + self.drive.runaway_counts), start + side * farthest
-        )
+        target, far = start + side * farthest, side * (farthest + self.drive.runaway_counts)
+        trouble = self._await_idle_or_trouble(start, far, target)
         here = self.stop_and_settle()
         self._target = None  # it lies behind the stop
         if trouble != STUCK:
-            raise MotorError(
-                f"motor {self.letter} met no stop within {farthest} counts; is it plugged in, its gear whole?"
-            )
+            raise self._error(f"met no stop within {farthest} counts; is it plugged in, its gear whole?")
         return here
 
     @property
@@ -182,6 +174,9 @@ class Motor:
         if self._target is None:
             raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
         return self._target
+
+    def _error(self, text: str) -> MotorError:
+        return MotorError(f"motor {self.letter} {text}")
 
     def _approach_goal(self, goal: int, side: Side, here: int) -> int:
         """Move towards the goal, fast to well short of it or slowly all the way; return the count."""
@@ -214,18 +209,15 @@ class Motor:
         stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
-        if not self._try_to_start_limited_move(
-            target, side, self._drive_command(side * power, side * (target - self._checked_target))
-        ):
+        command = self._drive_command(side * power, side * (target - self._checked_target))
+        if not self._try_to_start_limited_move(target, side, command):
             return self.stop_and_settle()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
         trouble = self._await_idle_or_trouble(here, stop + side * self.drive.runaway_counts - here, target)
         here = self.stop_and_settle()
         if trouble:
             self._target = None
-            raise MotorError(
-                f"motor {self.letter} {trouble} {here} counts at power {power}; is it plugged in, and its way free?"
-            )
+            raise self._error(f"{trouble} {here} counts at power {power}; is it plugged in, and its way free?")
         ran_on = side * (here - target)
         if ran_on < -self.drive.tolerance_counts:
             self._target = None  # it stopped short of the target, which must be elsewhere
@@ -263,9 +255,7 @@ class Motor:
         self._clock.sleep(self.drive.settle_s)
         state = self._read_confirmed_state(has_faint_power)
         if not has_faint_power(state):
-            raise MotorError(
-                f"motor {self.letter} does not keep the power it was set to; does a program run on the brick?"
-            )
+            raise self._error("does not keep the power it was set to; does a program run on the brick?")
         self._target = state.rotation_counts
         return self.stop_and_settle()
 
@@ -299,9 +289,7 @@ class Motor:
             state
         ) != before:
             if n_asked == N_ASKED:
-                raise MotorError(
-                    f"motor {self.letter} reports another state each of {N_ASKED} times; is the brick near?"
-                )
+                raise self._error(f"reports another state each of {N_ASKED} times; is the brick near?")
             before, state = _constant_fields(state), self._read_state()
             n_asked += 1
         self.last_counts = state.rotation_counts

@@ -11,8 +11,7 @@ from __future__ import annotations
 import dataclasses
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
+from dataclasses import MISSING, dataclass
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from probewise.errors import LinkError, ParameterError
@@ -22,15 +21,27 @@ class TelegramError(LinkError):
     """Raised for bytes that are not the expected telegram; the message shows the bytes and the expectation."""
 
 
+def number(code: str, *bounds: int, default: Any = MISSING) -> Any:
+    """Declare a field, a whole number of a `code` of Python's module struct.
+
+    `bounds` of a command's field are its least and greatest value, and others that are allowed: a wrong power or port
+    moves an arm.
+    """
+    return dataclasses.field(default=default, metadata={"code": code, "bounds": bounds})
+
+
 @dataclass(frozen=True)
 class Body:
-    """Body of a command or an answer: successive fields, their little-endian `LAYOUT` as in Python's module struct."""
+    """Body of a command or an answer: successive fields (`number`), little-endian."""
 
-    LAYOUT: ClassVar[str] = ""
+    @classmethod
+    def layout(cls) -> str:
+        """Return the layout of the fields as the module struct has it."""
+        return "".join(field.metadata["code"] for field in dataclasses.fields(cls))
 
     def pack(self) -> bytes:
-        """Encode the fields, whole numbers."""
-        return struct.pack("<" + self.LAYOUT, *(getattr(self, field.name) for field in dataclasses.fields(self)))
+        """Encode the fields."""
+        return struct.pack("<" + self.layout(), *(getattr(self, field.name) for field in dataclasses.fields(self)))
 
 
 def in_hex(raw: bytes) -> str:
@@ -97,16 +108,14 @@ class Request(Body, Generic[A_co]):
 
     OPCODE: ClassVar[int]
     ANSWER: ClassVar[type[Body] | str] = ""
-    BOUNDS: ClassVar[Mapping[str, tuple[int, ...]]] = {}
-    """Least and greatest value of each field, and others that are allowed: a wrong power or port moves an arm."""
 
     def __post_init__(self) -> None:
-        for name, (low, high, *others) in self.BOUNDS.items():
-            value = getattr(self, name)
+        for field in dataclasses.fields(self):
+            (low, high, *others), value = field.metadata["bounds"], getattr(self, field.name)
             plain = isinstance(value, int) and not isinstance(value, bool)
             if not plain or not (low <= value <= high or value in others):
                 more = "".join(f" or {other}" for other in others)
-                raise ParameterError(name, value, f"a whole number from {low} to {high}{more}")
+                raise ParameterError(field.name, value, f"a whole number from {low} to {high}{more}")
 
     @property
     def is_repeatable(self) -> bool:
@@ -128,7 +137,7 @@ class Request(Body, Generic[A_co]):
         # A refusal is padded with zeros, or empty: only its status matters.
         if reply.status != OK:
             raise BrickError(self.name, reply.status)
-        layout = "<" + (self.ANSWER if isinstance(self.ANSWER, str) else self.ANSWER.LAYOUT)
+        layout = "<" + (self.ANSWER if isinstance(self.ANSWER, str) else self.ANSWER.layout())
         if len(reply.body) != (size := struct.calcsize(layout)):
             raise TelegramError(
                 f"the answer to {self.name} has {size} bytes; there are {len(reply.body)}: {in_hex(reply.body)}"
@@ -151,25 +160,13 @@ class SetOutputState(Request[None]):
     """Drive a motor, or all with port 255; `limit_counts` 0 is no limit. The defaults release the motor."""
 
     OPCODE = 0x04
-    LAYOUT = "BbBBbBI"
-    BOUNDS = MappingProxyType(
-        {
-            "port": (0, 2, ALL_OUTPUTS),
-            "power": (-100, 100),
-            "mode": (0, 7),
-            "regulation": (0, 2),
-            "turn_ratio": (-100, 100),
-            "run_state": (0, 0, 0x10, 0x20, 0x40),
-            "limit_counts": (0, 0xFFFFFFFF),
-        }
-    )
-    port: int
-    power: int = 0
-    mode: int = 0
-    regulation: int = 0
-    turn_ratio: int = 0
-    run_state: int = IDLE
-    limit_counts: int = 0
+    port: int = number("B", 0, 2, ALL_OUTPUTS)
+    power: int = number("b", -100, 100, default=0)
+    mode: int = number("B", 0, 7, default=0)
+    regulation: int = number("B", 0, 2, default=0)
+    turn_ratio: int = number("b", -100, 100, default=0)
+    run_state: int = number("B", 0, 0, 0x10, 0x20, 0x40, default=IDLE)
+    limit_counts: int = number("I", 0, 0xFFFFFFFF, default=0)
 
     @property
     def is_repeatable(self) -> bool:
@@ -182,28 +179,25 @@ class SetInputMode(Request[None]):
     """Set the sensor type and the reading mode of an input."""
 
     OPCODE = 0x05
-    LAYOUT = "BBB"
-    BOUNDS = MappingProxyType({"port": (0, 3), "type": (0, 0x12), "mode": (0, 0xFF)})
-    port: int
-    type: int
-    mode: int
+    port: int = number("B", 0, 3)
+    type: int = number("B", 0, 0x12)
+    mode: int = number("B", 0, 0xFF)
 
 
 @dataclass(frozen=True)
 class OutputState(Body):
     """State of a motor, and its three counters in counts (degrees of its shaft)."""
 
-    LAYOUT = "BbBBbBIiii"
-    port: int
-    power: int
-    mode: int
-    regulation: int
-    turn_ratio: int
-    run_state: int
-    limit_counts: int
-    tacho_counts: int
-    block_counts: int
-    rotation_counts: int
+    port: int = number("B")
+    power: int = number("b")
+    mode: int = number("B")
+    regulation: int = number("B")
+    turn_ratio: int = number("b")
+    run_state: int = number("B")
+    limit_counts: int = number("I")
+    tacho_counts: int = number("i")
+    block_counts: int = number("i")
+    rotation_counts: int = number("i")
 
 
 @dataclass(frozen=True)
@@ -212,25 +206,22 @@ class GetOutputState(Request[OutputState]):
 
     OPCODE = 0x06
     ANSWER = OutputState
-    LAYOUT = "B"
-    BOUNDS = MappingProxyType({"port": (0, 2)})
-    port: int
+    port: int = number("B", 0, 2)
 
 
 @dataclass(frozen=True)
 class InputValues(Body):
     """Values of an input, raw and converted; out of date while `valid` is 0."""
 
-    LAYOUT = "BBBBBHHhh"
-    port: int
-    valid: int
-    calibrated: int
-    type: int
-    mode: int
-    raw: int
-    normalized: int
-    scaled: int
-    calibrated_value: int
+    port: int = number("B")
+    valid: int = number("B")
+    calibrated: int = number("B")
+    type: int = number("B")
+    mode: int = number("B")
+    raw: int = number("H")
+    normalized: int = number("H")
+    scaled: int = number("h")
+    calibrated_value: int = number("h")
 
 
 @dataclass(frozen=True)
@@ -239,9 +230,7 @@ class GetInputValues(Request[InputValues]):
 
     OPCODE = 0x07
     ANSWER = InputValues
-    LAYOUT = "B"
-    BOUNDS = MappingProxyType({"port": (0, 3)})
-    port: int
+    port: int = number("B", 0, 3)
 
 
 @dataclass(frozen=True)
@@ -249,10 +238,8 @@ class ResetMotorPosition(Request[None]):
     """Set the block counter (`relative` 1) or the rotation counter (0) of a motor to 0."""
 
     OPCODE = 0x0A
-    LAYOUT = "BB"
-    BOUNDS = MappingProxyType({"port": (0, 2), "relative": (0, 1)})
-    port: int
-    relative: int
+    port: int = number("B", 0, 2)
+    relative: int = number("B", 0, 1)
 
 
 @dataclass(frozen=True)
@@ -283,11 +270,10 @@ class GetCurrentProgramName(Request[str]):
 class FirmwareVersion(Body):
     """Versions of protocol and firmware."""
 
-    LAYOUT = "4B"
-    protocol_minor: int
-    protocol_major: int
-    firmware_minor: int
-    firmware_major: int
+    protocol_minor: int = number("B")
+    protocol_major: int = number("B")
+    firmware_minor: int = number("B")
+    firmware_major: int = number("B")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
+from typing import NamedTuple
 
 from probewise._signals import defer_signals, raise_if_stopped, reporting_what_is_kept
 from probewise.errors import FileError, ParameterError, ProbewiseError, message_of, require
@@ -317,6 +318,19 @@ def _remove(path: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+class Output(NamedTuple):
+    """What is written of a run: files by `files`, figures by name of file, and a page of the drawn figures.
+
+    `outdated` are patterns of files that an earlier run may have left, `main` the file by which its results are known.
+    """
+
+    files: Callable[[StagedFiles], None]
+    drawers: Mapping[str, Callable[[], bytes]]
+    page: Callable[[Mapping[str, bytes]], str]
+    outdated: Sequence[str] = ()
+    main: str = ""
+
+
 class NotDrawnError(ProbewiseError):
     """Report figures or pages that could not be drawn, beside results that are complete."""
 
@@ -365,24 +379,12 @@ class Drawings:
                 if drawn[name]:
                     stage.write(name, drawn[name])
 
-    def write_results(
-        self,
-        files: Callable[[StagedFiles], None],
-        drawers: Mapping[str, Callable[[], bytes]],
-        page: Callable[[Mapping[str, bytes]], str],
-        *,
-        inputs: Sequence[Path] = (),
-        outdated: Sequence[str] = (),
-        progress: Progress = silent,
-    ) -> None:
-        """Write the files of a run, all or none, by a function of the `StagedFiles`; then figures and page.
-
-        Files of an earlier run, of the patterns `outdated`, are removed.
-        """
+    def write_results(self, made: Output, *, inputs: Sequence[Path] = (), progress: Progress = silent) -> None:
+        """Write the files of a run, all or none, then figures and page; remove outdated files of an earlier run."""
         progress("writing the results")
-        with staged_output(self.out, inputs=inputs, outdated=(*outdated, *drawers, PAGE)) as stage:
-            files(stage)
-        self.write_report(drawers, page, inputs=inputs, progress=progress)
+        with staged_output(self.out, inputs=inputs, outdated=(*made.outdated, *made.drawers, PAGE)) as stage:
+            made.files(stage)
+        self.write_report(made.drawers, made.page, inputs=inputs, progress=progress)
         self.notes = [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
         self.notes += ["note: the results of an earlier run there were replaced"] * stage.replaces
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probewise._writing import Drawings, staged_output
+from probewise._writing import Drawings, Output, staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
 from probewise.cli._inputs import holds_readings
@@ -71,7 +71,7 @@ def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
 
         tell = lambda *told: stages.append(told)  # noqa: E731
         drawings = Drawings(tmp_path)
-        drawings.write_results(write, {}, lambda drawn: "", progress=tell)
+        drawings.write_results(Output(write, {}, lambda drawn: ""), progress=tell)
         said.append(drawings.notes)
     assert said == [[], ["note: the results of an earlier run there were replaced"]]
     assert stages[0] == ("writing the results",)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings
+from probewise._writing import Drawings, Output
 from probewise.cli._common import finish, message_to_resume, progress_of
 from probewise.errors import DoubtfulResultWarning, LinkError
 
@@ -61,9 +61,8 @@ def run_and_report(
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_of(arguments) as progress:
         page = page_of(results)
-        drawings.write_results(
-            lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw), progress=progress
-        )
+        made = Output(lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw))
+        drawings.write_results(made, progress=progress)
     return finish(arguments, drawings, page.sentence, f"{said}written to {out}")
 
 

@@ -1,17 +1,15 @@
 """`probewise audit`: which effects a plan cannot detect or tell apart, and which readings would help."""
 
 import argparse
-from pathlib import Path
 
 from probewise import diagnosis
-from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise._writing import Drawings, checked_output_directory
 from probewise.calibration import read_sensor
 from probewise.cli._common import finish, progress_of, say
 from probewise.cli._inputs import inputs_and_filled_in_plan, open_simulator, read_or_shipped_plan, refuse_journal
 from probewise.cli._options import refuse_options
 from probewise.diagnosis import CURE_PLAN
-from probewise.recordings import write_plan
-from probewise.report import audit as report
+from probewise.report.saving import of_audit
 from probewise.systems import read_table_for
 
 
@@ -30,20 +28,9 @@ def run(arguments: argparse.Namespace) -> int:
             plan = read_or_shipped_plan(str(arguments.plan), progress=progress)
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = diagnosis.audit_plan(plan, sensor=sensor, progress=progress)
-
-        def write_files(stage: StagedFiles) -> None:
-            stage.write_json("audit.json", diagnosis.audit_json(audit))
-            if audit.cure_plan is not None:
-                write_plan(audit.cure_plan, stage / CURE_PLAN)
-
         if drawings is not None:
-            drawings.write_results(
-                write_files,
-                report.figure_drawers(audit),
-                lambda drawn: report.page_html(audit, drawn, source=arguments.plan.name),
-                inputs=inputs_and_filled_in_plan([arguments.plan], drawings.out / CURE_PLAN),
-                outdated=(CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name),
-                progress=progress,
-            )
+            inputs = inputs_and_filled_in_plan([arguments.plan], drawings.out / CURE_PLAN)
+            made = of_audit(audit, source=arguments.plan.name)
+            drawings.write_results(made, inputs=inputs, progress=progress)
     say(arguments, audit.summary(), *(f"note: {note}" for note in getattr(audit.plan, "notes", ())))
     return 0 if drawings is None else finish(arguments, drawings, *drawings.notes, f"written to {drawings.out}")

@@ -7,13 +7,12 @@ import numpy as np
 
 from probewise import verbs
 from probewise._writing import Drawings, checked_output_directory
-from probewise.calibration import predict, write_sensor
 from probewise.cli._common import finish, progress_of
 from probewise.cli._inputs import refuse_journal, tables_and_descriptions
 from probewise.errors import ParameterError
 from probewise.nested import LIVE_PER_PARAM, least_live
 from probewise.recordings import read_recording
-from probewise.report import calibration as report
+from probewise.report.saving import output_of
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,14 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
             rng=np.random.default_rng(arguments.seed),
             progress=progress,
         )
-        prediction = predict(result.sensor, recording, progress=progress)
-        drawings.write_results(
-            lambda stage: write_sensor(result.sensor, stage / "sensor.json"),
-            report.figure_drawers(result, recording, prediction),
-            lambda drawn: report.page_html(result, recording, prediction, drawn, seed=arguments.seed),
-            inputs=tables_and_descriptions([arguments.recording]),
-            progress=progress,
-        )
+        inputs = tables_and_descriptions([arguments.recording])
+        drawings.write_results(output_of(result, seed=arguments.seed), inputs=inputs, progress=progress)
     notes = (f"note: {note}" for note in recording.notes)
     summary = f"{result.sensor.summary()}\nseed {arguments.seed}; written to {drawings.out}"
     return finish(arguments, drawings, *notes, *drawings.notes, summary)

@@ -14,16 +14,14 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from probewise import diagnosis as engine
 from probewise._signals import reporting_what_is_kept
 from probewise._tasks import results_as_tasks_end
 from probewise._version import __version__
-from probewise._writing import Drawings, StagedFiles, checked_output_directory, staged_output
-from probewise.calibration import read_sensor, write_sensor
+from probewise._writing import Drawings, Output, checked_output_directory, staged_output
+from probewise.calibration import read_sensor
 from probewise.cli._common import CommandError, error_in_one_line, finish, message_to_resume, progress_of
 from probewise.cli._executor import open_executor
 from probewise.cli._inputs import (
@@ -35,26 +33,23 @@ from probewise.cli._inputs import (
     read_joined_table,
 )
 from probewise.cli._options import parser, refuse_options
-from probewise.diagnosis import NEXT_PLAN, Diagnosis, PlanAudit
+from probewise.diagnosis import NEXT_PLAN, PlanAudit
 from probewise.errors import ParameterError, ProbewiseError, require
 from probewise.progress import Progress
-from probewise.recordings import Recording, read_recording, write_plan
+from probewise.recordings import Recording, read_recording
 from probewise.recordings.table import csv_text
-from probewise.systems import RunTable, run_table_csv, write_fitted_system
 
 if TYPE_CHECKING:
     from probewise.calibration import FittedSensor
     from probewise.report.each import DeviceRow
     from probewise.scene import Shape
 
-OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
-_OF_ONE_RUN_OF_SIMULATOR = ("witness_*.svg", "gain.svg", "next.csv")
 _INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simulator, and the options
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
-    from probewise.report import diagnosis as report
+    from probewise.report.saving import generators_of_diagnosis, of_diagnosis
 
     if arguments.each:
         return _diagnose_each(arguments)
@@ -65,8 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     source = ", ".join(path.name for path in arguments.recordings)
-    rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
-    outdated: tuple[str, ...] = OF_ONE_RUN
+    rng, nested_rng, _ = generators_of_diagnosis(arguments.seed)
     audited: Callable[[], PlanAudit | None] = lambda: None  # noqa: E731
     with contextlib.ExitStack() as stack:
         simulator = stack.enter_context(open_simulator(arguments)) if of_simulator else None
@@ -79,8 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
                 simulator, table, source=source, notes=said, progress=progress, **options
             )
             notes = (*diagnosis.recording.notes, *engine.notes_on_calls(diagnosis))
-            files, read = partial(_write_files_of_simulator, diagnosis), [*arguments.recordings, arguments.simulator]
-            advised, column, outdated = "next.csv", simulator.reading, _OF_ONE_RUN_OF_SIMULATOR
+            read = [*arguments.recordings, arguments.simulator]
+            advised, column = "next.csv", simulator.reading
         else:
             recordings, sensor, shape = _read_inputs(arguments, progress=progress)
             joined = engine.join(recordings)
@@ -94,17 +88,12 @@ def run(arguments: argparse.Namespace) -> int:
                 diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
             else:
                 audited = partial(engine.audit_plan_of_diagnosis, diagnosis, sensor=sensor)
-            files, notes = partial(write_files, diagnosis, rng=files_rng), joined.notes
+            notes = joined.notes
             read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
             advised, column = NEXT_PLAN, "reading"
-        drawings.write_results(
-            files,
-            report.figure_drawers(diagnosis),
-            lambda drawn: report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audited()),
-            inputs=inputs_and_filled_in_plan(read, drawings.out / advised, column),
-            outdated=outdated,
-            progress=progress,
-        )
+        made = of_diagnosis(diagnosis, seed=arguments.seed, source=source, audited=audited)
+        inputs = inputs_and_filled_in_plan(read, drawings.out / advised, column)
+        drawings.write_results(made, inputs=inputs, progress=progress)
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
     return finish(arguments, drawings, *(f"note: {n}" for n in notes), *drawings.notes, summary)
 
@@ -130,30 +119,6 @@ def _read_inputs(
             recording = read_recording(path, progress=progress)
         recordings.append(recording)
     return recordings, sensor, shape
-
-
-def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
-    """Return the generators of a diagnosis, of its nested sampling, and of the samples in its files."""
-    return np.random.default_rng(seed).spawn(3)
-
-
-def write_files(diagnosis: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
-    """Write diagnosis.json, both sensor models and the next plan."""
-    stage.write_json("diagnosis.json", engine.diagnosis_json(diagnosis))
-    write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), stage / "sensor.json")
-    write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), stage / "calibrated.json")
-    if diagnosis.next_measurement is not None:
-        write_plan(diagnosis.next_measurement.plan, stage / NEXT_PLAN)
-
-
-def _write_files_of_simulator(diagnosis: Diagnosis, stage: StagedFiles) -> None:
-    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
-    stage.write_json("diagnosis.json", engine.diagnosis_json(diagnosis))
-    write_fitted_system(engine.repaired_of(diagnosis), stage / "repaired.json")
-    write_fitted_system(engine.calibrated_of(diagnosis), stage / "calibrated.json")
-    if diagnosis.next_measurement is not None:
-        rows = cast("RunTable", diagnosis.next_measurement.plan)
-        stage.write(diagnosis.apparatus.words.next_plan, run_table_csv(rows))
 
 
 # --each
@@ -205,12 +170,12 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
         for name in files
     ]
     drawings = Drawings(out)
-    drawings.write_results(
+    made = Output(
         lambda stage: stage.write("table.csv", csv_text(report.columns_of(rows))),
         {"counts.svg": partial(report.counts_svg, rows)},
         partial(report.page_html, rows, seed=arguments.seed),
-        inputs=arguments.recordings,
     )
+    drawings.write_results(made, inputs=arguments.recordings)
     return finish(arguments, drawings, report.summary(rows), f"seed {arguments.seed}; written to {out}")
 
 

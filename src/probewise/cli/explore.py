@@ -18,7 +18,7 @@ import numpy as np
 from probewise import experiment as experiments
 from probewise._arrays import FloatArray
 from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise._writing import Drawings, Output, StagedFiles, checked_output_directory
 from probewise.arm import Geometry, Instrument, OwnInstrument, Reading
 from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
@@ -285,7 +285,7 @@ class Search:
             )
 
         animation = {"run.gif": lambda: animated_gif([frame for frame in self.frames if frame])}
-        self.drawings.write_results(write_files, animation, page, inputs=self.files, progress=progress)
+        self.drawings.write_results(Output(write_files, animation, page), inputs=self.files, progress=progress)
 
     def closing_lines(self, result: Exploration, journal: Path) -> Iterator[str]:
         """Yield the closing lines: the shape, what its sds leave out, probable sensor faults, and errors if known."""

@@ -4,12 +4,11 @@ import argparse
 
 import numpy as np
 
-from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import CommandError, finish, progress_of
 from probewise.cli._inputs import open_simulator, read_joined_table
-from probewise.diagnosis import fit_json, fit_simulator
-from probewise.report import fit as report
-from probewise.systems import samples_csv, write_fitted_system
+from probewise.diagnosis import fit_simulator
+from probewise.report.saving import output_of
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -24,18 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
         fitted = fit_simulator(
             simulator, table, source=source, notes=notes, thorough=arguments.thorough, rng=rng, progress=progress
         )
-
-        def write_files(stage: StagedFiles) -> None:
-            stage.write_json("fit.json", fit_json(fitted))
-            write_fitted_system(fitted.fitted, stage / "fitted.json")
-            stage.write("samples.csv", samples_csv(fitted.fitted))
-
-        drawings.write_results(
-            write_files,
-            report.figure_drawers(fitted),
-            lambda drawn: report.page_html(fitted, drawn, seed=arguments.seed),
-            inputs=[*arguments.tables, arguments.simulator],
-            progress=progress,
-        )
+        inputs = [*arguments.tables, arguments.simulator]
+        drawings.write_results(output_of(fitted, seed=arguments.seed), inputs=inputs, progress=progress)
     summary = f"{fitted.summary()}\nseed {arguments.seed}; written to {drawings.out}"
     return finish(arguments, drawings, *drawings.notes, summary)

@@ -12,15 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise._writing import Drawings, checked_output_directory
 from probewise.arm import Reading, RequestToPerson, carry_out
 from probewise.calibration import read_sensor
 from probewise.cli import _bench as benches
 from probewise.cli._common import CommandError, finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import inputs_and_filled_in_plan, read_or_shipped_geometry, read_or_shipped_plan
 from probewise.cli._options import SHIPPED, parse_place, refuse_options
-from probewise.cli.diagnose import OF_ONE_RUN, write_files
-from probewise.diagnosis import NEXT_PLAN, join
+from probewise.diagnosis import NEXT_PLAN
 from probewise.errors import ParameterError
 from probewise.investigation import (
     Budget,
@@ -31,9 +30,8 @@ from probewise.investigation import (
     investigate,
     parse_concealed,
 )
-from probewise.recordings import Plan, Recording, fingerprint, write_recording
-from probewise.report import diagnosis as of_a_diagnosis
-from probewise.report import investigation as report
+from probewise.recordings import Plan, Recording, fingerprint
+from probewise.report.saving import of_investigation
 from probewise.world import World
 from probewise.world.shipped import CANDIDATES, true_world
 
@@ -84,26 +82,14 @@ def run(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
         found = Investigation(tuple(rounds))
-    diagnosis = found.last.diagnosis
     read = [*([] if arguments.plan in SHIPPED else [Path(arguments.plan)]), *filter(None, [arguments.sensor])]
     drawings = Drawings(out)
-    figures = of_a_diagnosis.figure_drawers(diagnosis) | {"by_round.png": partial(report.probabilities_png, found)}
     concealed = None if world is None else tuple(effect.name for effect in world.concealed)
 
-    def write_all_files(stage: StagedFiles) -> None:
-        write_files(diagnosis, stage, rng=np.random.default_rng(files_seed))
-        write_recording(join([each.recording for each in found.rounds]), stage / "recording.csv")
-
-    page = partial(report.page_html, found, source=arguments.arm, seed=arguments.seed, concealed=concealed)
+    files_rng = np.random.default_rng(files_seed)
+    made = of_investigation(found, seed=arguments.seed, rng=files_rng, source=arguments.arm, concealed=concealed)
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
-        drawings.write_results(
-            write_all_files,
-            figures,
-            page,
-            inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN),
-            outdated=OF_ONE_RUN,
-            progress=progress,
-        )
+        drawings.write_results(made, inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN), progress=progress)
     known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]
     return finish(arguments, drawings, found.summary(), *known, *drawings.notes, f"written to {out}")
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial, singledispatch
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
 from probewise._kinds import checked_path
-from probewise._writing import Drawings, StagedFiles, checked_output_directory
+from probewise._writing import Drawings, Output, StagedFiles, checked_output_directory
 from probewise.calibration import Calibration, predict, write_sensor
 from probewise.diagnosis import (
     CURE_PLAN,
@@ -38,19 +38,6 @@ from probewise.systems import samples_csv as system_samples_csv
 DEFAULT_SEED = 2013  # of samples in files, if a result's own is not given; that of the command line
 
 
-class Output(NamedTuple):
-    """What is written: files by `files`, figures by name of file, a page of the drawn figures; what it replaces.
-
-    `main` is the file by which the results are known, `outdated` are patterns of files that an earlier run may have.
-    """
-
-    main: str
-    files: Callable[[StagedFiles], None]
-    drawers: Mapping[str, Callable[[], bytes]]
-    page: Callable[[Mapping[str, bytes]], str]
-    outdated: Sequence[str] = ()
-
-
 @singledispatch
 def output_of(value: object, *, seed: int | None = None) -> Output:
     """Return what is written of a result, whose command had this seed (None: unknown, and not stated)."""
@@ -67,7 +54,7 @@ def save(value: object, folder: str | Path, *, seed: int | None) -> Path:
     """Write a result into a folder, made if missing, and return it; errors as of `probewise._display.Reported.save`."""
     made, out = output_of(value, seed=seed), Path(checked_path("folder", folder))
     drawings = Drawings(checked_output_directory(out, main=made.main))
-    drawings.write_results(made.files, made.drawers, made.page, outdated=made.outdated)
+    drawings.write_results(made)
     drawings.raise_if_any_failed()
     return out
 
@@ -76,40 +63,45 @@ def save(value: object, folder: str | Path, *, seed: int | None) -> Path:
 def _of_calibration(value: Calibration, *, seed: int | None = None) -> Output:
     prediction = predict(value.sensor, value.recording)
     return Output(
-        "sensor.json",
         lambda stage: write_sensor(value.sensor, stage / "sensor.json"),
         calibration.figure_drawers(value, value.recording, prediction),
         lambda drawn: calibration.page_html(value, value.recording, prediction, drawn, seed=seed),
+        main="sensor.json",
     )
 
 
 @output_of.register
 def of_diagnosis(
-    value: Diagnosis, *, seed: int | None = None, source: str = "", audited: Callable[[], PlanAudit] | None = None
+    value: Diagnosis,
+    *,
+    seed: int | None = None,
+    rng: np.random.Generator | None = None,
+    source: str = "",
+    audited: Callable[[], PlanAudit | None] = lambda: None,
 ) -> Output:
     """Return the files of a diagnosis: diagnosis.json, both models, the next readings; its figures and page.
 
-    `source` names the recordings (default: the recording's own name), `audited` makes the audit of the plan, if any.
+    `rng` draws the samples in the sensors' files (default: by the seed); `source` names the recordings (default: the
+    recording's own name); `audited` makes the audit of the plan, or None.
     """
+    source = source or value.recording.source or "the readings"
     of_simulator = isinstance(value.recording.plan, RunTable)
-    rng = np.random.default_rng(DEFAULT_SEED if seed is None else seed).spawn(3)[2]  # two others made the diagnosis
-    files = _write_files_of_simulator if of_simulator else partial(write_files_of_light_sensor, rng=rng)
+    rng = rng or generators_of_diagnosis(DEFAULT_SEED if seed is None else seed)[2]
     return Output(
-        "diagnosis.json",
-        partial(files, value),
+        partial(_write_files_of_simulator if of_simulator else partial(_write_files_of_light_sensor, rng=rng), value),
         diagnosis.figure_drawers(value),
-        lambda drawn: diagnosis.page_html(
-            value,
-            drawn,
-            source=source or value.recording.source or "the readings",
-            seed=seed,
-            audit=None if audited is None else audited(),
-        ),
+        lambda drawn: diagnosis.page_html(value, drawn, source=source, seed=seed, audit=audited()),
         ("witness_*.svg", "gain.svg", *(("next.csv",) if of_simulator else (NEXT_PLAN, "next_plan.json"))),
+        main="diagnosis.json",
     )
 
 
-def write_files_of_light_sensor(value: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
+def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
+    """Return the generators of a diagnosis, of its nested sampling, and of the samples in its files."""
+    return np.random.default_rng(seed).spawn(3)
+
+
+def _write_files_of_light_sensor(value: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
     """Write diagnosis.json, both sensor models and the next plan."""
     stage.write_json("diagnosis.json", diagnosis_json(value))
     write_sensor(value.repaired.fitted_sensor(value.recording, rng=rng), stage / "sensor.json")
@@ -135,8 +127,8 @@ def _of_fit(value: SystemFit, *, seed: int | None = None) -> Output:
         write_fitted_system(value.fitted, stage / "fitted.json")
         stage.write("samples.csv", system_samples_csv(value.fitted))
 
-    figures = fit.figure_drawers(value)
-    return Output("fit.json", write_files, figures, lambda drawn: fit.page_html(value, drawn, seed=seed))
+    page = partial(fit.page_html, value, seed=seed)
+    return Output(write_files, fit.figure_drawers(value), page, main="fit.json")
 
 
 @output_of.register
@@ -148,36 +140,34 @@ def of_audit(value: PlanAudit, *, seed: int | None = None, source: str = "the pl
         if value.cure_plan is not None:
             write_plan(value.cure_plan, stage / CURE_PLAN)
 
-    return Output(
-        "audit.json",
-        write_files,
-        audit.figure_drawers(value),
-        lambda drawn: audit.page_html(value, drawn, source=source),
-        (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name),
-    )
+    outdated = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
+    page = partial(audit.page_html, value, source=source)
+    return Output(write_files, audit.figure_drawers(value), page, outdated, main="audit.json")
 
 
 @output_of.register
 def of_investigation(
-    value: Investigation, *, seed: int | None = None, source: str = "the arm", concealed: Sequence[str] | None = None
+    value: Investigation,
+    *,
+    seed: int | None = None,
+    rng: np.random.Generator | None = None,
+    source: str = "the arm",
+    concealed: Sequence[str] | None = None,
 ) -> Output:
     """Return the files of an investigation: those of its last diagnosis, and recording.csv; figures and page.
 
-    `source` names the arm; `concealed` are the effects of a simulated world, None for any other.
+    `rng` as of a diagnosis; `source` names the arm; `concealed` are the effects of a simulated world, None for any
+    other.
     """
-    last = of_diagnosis(value.last.diagnosis, seed=seed)
+    last = of_diagnosis(value.last.diagnosis, seed=seed, rng=rng)
 
     def write_files(stage: StagedFiles) -> None:
         last.files(stage)
         write_recording(join([each.recording for each in value.rounds]), stage / "recording.csv")
 
-    return Output(
-        "diagnosis.json",
-        write_files,
-        {**last.drawers, "by_round.png": partial(investigation.probabilities_png, value)},
-        lambda drawn: investigation.page_html(value, drawn, source=source, seed=seed, concealed=concealed),
-        last.outdated,
-    )
+    page = partial(investigation.page_html, value, source=source, seed=seed, concealed=concealed)
+    figures = {**last.drawers, "by_round.png": partial(investigation.probabilities_png, value)}
+    return last._replace(files=write_files, drawers=figures, page=page)
 
 
 @output_of.register
@@ -198,4 +188,4 @@ def _of_exploration(value: Exploration, *, seed: int | None = None) -> Output:
         return exploration.page_html(value, [drawn[name] for name in frames], seed=seed, model=model, truth=known)
 
     animation = {"run.gif": lambda: animated_gif([draw() for draw in frames.values()])}
-    return Output("result.json", write_files, frames | animation, page, ("frames/*.png",))
+    return Output(write_files, frames | animation, page, ("frames/*.png",), main="result.json")

@@ -194,14 +194,13 @@ def add(to: argparse._ActionsContainer, usage: str, about: str = "", **more: Any
 
     Without a metavar and `more` it is a flag.
     """
-    usual, options = _SHARED.get(usage, ("", {}))
-    options = more if about else options
+    about, options = (about, more) if about else _SHARED[usage]
     name, _, metavar = usage.partition(" ")
     if metavar:
         options = {**options, "metavar": metavar}
     elif name.startswith("--") and not options:
         options = {"action": "store_true"}
-    to.add_argument(name, help=about or usual, **options)
+    to.add_argument(name, help=about, **options)
 
 
 def _add_executor(to: argparse.ArgumentParser) -> None:

@@ -21,7 +21,14 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent, NoiseEffect
-from probewise.effects.noise import correlated_noise, drifting_noise, outliers, random_walk, signal_dependent_noise
+from probewise.effects.noise import (
+    correlated_noise,
+    drifting_noise,
+    noise_sd,
+    outliers,
+    random_walk,
+    signal_dependent_noise,
+)
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.systems import Simulator, table_for
 
@@ -128,6 +135,20 @@ def test_refined_nodes_are_as_good_as_dense_ones(effect, noise):
     heights = [float((e.log_z_nodes - e.nodes.log_weights).max()) for e in (own, wanted)]
     assert heights[0] > heights[1] - 0.1
     assert len(own.nodes.laws) <= 9
+
+
+def test_evidence_splits_into_the_calibrations_sd_and_another_of_some_factor():
+    """Beside outliers, whose name comes later: the factor is the first of the settings."""
+    found, recording = _found_with(2 * (WHITE * WIDE)[:400])
+    known = SdPrior(math.log(WHITE[:400].std()), SAME_SD, log_changed=-5.0)
+    whole = laplace_evidence(found, NoiseModel((outliers(),), recording, sd_prior=known))
+    same, changed = whole.by_sd(noise_sd())
+    assert np.logaddexp(same.log_z, changed.log_z - 5.0) == pytest.approx(whole.log_z)
+    assert changed.log_z > same.log_z + 50
+    assert [effect.name for effect in changed.noise.effects] == ["noise_sd", "outliers"]
+    drawn = changed.noise.effects[0].draws_about(changed.nodes.settings[:, :1], np.random.default_rng(1))
+    assert changed.weights @ drawn[:, 0] == pytest.approx(2.0, rel=0.2)
+    np.testing.assert_array_equal(changed.nodes.settings[:, 1:], whole.nodes.settings)
 
 
 def _mean_and_sd(evidence):

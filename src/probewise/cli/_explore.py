@@ -231,8 +231,8 @@ class Run:
         yield result.summary()
         if self.is_as_built and self.geometry is not None and self.geometry.accuracy is None:
             yield "arm          nobody has fitted its geometry: its own error is not in these sds"
-        if self.sensor.effects and self.arm.kind in ("simulated", "emulator"):
-            effects = ", ".join(map(spoken_name, self.sensor.effects))
+        effects = ", ".join(spoken_name(effect.name) for effect in self.sensor.effects_on_new_scans)
+        if effects and self.arm.kind in ("simulated", "emulator"):
             yield f"note: the simulated arm has the sensor's SSF, levels and noise, but not its effects: {effects}"
         trust = self.experiment.trust
         missing = experiments.left_out_after_step(result.last, trust)

@@ -77,7 +77,7 @@ class NoiseEvidence:
     def by_sd(self, changed: NoiseEffect) -> tuple[NoiseEvidence, NoiseEvidence]:
         """Return the evidence if the sd is that at the calibration, and if it has `changed`; without their prior odds.
 
-        The settings of the second have the factor in a last column; samples of it lie about that of their node.
+        The second has the factor among its settings; samples of it lie about that of their node.
         """
         prior, model, nodes = self.noise.sd_prior, self.noise, self.nodes
         assert prior is not None
@@ -91,10 +91,12 @@ class NoiseEvidence:
         log_sd, variance = self.peak
         sd = math.hypot(prior.spread, math.sqrt(float(variance.max(initial=0.0))))
         factor = replace(changed, draws_about=lambda about, rng: about * np.exp(sd * rng.standard_normal(about.shape)))
-        settings = np.column_stack([nodes.settings, np.exp(log_sd - prior.log_sd)])
+        effects = tuple(sorted((*model.effects, factor), key=lambda effect: effect.name))  # as a chain has them
+        column = next(own.start for effect, own in effects_with_columns(effects) if effect is factor)
+        settings = np.insert(nodes.settings, column, np.exp(log_sd - prior.log_sd), axis=1)
         return (
             of(replace(prior, log_same=0.0, log_changed=-math.inf), model.effects, nodes.settings),
-            of(replace(prior, log_same=-math.inf, log_changed=0.0), (*model.effects, factor), settings),
+            of(replace(prior, log_same=-math.inf, log_changed=0.0), effects, settings),
         )
 
 

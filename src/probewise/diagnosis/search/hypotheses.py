@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TypeAlias, TypeVar
@@ -661,21 +661,24 @@ class Evidences:
 
         @cache
         def part_of(mean: Names) -> tuple[int, Names]:
-            return max(
-                (key for key in fits if {*key[1]} <= {*mean}), key=lambda key: (len(key[1]), self.fits[key].log_z)
-            )
+            parts = [key for key in fits if {*key[1]} <= {*mean}]
+            return max(parts, key=lambda key: (len(key[1]), self.fits[key].log_z))
 
-        def split(values: Mapping[K, float], fit_of: Callable[[K], tuple[int, Names]]) -> dict[K, float]:
-            out = {}
-            for key, value in values.items():
-                *hypothesis, noise = key
-                whole, parts = self.fits[fit_of(key)], fits[fit_of(key)]
-                for own in (noise, _changed(noise)):
-                    out[(*hypothesis, own)] = value + parts.evidence[own].log_z - whole.evidence[noise].log_z
-            return out
+        def shares(key: tuple[int, Names], noise: Names) -> Iterator[tuple[Names, float]]:
+            whole = self.fits[key].evidence[noise].log_z
+            return ((own, fits[key].evidence[own].log_z - whole) for own in (noise, _changed(noise)))
 
-        screened = split(self.screened, lambda key: part_of(key[0]))
-        return Evidences(fits, screened, split(self.unknown, lambda key: key[:2]), self.unknown_shares)
+        screened = {
+            (mean, own): value + share
+            for (mean, noise), value in self.screened.items()
+            for own, share in shares(part_of(mean), noise)
+        }
+        unknown = {
+            (n, mean, own): value + share
+            for (n, mean, noise), value in self.unknown.items()
+            for own, share in shares((n, mean), noise)
+        }
+        return Evidences(fits, screened, unknown, self.unknown_shares)
 
     def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
         """Return a copy with the log evidence of fits, with and without an unknown effect, shifted by `gaps` in nats.

@@ -28,7 +28,7 @@ MAD_OF_NORMAL = 0.6745
 """Median absolute deviation of a standard normal, by which a robust sd is estimated."""
 
 SAME_SD = 0.03
-"""Share by which two noise sds may differ and count as equal: what noise law a fit has matters no more than that."""
+"""Share by which two noise sds may differ and count as equal: weights that differ so little hardly move a fit."""
 
 LEAST_SCALE = 1e-150
 """Least sd, for readings that are exactly as predicted."""
@@ -715,7 +715,8 @@ class SdPrior:
         ratio = np.exp(log_sd - self.log_sd)
         variance = (variance + ratio * self.spread**2) / 1.5**2  # of the root; of the prior's, between both sds
         same = -0.5 * (np.cbrt(ratio**2) - 1) ** 2 / variance - 0.5 * np.log(variance) - math.log(1.5) - _LOG_ROOT_2_PI
-        return np.stack([self.log_same + same, self.log_changed + SD_FACTORS.log_prob(np.ones_like(same))])
+        changed = SD_FACTORS.log_prob(np.ones_like(same))  # of its log, which is as dense everywhere as the factor at 1
+        return np.stack([self.log_same + same, self.log_changed + changed])
 
     def log_density(self, peak: FloatArray) -> FloatArray:
         """Return the log evidence of both together relative to a flat prior of log sd: (2, n) -> (n,)."""

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import hand_made_sensor
 
 from probewise.diagnosis import audit_plan
 from probewise.diagnosis.audit import Expected
@@ -126,3 +127,10 @@ def test_a_sensor_whose_readings_fall_with_the_light_is_audited_like_another():
     audit = audit_plan(plan, sensor=sensor, effects={"backlash": VOCABULARY["backlash"]})
     assert audit.effects[0].detectability == "fine"
     assert "noise 0.47 LEGO" in audit.assumed
+
+
+def test_another_noise_sd_shows_only_beside_a_calibrated_sensor():
+    effects = {name: VOCABULARY[name] for name in ("noise_sd", "offset_drift")}
+    alone, beside = (audit_plan(paper_plan(), sensor=known, effects=effects) for known in (None, hand_made_sensor()))
+    assert alone.effects[0].reason == "the model's own parameters absorb it"
+    assert beside.effects[0].detectability == "fine"

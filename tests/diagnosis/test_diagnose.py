@@ -10,12 +10,17 @@ import math
 import jsonschema
 import numpy as np
 import pytest
+from hand_made import TRUTH, sensor_of
 
+from probewise.calibration import predict
 from probewise.diagnosis import Diagnosis, diagnose, diagnosis_json, diagnosis_schema
 from probewise.diagnosis.held_out import HeldOutGain
+from probewise.diagnosis.sensors import sensor_from_samples
 from probewise.effects import EFFECTS, VOCABULARY, Origin
 from probewise.errors import ParameterError
+from probewise.experiment import experiment_for
 from probewise.recordings import Plan, Recording, paper_plan, two_way_plan
+from probewise.scene import Circle, Field
 from probewise.world import concealed as hidden
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -216,6 +221,22 @@ def test_levels_that_have_changed_since_the_calibration_are_named_beside_its_sen
     assert parameter["mean"] == pytest.approx(size, abs=4 * parameter["sd"])
     repaired = found.repaired.fitted_sensor(changed, rng=np.random.default_rng(0))
     assert name in repaired.effects
+
+
+def test_another_noise_sd_than_at_the_calibration_is_named_with_its_factor_and_kept_by_the_repaired_sensor():
+    spot, rng = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.0)], pixel_mm=1.0), np.random.default_rng(4)
+    read = World(spot, noise_sd=NOISE_SD, concealed=(hidden.noise_sd(2.0),)).simulate(paper_plan(), rng=rng)
+    found = diagnose(read, sensor=sensor_of(TRUTH * rng.normal(1.0, 0.003, (500, 8))), rng=rng)
+    document = strict(found)
+    assert (found.verdict, document["combination"]) == ("noise", ["noise_sd"])
+    low, high = document["effects"][0]["parameters"][0]["interval95"]
+    assert low < 2 < high < 1.3 * low
+    assert found.noise.model == "noise_sd"
+    sensor = found.repaired.fitted_sensor(read, rng=rng)
+    assert sensor.effects == ("noise_sd",)
+    robot = experiment_for(sensor, Circle(Field()), Field())
+    for sd in (robot.noise_sd, predict(sensor, read).sd.mean(), math.exp(sensor_from_samples(sensor).sd_prior.log_sd)):
+        assert sd == pytest.approx(2 * NOISE_SD, rel=0.15)  # four standard errors
 
 
 @pytest.mark.slow

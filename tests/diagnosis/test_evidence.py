@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -15,12 +16,19 @@ from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import LEAST_VISIBLE, laplace_evidence, log_probability_effects_detectable, refined
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, fit
 from probewise.diagnosis.held_out import held_out_gain
-from probewise.diagnosis.noise import NoiseModel, white_noise, white_noise_of_recording
+from probewise.diagnosis.noise import SAME_SD, NoiseModel, SdPrior, white_noise, white_noise_of_recording
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent, NoiseEffect
-from probewise.effects.noise import correlated_noise, drifting_noise, outliers, random_walk, signal_dependent_noise
+from probewise.effects.noise import (
+    correlated_noise,
+    drifting_noise,
+    noise_sd,
+    outliers,
+    random_walk,
+    signal_dependent_noise,
+)
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.systems import Simulator, table_for
 
@@ -47,6 +55,27 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     assert log_probability_effects_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(
         expected, abs=0.1 + 0.02 * abs(expected)
     )
+
+
+@pytest.mark.parametrize(("n", "ratio"), [(12, 1.6), (30, 0.7), (400, 1.0), (400, 1.3), (400, 2.0)])
+def test_the_evidence_of_the_calibrations_sd_is_that_of_an_integral(n, ratio):
+    """Of a flat prior of log sd, the likelihood of n residuals is that of a gamma distribution of the precision."""
+    prior, log_sd = SdPrior(0.0, 0.05), np.linspace(-2.0, 2.0, 20001)
+    log_p = -n * (log_sd - math.log(ratio)) - 0.5 * n * (ratio / np.exp(log_sd)) ** 2
+    wanted = logsumexp(log_p + norm.logpdf(log_sd, 0.0, 0.05)) - logsumexp(log_p)
+    (found,) = prior.log_density(np.array([[math.log(ratio)], [0.5 / n]]))
+    assert found == pytest.approx(wanted, abs=0.1, rel=0.08)
+
+
+@pytest.mark.parametrize(("n", "expected"), [(24, 51.0), (100, 9.2), (408, 0.45)])
+def test_an_unchanged_noise_sd_is_called_changed_as_rarely_as_computed(n, expected):
+    """Of 100,000 pairs of calibration and recording, of `n` readings each; expected by two million others."""
+    rng, prior = np.random.default_rng(7), PriorOdds(n_noises=7)
+    sds = np.sqrt(rng.chisquare(n, (2, 100_000)) / n)
+    odds = prior.log_prior_on_noise(("noise_sd",)) - prior.log_prior_on_noise(())
+    known = SdPrior(0.0, math.hypot((2 * n) ** -0.5, SAME_SD), log_changed=odds)
+    same, changed = known.log_odds(np.stack([np.log(sds[1] / sds[0]), np.full(100_000, 0.5 / n)]))
+    assert abs(np.sum(changed > same) - expected) <= 4 * math.sqrt(expected) + 1
 
 
 N = 2000
@@ -106,6 +135,20 @@ def test_refined_nodes_are_as_good_as_dense_ones(effect, noise):
     heights = [float((e.log_z_nodes - e.nodes.log_weights).max()) for e in (own, wanted)]
     assert heights[0] > heights[1] - 0.1
     assert len(own.nodes.laws) <= 9
+
+
+def test_evidence_splits_into_the_calibrations_sd_and_another_of_some_factor():
+    """Beside outliers, whose name comes later: the factor is the first of the settings."""
+    found, recording = _found_with(2 * (WHITE * WIDE)[:400])
+    known = SdPrior(math.log(WHITE[:400].std()), SAME_SD, log_changed=-5.0)
+    whole = laplace_evidence(found, NoiseModel((outliers(),), recording, sd_prior=known))
+    same, changed = whole.by_sd(noise_sd())
+    assert np.logaddexp(same.log_z, changed.log_z - 5.0) == pytest.approx(whole.log_z)
+    assert changed.log_z > same.log_z + 50
+    assert [effect.name for effect in changed.noise.effects] == ["noise_sd", "outliers"]
+    drawn = changed.noise.effects[0].draws_about(changed.nodes.settings[:, :1], np.random.default_rng(1))
+    assert changed.weights @ drawn[:, 0] == pytest.approx(2.0, rel=0.2)
+    np.testing.assert_array_equal(changed.nodes.settings[:, 1:], whole.nodes.settings)
 
 
 def _mean_and_sd(evidence):

@@ -56,6 +56,10 @@ def test_signal_dependent_noise_has_a_variance_in_proportion(noise, ramp):
         assert abs(part.var() - 1) < 4 * math.sqrt(2 / len(part))
 
 
+def test_another_noise_sd_scales_the_noise(noise):
+    np.testing.assert_allclose(noise(known.noise_sd(3.0)), 3.0 * noise(), atol=1e-9)
+
+
 def test_drifting_noise_grows_to_its_factor_and_stays(noise, ramp):
     z = noise(known.drifting_noise(2.0, N / 2))
     late = z[ramp.time_s > N / 2]

@@ -21,6 +21,7 @@ from probewise.calibration.fields import QuantitySummary, posterior_mean_ssf_fie
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
 from probewise.effects import EFFECTS, OTHER_FORMS, Extent, Origin
+from probewise.effects.noise import noise_sd
 from probewise.effects.optics import edge_shadow, edge_shadow_of_patterns
 from probewise.effects.reference import ZERO
 from probewise.errors import FileError, ProbewiseError, printable, require, shown
@@ -43,8 +44,9 @@ from probewise.sensor import (
 
 FORMAT = "sensor/1"
 _ALLOWED = "a sensor.json as `probewise calibrate` writes"
-# Effects of single scans or mountings: they explain the recording but do not apply to new scans.
-BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
+# Effects that explain the recording but do not apply to new scans: of single scans or mountings; and another noise sd
+# than at an earlier calibration, which the sensor's own sd is.
+NOT_OF_NEW_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement", noise_sd.name})
 _FOR_A_FREE_FORM = 4  # Gaussians that approximate a free-form SSF where a mixture is required
 # Effects that may be restricted to some patterns.
 _BOUND_TO_PATTERNS = frozenset({edge_shadow.name})
@@ -151,8 +153,8 @@ class FittedSensor(NamedSamples):
 
     @property
     def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
-        """The effects that also apply to new scans, as objects: all but those of single scans (`BOUND_TO_SCANS`)."""
-        return tuple(self._build_effect(name) for name in self.effects if name not in BOUND_TO_SCANS)
+        """The effects that also apply to new scans, as objects: all but those in `NOT_OF_NEW_SCANS`."""
+        return tuple(self._build_effect(name) for name in self.effects if name not in NOT_OF_NEW_SCANS)
 
     def _build_effect(self, name: str) -> AnyEffect:
         if name in self.patterns:
@@ -301,7 +303,8 @@ class FittedSensor(NamedSamples):
         return json.dumps(document, allow_nan=False) + "\n"
 
     def _noise_in_words(self) -> str:
-        known = [name.replace("_", " ") for name in self.effects if EFFECTS[name].stage is Stage.NOISE]
+        acting = [effect.name for effect in self.effects_on_new_scans if effect.stage is Stage.NOISE]
+        known = [name.replace("_", " ") for name in acting]
         plain = "Gaussian, one sd pooled over scans; one value per sample"
         return f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}"
 

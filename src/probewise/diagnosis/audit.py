@@ -42,7 +42,7 @@ from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
 from probewise.diagnosis.templates import templates_of_effect
 from probewise.diagnosis.words import substitute_reading_unit
 from probewise.effects import NUISANCES, VOCABULARY, Effect, Extent, LightEffect, name_of_first_copy
-from probewise.effects.noise import noise_of_runs, noise_per_run
+from probewise.effects.noise import noise_of_runs, noise_per_run, noise_sd
 from probewise.errors import ParameterError, require
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
@@ -188,6 +188,7 @@ _READING_GUIDE = (
     " of c; the reverse need not hold. invisible: not detected.)",
 )
 _AS_CALIBRATED = "the sensor as calibrated"
+_ABSORBED = "the model's own parameters absorb it"
 _NOISE = 0.01  # noise as a share of the span between the levels, likewise
 # Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
 _TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.2, 0.0, 0.0])
@@ -383,7 +384,7 @@ def audit_plan_of_diagnosis(diagnosis: Diagnosis, *, sensor: SensorPrior | None 
     else:
         null = default_sensor(extent, known.n_gaussians)
     z, sd = np.clip(null.z(own)[0], -FARTHEST, FARTHEST), float(known.noise_sd.mean())
-    scaled = partial(_effects_under, VOCABULARY, _levels(known.chain.names, mean))
+    scaled = partial(_effects_under, VOCABULARY, _levels(known.chain.names, mean), null)
     expected = Expected(null, z, sd, scaled, f"{_AS_CALIBRATED} from these readings")
     bank = expected.bank(plan, most=_SETTINGS)
     seen, cosines = audits_and_cosines(bank, list(VOCABULARY), plan.instrumentation.unit)
@@ -395,10 +396,12 @@ def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
     return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
 
 
-def _effects_under(kinds: Mapping[str, LightEffect], levels: tuple[float, float], plan: Plan) -> dict[str, Effect]:
-    """Scale effects to the low and high level and to a plan, without those that cannot act."""
+def _effects_under(
+    kinds: Mapping[str, LightEffect], levels: tuple[float, float], null: Null, plan: Plan
+) -> dict[str, Effect]:
+    """Scale effects to the low and high level and to a plan, without those that cannot act or be told from the null."""
     maybe = {name: kind.for_extent(Extent(*levels, plan)) for name, kind in kinds.items()}
-    return {name: effect for name, effect in maybe.items() if effect is not None}
+    return {name: effect for name, effect in maybe.items() if effect is not None and null.admits(effect)}
 
 
 def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[str, LightEffect]) -> Expected:
@@ -417,7 +420,7 @@ def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[st
         said = f"a typical sensor of {low:g} to {high:g}"
     sd = float(sensor.noise_sd.mean()) if isinstance(sensor, FittedSensor) else _NOISE * (high - low)
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
-    return Expected(null, z, sd, partial(_effects_under, effects, (low, high)), said)
+    return Expected(null, z, sd, partial(_effects_under, effects, (low, high), null), said)
 
 
 def audits_and_cosines(bank: EffectBank, names: Sequence[str], unit: str) -> tuple[tuple[EffectAudit, ...], FloatArray]:
@@ -427,14 +430,14 @@ def audits_and_cosines(bank: EffectBank, names: Sequence[str], unit: str) -> tup
     cosines, out = np.zeros((len(names), len(names))), list[EffectAudit]()
     for own, name in enumerate(names):
         effect = bank.built.get(name)
-        share, reason = 0.0, "its covariate does not vary here"
+        share, reason = 0.0, _ABSORBED if name == noise_sd.name else "its covariate does not vary here"
         alike, smallest = list[tuple[str, float]](), tuple[DetectableSize, ...]()
         if effect is not None and effect.stage is Stage.NOISE:
             share = float(n_points >= LEAST_READINGS)
             reason = f"{n_points} readings do not show the scatter; {LEAST_READINGS} would"
         elif effect is not None:
             share, like, sizes = every[name]
-            reason = "the model's own parameters absorb it" if share > 0 else "it leaves no trace here"
+            reason = _ABSORBED if share > 0 else "it leaves no trace here"
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
             alike = sorted(((other, c) for other, c in like.items() if c >= ALIAS), key=lambda pair: -pair[1])

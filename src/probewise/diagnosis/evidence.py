@@ -16,7 +16,7 @@ from scipy.special import log_ndtr, logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, log_multiplicity, residual_degrees_of_freedom, with_prior
-from probewise.diagnosis.noise import NoiseLaw, NoiseModel, NoiseNodes, stacked_density, whiten_under_each
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, NoiseNodes, SdPrior, stacked_density, whiten_under_each
 from probewise.effects import NoiseEffect
 from probewise.sensor.stages import effects_with_columns
 
@@ -33,13 +33,15 @@ _MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noi
 class NoiseEvidence:
     """Log evidence of a fit under one noise model, in total and by node (a setting of the model's parameters).
 
-    An impossible model (none of its nodes fits these readings) has no nodes and log evidence minus infinity.
+    An impossible model (none of its nodes fits these readings) has no nodes and log evidence minus infinity. `peak`:
+    the likeliest log of a reading's sd, rounding included, and its variance, (2, n_nodes); (2, 0) without prior of it.
     """
 
     noise: NoiseModel
     log_z: float
     log_z_nodes: FloatArray
     nodes: NoiseNodes
+    peak: FloatArray
 
     @property
     def weights(self) -> FloatArray:
@@ -70,7 +72,32 @@ class NoiseEvidence:
         """A copy with the most probable node alone; `log_z` remains that of all nodes."""
         at = [int(np.argmax(self.log_z_nodes))]
         own = NoiseNodes(self.nodes.settings[at], (self.likeliest_law,), self.nodes.log_weights[at])
-        return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], own)
+        return replace(self, log_z_nodes=self.log_z_nodes[at], nodes=own, peak=self.peak[:, at[: self.peak.shape[1]]])
+
+    def by_sd(self, changed: NoiseEffect) -> tuple[NoiseEvidence, NoiseEvidence]:
+        """Return the evidence if the sd is that at the calibration, and if it has `changed`; without their prior odds.
+
+        The second has the factor among its settings; samples of it lie about that of their node.
+        """
+        prior, model, nodes = self.noise.sd_prior, self.noise, self.nodes
+        assert prior is not None
+
+        def of(own: SdPrior, effects: tuple[NoiseEffect, ...], settings: FloatArray) -> NoiseEvidence:
+            every = self.log_z_nodes - prior.log_density(self.peak) + own.log_density(self.peak)
+            share = logsumexp(every) - logsumexp(self.log_z_nodes) if np.isfinite(self.log_z) else 0.0
+            noise, given = replace(model, effects=effects, sd_prior=own), replace(nodes, settings=settings)
+            return NoiseEvidence(noise, self.log_z + float(share), every, given, self.peak)
+
+        log_sd, variance = self.peak
+        sd = math.hypot(prior.spread, math.sqrt(float(variance.max(initial=0.0))))
+        factor = replace(changed, draws_about=lambda about, rng: about * np.exp(sd * rng.standard_normal(about.shape)))
+        effects = tuple(sorted((*model.effects, factor), key=lambda effect: effect.name))  # as a chain has them
+        column = next(own.start for effect, own in effects_with_columns(effects) if effect is factor)
+        settings = np.insert(nodes.settings, column, np.exp(log_sd - prior.log_sd), axis=1)
+        return (
+            of(replace(prior, log_same=0.0, log_changed=-math.inf), model.effects, nodes.settings),
+            of(replace(prior, log_same=-math.inf, log_changed=0.0), effects, settings),
+        )
 
 
 def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
@@ -80,32 +107,63 @@ def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     white. If the floor of the sd exceeds the residuals, the integral over the sd is taken as wide as without a floor.
     """
     every = noise.nodes_for_predictions(found.predicted)
-    out = log_evidence_under(found, every.laws) + every.log_weights
-    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
+    out, peak = log_evidence_under(found, every.laws, noise.sd_prior)
+    out += every.log_weights
+    return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every, peak)
 
 
-def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw]) -> FloatArray:
-    """Return the log evidence of a fit under each noise distribution, (n_laws,); minus infinity if impossible."""
+def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw], sd_prior: SdPrior | None) -> tuple[FloatArray, FloatArray]:
+    """Return the log evidence of a fit under each noise distribution, (n_laws,); minus infinity if impossible.
+
+    With a prior of the sd, also the `peak` of `NoiseEvidence`, (2, n_laws); else (2, 0).
+    """
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
+    out, peak = np.full(len(laws), -math.inf), np.zeros((2, 0 if sd_prior is None else len(laws)))
     if not np.isfinite(joined).all():  # a fit at the edge of what its formula predicts
-        return np.full(len(laws), -math.inf)
-    out = np.empty(len(laws))
+        return out, peak
+
+    def weigh(nodes: Sequence[int], evidences: Callable[..., tuple[FloatArray, ...]]) -> None:
+        own = [laws[node] for node in nodes]
+        out[nodes], sigma, bend, curvature = evidences(found, own, joined)
+        if sd_prior is not None:
+            peak[:, nodes] = _peak_of_log_sd(own, sigma, bend, curvature)
+
     normal = [node for node, law in enumerate(laws) if law.whitened_density.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
-        out[nodes] = _normal_log_evidences(found, [laws[node] for node in nodes], joined)
+        weigh(nodes, _normal_log_evidences)
     tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
     for node in sorted({*range(len(out))} - {*normal}):
         tailed.setdefault((laws[node].whitening_key, laws[node].flat > 0), []).append(node)
     for nodes in tailed.values():
-        out[nodes] = _tailed_log_evidences(found, [laws[node] for node in nodes], joined)
+        weigh(nodes, _tailed_log_evidences)
     out += np.array([law.log_extra for law in laws]) + log_multiplicity(found.model.sensor)
+    if sd_prior is not None:
+        out += sd_prior.log_density(peak)
     out[np.isnan(out)] = -math.inf  # slopes or residuals whose squares overflow: impossible
-    return out
+    return out, peak
 
 
-def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
-    """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual."""
+def _peak_of_log_sd(
+    laws: Sequence[NoiseLaw], sigma: FloatArray, bend: FloatArray, curvature: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the likeliest log of a reading's sd, and its variance, (n_laws,), the fit's parameters integrated out.
+
+    `sigma`, `bend`, `curvature`: as in `_normal_log_evidences`. The sd of a node of rounded noise is known.
+    """
+    n_points = np.array([law.n_kept for law in laws])
+    n_fitted = curvature.shape[1] - np.trace(np.linalg.inv(curvature), axis1=1, axis2=2)
+    more = n_points / np.maximum(n_points - n_fitted, 1.0)  # by which parameters that were fitted reduce the variance
+    more, variance = np.where([law.flat > 0 for law in laws], [[1.0], [0.0]], [more, more / bend])
+    return np.log(sigma * np.sqrt(more) * [law.sd_factor_of_rounding for law in laws]), variance
+
+
+def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the log evidence under Gaussian noise, (n_laws,); `joined` (n_points, n_params + 1): slopes, residual.
+
+    Returns also the likeliest sigma and the curvature of log sigma there, (n_laws,) both; and that of the coordinates,
+    (n_laws, n_params, n_params).
+    """
     p, n_points = joined.shape[1] - 1, np.array([law.n_kept for law in laws])
     turned = np.ascontiguousarray(whiten_under_each(laws, joined))
     gram = turned.transpose(0, 2, 1) @ turned
@@ -124,11 +182,12 @@ def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
     rss = sums_of_squares()
     variance = np.maximum(rss / n_points, least)
     misfit = 0.5 * n_points * np.log(variance) + 0.5 * rss / variance
-    return np.asarray(fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points))
+    log_z = fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points)
+    return log_z, np.sqrt(variance), 2.0 * n_points, curvature
 
 
-def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
-    """Return the log evidence, (n_laws,), under noise models that whiten alike but differ in tail or rounding."""
+def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the same under noise models that whiten alike but differ in tail or rounding."""
     turned = laws[0](joined)
     p, n_points = turned.shape[1] - 1, laws[0].n_kept
     slopes, residual = turned[:, :p], turned[:, p:]
@@ -145,8 +204,9 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
     left = residual - slopes @ steps
     sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
     fit_and_prior = _laplace_terms((found.z[:, None] + steps).T, curvature, n_points) - laws[0].half_log_det()
-    scale = 0.5 * np.log(2 * math.pi / tail.log_sigma_curvature(left, sigma, n_points))
-    return np.asarray(fit_and_prior - tail.minus_log_likelihood(left, sigma, n_points) + scale)
+    bend = tail.log_sigma_curvature(left, sigma, n_points)
+    log_z = fit_and_prior - tail.minus_log_likelihood(left, sigma, n_points) + 0.5 * np.log(2 * math.pi / bend)
+    return log_z, sigma, bend, curvature
 
 
 def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
@@ -189,7 +249,7 @@ def refined(found: Fit, evidence: NoiseEvidence, *, least: float = -math.inf) ->
                 unit = effect.prior.to_unit_cube(settings[:, part])
                 unit[:, columns[own] - part.start] = points[:, own]
                 settings[:, part] = effect.prior.from_unit_cube(unit)
-        return log_evidence_under(found, model.laws_at(settings, found.predicted))
+        return log_evidence_under(found, model.laws_at(settings, found.predicted), model.sd_prior)[0]
 
     while columns.size:
         peak, sd = _peak_and_sds(log_density, start, spacing)

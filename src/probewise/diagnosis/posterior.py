@@ -35,7 +35,7 @@ from probewise.diagnosis.linear_posterior import (
     modes_of_opposite_sign,
     sizes_with_shape,
 )
-from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw
+from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, SdPrior
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.diagnosis.simulator_fit import log_evidence_of
 from probewise.errors import NotConvergedError
@@ -132,7 +132,7 @@ class HypothesisProblem:
         with np.errstate(all="ignore"):  # of predictions that ran away: impossible below
             residuals = (self.recording.readings[usable] - predicted).T
             terms = [
-                log_weight + log_likelihood_marginal_over_sigma(law, law(residuals))
+                log_weight + log_likelihood_marginal_over_sigma(law, law(residuals), self.noise.noise.sd_prior)
                 for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
             ]
             out = np.asarray(logsumexp(terms, axis=0)) + log_share
@@ -146,10 +146,12 @@ class HypothesisProblem:
         return kept
 
 
-def log_likelihood_marginal_over_sigma(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
+def log_likelihood_marginal_over_sigma(
+    law: NoiseLaw, whitened: FloatArray, sd_prior: SdPrior | None = None
+) -> FloatArray:
     """Return the log likelihood of whitened residuals (n_points, n_samples) under one noise distribution: (n_samples,).
 
-    Log sigma, with a flat prior, is integrated out by Laplace's method about its peak.
+    Log sigma, with a flat prior unless that of the sd is given, is integrated out by Laplace's method about its peak.
     """
     n_points = law.n_kept
     sigma = law.likeliest_sigma(whitened)
@@ -159,7 +161,11 @@ def log_likelihood_marginal_over_sigma(law: NoiseLaw, whitened: FloatArray) -> F
         else 2.0 * n_points
     )
     peak = -law.minus_log_likelihood(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
-    return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.half_log_det() + law.log_extra)
+    out = peak + 0.5 * np.log(2 * math.pi / curvature) - law.half_log_det() + law.log_extra
+    if sd_prior is not None:
+        variance = np.broadcast_to(0.0 if law.flat else 1 / curvature, sigma.shape)
+        out += sd_prior.log_density(np.stack([np.log(sigma * law.sd_factor_of_rounding), variance]))
+    return np.asarray(out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,4 +112,5 @@ class PriorOdds:
         """Return the log prior of a noise model by its uncertain effects `names`."""
         if not names:
             return math.log(self.white)
-        return math.log(self.noise_by_size[len(names) - 1] / math.comb(self.n_noises, len(names)))
+        size = min(len(names), len(self.noise_by_size))  # beside three, another sd is as probable as they are
+        return math.log(self.noise_by_size[size - 1] / math.comb(self.n_noises, len(names)))

@@ -69,10 +69,10 @@ N_SAMPLES = 500
 class ModelSamples:
     """Equally weighted posterior samples of a model (`chain`) with effects.
 
-    `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading;
-    `n_gaussians` is that of the SSF, 0 without; `nuisance` names parameters of this recording only;
-    `has_exchangeable_gaussians`: whether permuting the Gaussians changes nothing; `absent` marks, by effect, the
-    samples without it, (n_samples,).
+    `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading, which an
+    effect of that name compares with an earlier calibration's; `n_gaussians` is that of the SSF, 0 without; `nuisance`
+    names parameters of this recording only; `has_exchangeable_gaussians`: whether permuting the Gaussians changes
+    nothing; `absent` marks, by effect, the samples without it, (n_samples,).
     """
 
     chain: Predictor

@@ -25,7 +25,9 @@ from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise._kinds import require_like
 from probewise.calibration import FittedSensor, mixture_moments
 from probewise.diagnosis.fit import FARTHEST, Model, Null
+from probewise.diagnosis.noise import SAME_SD, SdPrior
 from probewise.effects import Effect, Extent
+from probewise.effects.noise import noise_sd, quantisation
 from probewise.errors import ParameterError, require
 from probewise.priors import Prior
 from probewise.recordings.plan import Plan, Recording
@@ -57,7 +59,8 @@ class CalibratedSensor:
     N_BENDS weights.
 
     `center` (n_params,) is the prior's mean, `factor` a square root of its covariance. `calibrated_height_mm` is the
-    height of an earlier calibration; None: the height that a plan declares.
+    height of an earlier calibration; None: the height that a plan declares. `sd_prior` is that of its noise; None: not
+    known.
     """
 
     n_gaussians: int
@@ -66,6 +69,7 @@ class CalibratedSensor:
     has_exchangeable_gaussians: bool = True
     is_free_form: bool = False
     calibrated_height_mm: float | None = None
+    sd_prior: SdPrior | None = None
     predicts_in_bulk = predicts_dearly = may_be_far_off = False
 
     def __post_init__(self) -> None:
@@ -99,7 +103,7 @@ class CalibratedSensor:
         return np.zeros((1, self.n_params))
 
     def admits(self, effect: Effect) -> bool:
-        return True
+        return self.sd_prior is not None or effect.name != noise_sd.name
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates z, (n_samples, n_params), to a_1 .. C_N, I_min, I_max, (n_samples, 6 N + 2)."""
@@ -245,9 +249,13 @@ def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
 
     Raises ParameterError if the names are not those of a mixture of Gaussians with two free levels.
     """
-    height_mm = None
+    height_mm, sd_prior = None, None
     if isinstance(sensor, FittedSensor):
         sensor, height_mm = sensor.with_leading_effects(), sensor.instrumentation.height_mm
+        step = f"{quantisation.name}.step"  # of a rounding that the sd does not include
+        of_rounding = sensor.samples[:, sensor.names.index(step)] / math.sqrt(12) if step in sensor.names else 0.0
+        log_sd = np.log(np.hypot(sensor.noise_sd, of_rounding))
+        sd_prior = SdPrior(float(log_sd.mean()), math.hypot(float(log_sd.std()), SAME_SD))
     names, samples = list(sensor.names), np.asarray(sensor.samples, dtype=np.float64)
     n_gaussians = sum(name.startswith("a_") for name in names)
     wanted = [*mixture_parameter_names(max(n_gaussians, 1)), "I_min", "I_max"]
@@ -267,7 +275,7 @@ def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
     size[levels] = np.abs(center[levels]).max() or 1.0
     floor = _RIDGE * np.maximum(np.diag(natural_cov), _LEAST_VARIANCE * size**2)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
-    return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm)
+    return CalibratedSensor(n_gaussians, center, factor, False, free, height_mm, sd_prior)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

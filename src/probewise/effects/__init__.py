@@ -50,6 +50,7 @@ VOCABULARY: Mapping[str, LightEffect] = _by_name(
     optics.halo,
     optics.glint,
     noise.quantisation,
+    noise.noise_sd,
     noise.signal_dependent_noise,
     noise.correlated_noise,
     noise.outliers,

@@ -45,6 +45,7 @@ def _on_noise(
     n_nodes: tuple[int, ...] = (10,),
     *,
     from_prior: bool = True,
+    **more: Any,
 ) -> Effect:
     """Return an effect with nodes of its prior: midpoints of `n_nodes` equal shares along each parameter.
 
@@ -54,7 +55,33 @@ def _on_noise(
     u = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
     entries = Product(priors_and_units(parameters)[0]).from_unit_cube(u)[:, None, :]
     nodes = n_nodes if from_prior else ()
-    return kind.bind(of, parameters, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes)
+    return kind.bind(of, parameters, act, entries, says, kind=NoiseEffect, nodes_per_parameter=nodes, **more)
+
+
+SD_FACTORS = LogUniform(0.25, 6.0)
+"""Prior of the noise sd since the calibration, in units of the sd then."""
+
+
+@light_effect(
+    "noise_sd",
+    Stage.NOISE,
+    "noise of another size than at the calibration",
+    ("level", "time"),
+    is_absorbed_by_ssf=lambda plan: True,  # with the SSF the sd is free too
+)
+def noise_sd(kind: LightEffect, of: Extent) -> Effect:
+    """Noise of another size than at the calibration: sd x factor."""
+    return _on_noise(
+        kind,
+        of,
+        {"factor": (SD_FACTORS, "1")},
+        lambda noise, theta, plan: replace(noise, sd=noise.sd * theta[:, :1]),
+        in_words("the sd of the noise is {0} times that at the calibration"),
+        (12,),
+        from_prior=False,  # the readings' sd tells the factor: `diagnosis.noise.SdPrior`
+        amplitudes=(),
+        absent={0: 1.0},
+    )
 
 
 @light_effect("correlated_noise", Stage.NOISE, "correlated noise", ("scan",))

@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects import HeavyTailedPrior
-from probewise.effects.noise import correlated_noise, lattice_step, outliers, signal_dependent_noise
+from probewise.effects.noise import SD_FACTORS, correlated_noise, lattice_step, outliers, signal_dependent_noise
 from probewise.effects.noise_distribution import log_gaussian_density, log_rounding_cell_density
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
@@ -26,7 +26,7 @@ from probewise.priors import LogUniform
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
-_FACTORS = LogUniform(0.25, 6.0).from_unit((np.arange(12) + 0.5) / 12)  # of the noise since the calibration
+_FACTORS = SD_FACTORS.from_unit((np.arange(12) + 0.5) / 12)
 _NODES = (np.arange(6)[:, None] + 0.5) / 6  # of a prior of one parameter
 _EXACT = 1e-3  # of the noise sd: within which a value counts as the same, lost to black or rounded
 _PHASES = 7

@@ -12,6 +12,7 @@ from probewise.diagnosis.unknown_bases import MEMORY, PRODUCTS, SCAN_ENDS
 from probewise.diagnosis.verdict import covariate_of_unknown
 from probewise.diagnosis.words import effect_in_words, effects_in_words, hypothesis_in_words, join_lists, join_names
 from probewise.effects import PROPOSAL, RARE_EFFECTS
+from probewise.effects.noise import noise_sd
 from probewise.report.covariates import covariate_in_words_and_unit
 from probewise.report.words import typeset_numbers
 
@@ -44,7 +45,8 @@ def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
         case "cannot_tell":
             return _undecided_versions(diagnosis)
         case "noise":
-            said = _left_out_versions(diagnosis, "The predicted mean is right, but the noise is not white:")
+            unlike = "what it was" if diagnosis.stated == (noise_sd.name,) else "white"
+            said = _left_out_versions(diagnosis, f"The predicted mean is right, but the noise is not {unlike}:")
         case "named":
             more = " Something more is missing." if diagnosis.improvement.p_value_after < ALARM else ""
             *plain, last = _left_out_versions(diagnosis, "The model leaves out")

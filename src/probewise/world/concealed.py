@@ -265,6 +265,12 @@ def correlated_noise(rho: float) -> Act:
 
 
 @acts_at("noise")
+def noise_sd(factor: float) -> Act:
+    """Noise of `factor` times its sd."""
+    return lambda values, rows, seen, rng: factor * values
+
+
+@acts_at("noise")
 def signal_dependent_noise(ratio: float) -> Act:
     """Noise variance that grows linearly from its value on black to 1 + `ratio` times that on white."""
     return lambda values, rows, seen, rng: values * np.sqrt(1 + ratio * seen)

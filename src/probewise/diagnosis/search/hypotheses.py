@@ -26,7 +26,7 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, rough_sd
+from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, SdPrior, rough_sd
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
@@ -43,6 +43,7 @@ from probewise.effects.noise import (
     ROUNDING_SEEN_ABOVE,
     correlated_noise,
     lattice_step,
+    noise_sd,
     outliers,
     quantisation,
     random_walk,
@@ -151,6 +152,16 @@ class WeighedFit:
         """Log evidence under the best noise model."""
         return max(e.log_z for e in self.evidence.values())
 
+    def at_likelier_sd(self, noise: Names) -> NoiseEvidence:
+        """Return the evidence under a noise model, with the calibration's noise sd or another, the larger one."""
+        return max((e for names, e in self.evidence.items() if _unchanged(names) == noise), key=lambda e: e.log_z)
+
+    def split_by_sd(self, changed: NoiseEffect) -> WeighedFit:
+        """Return a copy with two noise models for each: with the noise sd of the calibration, and with another."""
+        by_sd = {noise: evidence.by_sd(changed) for noise, evidence in self.evidence.items()}
+        same = {noise: first for noise, (first, _) in by_sd.items()}
+        return replace(self, evidence=same | {_changed(noise): second for noise, (_, second) in by_sd.items()})
+
     def possible_noise(self, noise: Names) -> Names:
         """Return a noise model or, where it is impossible about this fit, the best of those with part of its effects.
 
@@ -199,6 +210,14 @@ def effects_out_of_vocabulary(mean: Names) -> Names:
     return tuple(name for name in mean if is_out_of_vocabulary(name))
 
 
+def _changed(noise: Names) -> Names:
+    return tuple(sorted((*noise, noise_sd.name)))
+
+
+def _unchanged(noise: Names) -> Names:
+    return tuple(name for name in noise if name != noise_sd.name)
+
+
 WITH_MEMORY = frozenset({correlated_noise.name, random_walk.name})
 """Effects on the noise of which a noise distribution can contain only one."""
 
@@ -212,13 +231,15 @@ class NoiseModels:
 
     `certain`: noise effects that the readings show beyond doubt, part of every model; `least_sd`: the least plausible
     sd of a reading; `sd_about_fit`: the noise sd about a first fit, infinite without one. Rounding is judged by it too,
-    since successive readings tell the noise only if the signal varies little from one to the next.
+    since successive readings tell the noise only if the signal varies little from one to the next. `sd_prior`: that of
+    a given sensor's noise; each model then allows for the sd at its calibration and for another, by their prior odds.
     """
 
     recording: Recording
     effects: Mapping[str, NoiseEffect]
     prior: PriorOdds
     sd_about_fit: float = math.inf
+    sd_prior: SdPrior | None = None
     least_sd: float = field(init=False)
     certain: Names = field(init=False)
     models: dict[Names, NoiseModel] = field(init=False)
@@ -235,7 +256,8 @@ class NoiseModels:
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in known.items()}
         self._hidden = sd < HIDDEN * self._step
         self.certain = tuple(sorted(known))
-        others = sorted(name for name in self.effects if name not in (quantisation.name, *self.certain))
+        apart = (quantisation.name, noise_sd.name, *self.certain)
+        others = sorted(name for name in self.effects if name not in apart)
         single = [tuple(sorted({*names, *self.certain})) for names in ((), *((name,) for name in others))]
         self.models = {names: self._build_model(names) for names in single}
 
@@ -243,7 +265,10 @@ class NoiseModels:
         # Certain effects are not re-estimated about each fit, whose own residual may be larger.
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
-        return NoiseModel(effects, self.recording, {**self._known, **(likely or {})}, rounding, self.least_sd)
+        sd_prior = self.sd_prior
+        if sd_prior is not None:
+            sd_prior = replace(sd_prior, log_changed=self.log_prior(_changed(names)) - self.log_prior(names))
+        return NoiseModel(effects, self.recording, {**self._known, **(likely or {})}, rounding, self.least_sd, sd_prior)
 
     def log_prior(self, names: Names) -> float:
         """Return the log prior probability of a noise model; certain effects do not count."""
@@ -619,13 +644,13 @@ class Evidences:
         nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
         if not nulls:
             return False
-        null = max(nulls, key=lambda fit: fit.evidence[noise].log_z)
-        least = null.evidence[noise].log_z
+        null = max(nulls, key=lambda fit: fit.at_likelier_sd(noise).log_z)
+        evidence = null.at_likelier_sd(noise)
+        least, law = evidence.log_z, evidence.likeliest_law
         odds = prior.log_prior_on_noise((outliers.name,)) - prior.log_prior_on_noise(())
         rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
-        if not rivals or not least - max(fit.evidence[certain].log_z for fit in nulls) + odds > _BEYOND_DOUBT:
+        if not rivals or not least - max(fit.at_likelier_sd(certain).log_z for fit in nulls) + odds > _BEYOND_DOUBT:
             return False
-        law = null.evidence[noise].likeliest_law
         narrow = 1 - outlier_probabilities(null.found.residuals, law)
         sd = law.likeliest_sigma_of(null.found.residuals)
         apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
@@ -633,6 +658,34 @@ class Evidences:
             0.5 * float(narrow @ change**2) < ALIASED_NATS and np.count_nonzero(np.abs(change) > 1) < ROWS_OF_A_SIDE
             for change in apart
         )
+
+    def split_by_sd(self, changed: NoiseEffect) -> Evidences:
+        """Return a copy with two noise models for each: with the noise sd of the calibration, and with another.
+
+        Beside an effect that was not refitted, or an unknown one, the sd is that of the largest part that was.
+        """
+        fits = {key: fit.split_by_sd(changed) for key, fit in self.fits.items()}
+
+        @cache
+        def part_of(mean: Names) -> tuple[int, Names]:
+            parts = [key for key in fits if {*key[1]} <= {*mean}]
+            return max(parts, key=lambda key: (len(key[1]), self.fits[key].log_z))
+
+        def shares(key: tuple[int, Names], noise: Names) -> Iterator[tuple[Names, float]]:
+            whole = self.fits[key].evidence[noise].log_z
+            return ((own, fits[key].evidence[own].log_z - whole) for own in (noise, _changed(noise)))
+
+        screened = {
+            (mean, own): value + share
+            for (mean, noise), value in self.screened.items()
+            for own, share in shares(part_of(mean), noise)
+        }
+        unknown = {
+            (n, mean, own): value + share
+            for (n, mean, noise), value in self.unknown.items()
+            for own, share in shares((n, mean), noise)
+        }
+        return Evidences(fits, screened, unknown, self.unknown_shares)
 
     def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
         """Return a copy with the log evidence of fits, with and without an unknown effect, shifted by `gaps` in nats.

@@ -65,7 +65,7 @@ from probewise.effects import (
     is_out_of_vocabulary,
     name_of_first_copy,
 )
-from probewise.effects.noise import lattice_step
+from probewise.effects.noise import lattice_step, noise_sd
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
@@ -762,7 +762,8 @@ def search(
     on_mean = {name: effect for name, effect in effects.items() if name not in prepared.noise_effect_names}
     on_noise = {name: cast(NoiseEffect, effect) for name, effect in effects.items() if name not in on_mean}
     if after is None:
-        models = NoiseModels(recording, on_noise, prior, noise_sd_about_given_null(prepared))
+        sd_prior = getattr(prepared.null, "sd_prior", None) if noise_sd.name in on_noise else None
+        models = NoiseModels(recording, on_noise, prior, noise_sd_about_given_null(prepared), sd_prior)
         refits = Refits(prepared.null, models, TemplateCache(prepared.usable_rows))
     else:
         refits = after.refits
@@ -803,7 +804,10 @@ def search(
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
     unknown.drop_superfluous(state.candidates.values())
-    return found()
+    out = found()
+    if refits.noises.sd_prior is not None:
+        out = out.with_evidences(out.evidences.split_by_sd(on_noise[noise_sd.name]))
+    return out
 
 
 def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior]) -> None:

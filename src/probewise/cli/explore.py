@@ -292,8 +292,8 @@ class Search:
         yield result.summary()
         if self.as_built is not None and self.as_built.accuracy is None:
             yield "arm          nobody has fitted its geometry: its own error is not in these sds"
-        if self.sensor.effects and not self.arm.is_real:
-            effects = ", ".join(map(spoken_name, self.sensor.effects))
+        effects = ", ".join(spoken_name(effect.name) for effect in self.sensor.effects_on_new_scans)
+        if effects and not self.arm.is_real:
             yield f"note: the simulated arm has the sensor's SSF, levels and noise, but not its effects: {effects}"
         trust = self.experiment.trust
         missing = experiments.left_out_after_step(result.last, trust)

@@ -20,7 +20,6 @@ from probewise.systems.integrate import (
     evaluations_per_step,
     initial_states,
     integrate_states,
-    n_parts_of_steps,
     states_by_step,
     step_in_part,
 )
@@ -78,29 +77,10 @@ class Integrations:
     cut_short: bool = False
     too_stiff: bool = False
 
-    def known_and_nearest_indices(
-        self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
-    ) -> tuple[list[KnownTrajectory], IntArray]:
-        """Return the cached trajectories of these steps and effects, and the index of the nearest to each sample.
-
-        Samples are theta, (n_samples, n_params); the indices are (n_samples,). Without a trajectory of these effects,
-        those of others are returned, compared by the first `n_own` parameters; without any, both results are empty.
-        """
-        every = [each for each in self.known if each.steps == steps]
-        own, width = [each for each in every if each.effects == effects], theta.shape[1]
-        if not own:
-            own, width = every, n_own
-        if not own:
-            return [], np.zeros(0, dtype=np.int64)
-        there = np.stack([each.theta[:width] for each in own])
-        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
-        return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
-
     def add(self, more: Sequence[KnownTrajectory]) -> None:
         """Add trajectories of the same steps and effects; beyond 48 in all, drop the first."""
         of = [(each.steps, each.effects) for each in more[:1]]
-        others = [each for each in self.known if (each.steps, each.effects) not in of]
-        again = [each for each in self.known if (each.steps, each.effects) in of]
+        others, again = ([e for e in self.known if ((e.steps, e.effects) in of) is same] for same in (False, True))
         self.known = [*others, *again, *more][-_MOST_KNOWN:]
 
 
@@ -120,41 +100,43 @@ def integrate_from_known_trajectories(
     the evaluations that this takes. `effects` is what distinguishes the law with its effects from the same law with
     others; the first `n_own` parameters are the system's.
     """
-    n_samples = len(theta)
-    if n_samples * steps.n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
-        motion, parameters, columns = law_and_inputs(np.arange(n_samples))
-        memory.n_evaluations += n_parts_of_steps(motion, steps) * evaluations_per_step(motion, steps.method)
-        return integrate_states(motion, steps, parameters, columns)
-    states, left, cost = None, np.arange(n_samples), 0
-    known, nearest = memory.known_and_nearest_indices(steps, effects, theta, n_own)
-    refused = False
+    n_samples, n_runs = len(theta), steps.gaps.shape[1]
+    motion, *given = law_and_inputs(np.arange(n_samples))
+    evaluations = evaluations_per_step(motion, steps.method)
+    n_parts = int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))  # a late column divides steps
+    if n_samples * n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
+        memory.n_evaluations += n_parts * evaluations
+        return integrate_states(motion, steps, *given)
+    states, left, cost, refused = np.empty((len(motion.law.states), n_samples, 0, 0)), np.arange(n_samples), 0, False
+    every = [each for each in memory.known if each.steps == steps]
+    known, width = [each for each in every if each.effects == effects], theta.shape[1]
+    if not known:  # those of other effects, compared by the system's parameters
+        known, width = every, n_own
     if known:
+        there = np.stack([each.theta[:width] for each in known])
+        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
+        nearest = np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
         try:
             with np.errstate(all="ignore"):
                 solved, new = _solve_all_steps(law_and_inputs, steps, known, nearest)
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
-            own = ((theta[k].copy(), states[:, k].copy(), bands) for k, bands in new.items())
-            memory.add([KnownTrajectory(steps, effects, *each) for each in own])
+            memory.add([KnownTrajectory(steps, effects, theta[k].copy(), states[:, k].copy(), b) for k, b in new.items()])
             memory.n_refused = 0
         except Exception:  # of the law: for these samples, or for more columns than there are runs
             refused = True
     if left.size:
-        motion, parameters, columns = law_and_inputs(left)
-        every = states_by_step(motion, steps, parameters, columns)
-        there = np.stack([[*s.values()] for s in every], axis=2)
+        motion, *given = law_and_inputs(left)
+        stepped = np.stack([*states_by_step(motion, steps, *given)], axis=2)
         memory.n_refused += refused
-        if states is None:
-            states = there
-        else:
-            states[:, left] = there
-        cost += n_parts_of_steps(motion, steps)
-        finite = np.flatnonzero(np.isfinite(there).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
-        memory.add([KnownTrajectory(steps, effects, theta[left[k]], there[:, k]) for k in finite])
-    assert states is not None
-    motion = law_and_inputs(np.arange(1))[0]
-    memory.n_evaluations += cost * evaluations_per_step(motion, steps.method)
-    at_rows = states[:, :, steps.n_steps_before_position[steps.position_by_row], steps.table.scan]
+        if len(left) == n_samples:
+            states = stepped
+        states[:, left] = stepped
+        cost += n_parts
+        finite = np.flatnonzero(np.isfinite(stepped).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
+        memory.add([KnownTrajectory(steps, effects, theta[left[k]], stepped[:, k]) for k in finite])
+    memory.n_evaluations += cost * evaluations
+    at_rows = states[:, :, steps.n_before[steps.place], steps.table.scan]
     return dict(zip(motion.law.states, at_rows, strict=True))
 
 
@@ -183,7 +165,7 @@ def _solve_all_steps(
             correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
         search.apply_correction(samples, correction)
         far = ~(search.change < _FAR)
-        if samples.size == len(nearest) and far.sum() * steps.n_runs > _FEW_FAR:
+        if samples.size == len(nearest) and far.sum() * steps.gaps.shape[1] > _FEW_FAR:
             search.possible &= ~far
     # A chord that led away is no better a start than the trajectory that it began from.
     astray = search.active_mask & ~(search.rate < 1)
@@ -219,7 +201,7 @@ class _NewtonState:
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen, self._parts = np.zeros(0, dtype=np.int64), list[StepPart]()
         self._motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
-        self.states[:, :, 0] = [*initial_states(self._motion, self.steps, parameters, n_samples).values()]
+        self.states[:, :, 0] = initial_states(self._motion, self.steps, parameters, n_samples)
 
     @property
     def active_mask(self) -> BoolArray:
@@ -228,20 +210,18 @@ class _NewtonState:
 
     def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
-        gap, begins = self.steps.gap_of_step, states[:, :, :-1]
+        steps, begins = self.steps, states[:, :, :-1]
         if not np.array_equal(samples, self._chosen):
             self._motion, parameters, columns = self.law_and_inputs(samples)
-            given = LawInputs(self._motion, self.steps, parameters, columns)
-            whole = given.parts_of_steps(given.of_gaps(gap, len(gap)), gap, *self.steps.begin_and_length, whole=False)
-            self._chosen, self._parts = samples, list(whole)
-        s = dict(zip(self._motion.law.states, begins.reshape(len(begins), len(samples), -1), strict=True))
-        after: dict[str, Any] = s
+            given = LawInputs(self._motion, steps, parameters, columns)
+            inputs = given.of_gaps(steps.gap, len(steps.gap))
+            self._parts = [*given.parts_of_steps(inputs, steps.gap, steps.begin, steps.length, whole=False)]
+            self._chosen = samples
+        after = begins.reshape(len(begins), len(samples), -1)
         for part in self._parts:
-            columns_of_part = part[0]
-            n_columns = len(gap) * self.steps.n_runs if columns_of_part is None else len(columns_of_part)
-            self.n_evaluated += len(samples) * n_columns
-            after = step_in_part(self._motion, self.steps.method, part, after)
-        return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(begins.shape)
+            self.n_evaluated += len(samples) * (len(steps.begin) if part[0] is None else len(part[0]))
+            after = step_in_part(self._motion, steps.method, part, after)
+        return after.reshape(begins.shape)
 
     def step_residuals(self, samples: IntArray) -> FloatArray:
         """Return each step's end minus the trajectory's state there, (n_states, n, n_steps, n_runs); 0 if solved."""

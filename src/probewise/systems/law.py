@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from probewise.systems.step import Steps
 from probewise.systems.table import RunTable
 
 _ROUNDING = 16  # last digits of a time by which two times may differ by rounding alone
+
+_NO_WAYS: Mapping[int, Any] = MappingProxyType({})
 
 Term = Callable[[Values, Values, Values], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -64,60 +67,69 @@ class LawWithEffects:
 
     def plus(self, **more: Any) -> LawWithEffects:
         """Return the law with more `terms`, `limits` or `jumps`, or values by name, of which two of one name add up."""
-
-        def with_more(known: Any, new: Any) -> Any:
+        own = {}
+        for what, new in more.items():
+            known = getattr(self, what)
             if isinstance(new, tuple):
-                return (*known, *new)
-            return {**known, **{name: known[name] + value if name in known else value for name, value in new.items()}}
+                own[what] = (*known, *new)
+            else:
+                own[what] = {**known, **{name: known[name] + v if name in known else v for name, v in new.items()}}
+        return replace(self, **own)
 
-        return replace(self, **{name: with_more(getattr(self, name), new) for name, new in more.items()})
+    @property
+    def may_halt(self) -> bool:
+        """Whether a state may come to a halt within a step."""
+        return bool(self.limits or self.friction)
 
-    def directions_of_motion(self, s: Values, p: Values, u: Values) -> dict[str, Any]:
-        """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
-        if not self.friction:
-            return {}
-        if all((s[state] != 0).all() for state in self.friction):
-            return {state: np.sign(s[state]) for state in self.friction}
-        free = self.rates(s, p, u, {})
-        return {
-            state: np.where(
-                s[state] != 0, np.sign(s[state]), np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0)
-            )
-            for state, size in self.friction.items()
-        }
+    @cached_property
+    def friction_of(self) -> dict[int, FloatArray]:
+        """The size of the friction by the number of the state."""
+        return {[*self.law.states].index(state): size for state, size in self.friction.items()}
 
-    def rates(self, s: Values, p: Values, u: Values, ways: Values) -> Values:
-        """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`.
+    def directions_of_motion(self, s: FloatArray, given: tuple[Values, Values]) -> dict[int, Any]:
+        """Return, by number of the state with friction, the direction of its next motion: 1, -1, or 0 if it sticks."""
+        ways: dict[int, Any] = {state: np.sign(s[state]) for state in self.friction_of}
+        if any((way == 0).any() for way in ways.values()):
+            free = self.rates(s, given)
+            for state, size in self.friction_of.items():
+                breaks_loose = np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0)
+                ways[state] = np.where(s[state] != 0, ways[state], breaks_loose)
+        return ways
 
-        `p` and `u` are read-only, as an interpolator of `LawInputs` returns them; so are the states `s` afterwards.
+    def rates(self, s: FloatArray, given: tuple[Values, Values], ways: Mapping[int, Any] = _NO_WAYS) -> FloatArray:
+        """Return the rates of states, (n_states, n_samples, n_columns), with bounds, and friction against `ways`.
+
+        `given` are parameters and columns, read-only, as `StepInputs` returns them.
         """
-        for values in s.values():
-            values.setflags(False)  # of writing; a keyword would double the time
-        given: Values = call_on_read_only(self.law.rates, s, p, u)
-        if not (self.terms or self.friction or self.limits):
-            return given
-        out = {state: given[state] for state in self.law.states}
+        at, out = s.view(), np.empty(s.shape)
+        at.setflags(False)  # of writing; a keyword would double the time
+        by_name, rate = dict(zip(self.law.states, at, strict=True)), dict(zip(self.law.states, out, strict=True))
+        found = call_on_read_only(self.law.rates, by_name, *given)
+        for state in rate:
+            rate[state][:] = found[state]
         for state, term in self.terms:
-            out[state] = out[state] + term(s, p, u)
-        for state, way in ways.items():
-            out[state] = np.where(way == 0, 0.0, out[state] - self.friction[state] * way)
+            rate[state] += term(by_name, *given)
+        for number, way in ways.items():
+            out[number] = np.where(way == 0, 0.0, out[number] - self.friction_of[number] * way)
         for limit in self.limits:
-            rate, at = out[limit.state], s[limit.state]
-            stopped = (at >= limit.level) & (rate > 0) if limit.upper else (at <= limit.level) & (rate < 0)
-            out[limit.state] = np.where(stopped, 0.0, rate)
+            own, here = rate[limit.state], by_name[limit.state]
+            stopped = (here >= limit.level) & (own > 0) if limit.upper else (here <= limit.level) & (own < 0)
+            lost = np.where(stopped, own, 0.0)
+            own[stopped] = 0.0
             for other, share in limit.spilt.items():
-                out[other] = out[other] + share * np.where(stopped, rate, 0.0)
+                rate[other] += share * lost
         return out
 
-    def clip_and_stop_states(self, ways: Values, after: dict[str, Any]) -> dict[str, Any]:
-        """Return the states after a step: clipped to their bounds, and 0 where they reversed against friction."""
-        for state, way in ways.items():
-            after[state] = np.where(way * after[state] < 0, 0.0, after[state])
+    def clip_and_stop_states(self, ways: Mapping[int, Any], after: FloatArray) -> FloatArray:
+        """Clip states after a step to their bounds, and set those to 0 that reversed against friction, in place."""
+        for number, way in ways.items():
+            after[number] = np.where(way * after[number] < 0, 0.0, after[number])
+        state = dict(zip(self.law.states, after, strict=True))
         for limit in self.limits:
-            bound, before = np.minimum if limit.upper else np.maximum, after[limit.state]
-            after[limit.state] = bound(before, limit.level)
+            bound, before = np.minimum if limit.upper else np.maximum, state[limit.state].copy()
+            state[limit.state][:] = bound(before, limit.level)
             for other, share in limit.spilt.items():
-                after[other] = after[other] + share * (before - after[limit.state])
+                state[other] += share * (before - state[limit.state])
         return after
 
 
@@ -264,7 +276,7 @@ class LawInputs:
     """
 
     def __init__(self, motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns) -> None:
-        rows, table, linear = steps.row_by_position_and_run, steps.table, motion.law.hold == "linear"
+        rows, table, linear = steps.rows, steps.table, motion.law.hold == "linear"
         held: dict[str, Any] = {}
         moving: dict[str, Line] = {}
         for name, values in parameters.items():
@@ -319,7 +331,7 @@ class LawInputs:
         if not (self.late or self.jumps):
             yield None, inputs, begin, length
             return
-        rows, time = self.steps.row_by_position_and_run, self.steps.table.time_s
+        rows, time = self.steps.rows, self.steps.table.time_s
         run, rounding = np.tile(np.arange(rows.shape[1]), len(gap)), rounding_of_times(time)
         n_columns = len(run)
         start, gap_s = time[rows[gap]].ravel(), self.steps.gaps[gap].ravel()

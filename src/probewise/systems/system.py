@@ -478,4 +478,4 @@ def _cost_of_integration(system: System, table: RunTable) -> float:
 
 def _has_affordable_steps(system: System, table: RunTable) -> bool:
     steps = system.steps(table)
-    return bool(steps.n_steps.sum() <= _MOST_STEPS + len(steps.row_by_position_and_run))
+    return bool(steps.n_steps.sum() <= _MOST_STEPS + len(steps.rows))

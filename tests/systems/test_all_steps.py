@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.systems import Law, RunTable
-from probewise.systems.all_steps import Integrations, integrate_from_known_trajectories
-from probewise.systems.integrate import integrate_states
+from probewise.systems.integrate import Integrations, integrate_from_known_trajectories, integrate_states
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.step import steps_for_table
 

@@ -9,10 +9,9 @@ from scipy.integrate import solve_ivp
 
 from probewise.errors import ParameterError
 from probewise.systems import Law, Noise, RunTable, Simulator, System
-from probewise.systems.all_steps import Integrations
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.inputs import delayed_held_column
-from probewise.systems.integrate import integrate_states
+from probewise.systems.integrate import Integrations, integrate_states
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.step import steps_for_table
 from probewise.systems.system import with_converged_step

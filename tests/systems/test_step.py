@@ -14,7 +14,7 @@ SWINGS = LawWithEffects(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], 
 
 def _between(gap, **parameters):
     """Return the inputs in a gap of this time, from time 0 on."""
-    return StepInputs("t", (parameters, {}), ({}, {"t": (np.zeros(np.shape(gap)), np.asarray(gap))}))
+    return StepInputs("t", (parameters, {"t": np.zeros(np.shape(gap))}), ({}, {"t": np.asarray(gap)}))
 
 
 def _error(method, n_steps):

@@ -1,20 +1,42 @@
-"""Integrate a law between the rows of each run, for all samples and runs at once."""
+"""Integrate a law between the rows of each run, for all samples and runs at once: by steps, or all steps at once.
+
+A trajectory of a fixed-step method satisfies s[k + 1] = step(s[k]) for every k: a system of equations whose only
+solution is what stepping gives. Newton's method solves it from a trajectory nearby. Its Jacobian is block bidiagonal,
+so an iteration is one evaluation of all steps together and one banded triangular solve. Samples near a known trajectory
+share its Jacobian (chord iterations), the others have their own; those that do not converge are left to be stepped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import FOURTH_ORDER, N_LONGER, RODAS, Rosenbrock, RungeKutta, Steps
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
+_CHORDS = 4  # iterations with the Jacobian of a known trajectory
+_NEWTONS = 8  # iterations with a sample's own Jacobian
+_HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped
+_SLOW = 0.1  # change of a chord iteration, in that of the one before, from which a sample needs its own Jacobian
+_CONVERGED = 1e-8  # largest change of a state by an iteration, in that state's largest value
+_SETTLED = 1e-12  # and by the next
+_NUDGE = 1e-7  # of each state's largest value, for the Jacobian
+_FAR = 1e-3  # change from a known trajectory, in a state's largest value, from which another one is remembered
+_MOST_NEW = 8  # trajectories remembered of one batch
+_MOST_KNOWN = 48  # trajectories remembered
+_REFUSALS = 3  # errors in a row of all steps together after which a law is only stepped; one may be of a sample far off
+_WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
+# Samples times runs up to which all steps at once cost less than one after another: near known trajectories, where two
+# evaluations of all steps suffice, and far from them, where a dozen are needed.
+_FEW_NEAR, _FEW_FAR = 300, 40
 
 
 def integrate_states(
@@ -30,9 +52,7 @@ def integrate_states(
     return dict(zip(motion.law.states, np.stack(kept, axis=2)[:, :, steps.place, steps.table.scan], strict=True))
 
 
-def states_by_step(
-    motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns
-) -> Iterator[FloatArray]:
+def states_by_step(motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns) -> Iterator[FloatArray]:
     """Integrate the law: yield all states, (n_states, n_samples, n_runs), at the start and after each step."""
     s = initial_states(motion, steps, parameters, number_of_samples(parameters, columns))
     with np.errstate(all="ignore"):
@@ -41,7 +61,7 @@ def states_by_step(
         for k, n in enumerate(steps.n_steps.tolist()):
             inputs = given.of_gaps(slice(k, k + 1), 1)
             for i in range(n):
-                for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n, whole=True):
+                for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n):
                     s = step_in_part(motion, steps.method, part, s)
                 yield s
 
@@ -114,7 +134,9 @@ class Stepper:
             moving = way * at[state]
             if not at_rest.any():
                 return moving
-            return np.where(at_rest, motion.friction_of[state] - np.abs(motion.rates(at, between(share))[state]), moving)
+            return np.where(
+                at_rest, motion.friction_of[state] - np.abs(motion.rates(at, between(share))[state]), moving
+            )
 
         last = margin_to_transition(after, begin + length)
         ends = last < 0
@@ -122,22 +144,19 @@ class Stepper:
             return after, ways
         n_columns, some = ends.shape[1], np.flatnonzero(ends.any(axis=0))
         if n_columns > _MANY_COLUMNS and 2 * len(some) <= n_columns:
-            few, ends_of = replace(self, between=self.between.of_columns(some)), {k: v[:, some] for k, v in ways.items()}
+            few, ends_of = replace(self, between=between.of_columns(some)), {k: v[:, some] for k, v in ways.items()}
             begin, length = of_columns(begin, some), of_columns(length, some)
-            own = few._split_at_transitions(
-                state, way[:, some], s[:, :, some], after[:, :, some], begin, length, ends_of
-            )
+            own = (state, way[:, some], s[:, :, some], after[:, :, some], begin, length, ends_of)
             out, ways = after.copy(), {k: v.copy() for k, v in ways.items()}
-            out[:, :, some] = own[0]
-            for k, new in own[1].items():
+            out[:, :, some], changed = few._split_at_transitions(*own)
+            for k, new in changed.items():
                 ways[k][:, some] = new
             return out, ways
         first = margin_to_transition(s, begin)
         until = np.where(ends, _zero_of_straight_line(0.0, first, 1.0, last), 1.0)
         left = margin_to_transition(self._step_without_split(s, begin, until * length, ways), begin + until * length)
-        closer = np.where(
-            left > 0, _zero_of_straight_line(until, left, 1.0, last), _zero_of_straight_line(0.0, first, until, left)
-        )
+        later, earlier = (until, left, 1.0, last), (0.0, first, until, left)
+        closer = np.where(left > 0, _zero_of_straight_line(*later), _zero_of_straight_line(*earlier))
         until = np.where(ends, closer, 1.0)
         there = self._step_without_split(s, begin, until * length, ways)
         there[state] = np.where(ends, 0.0, there[state])
@@ -147,16 +166,12 @@ class Stepper:
         return self._step_without_split(there, begin + until * length, (1 - until) * length, anew), anew
 
     def _step_without_split(self, s: FloatArray, begin: Any, length: Any, ways: dict[int, Any]) -> FloatArray:
-        """Return the states after one step of the method, with friction against the fixed directions `ways`."""
-        rates = self.motion.rates
-        gap = self.between.gap
-        return self.method.advance(lambda at, given: rates(at, given, ways), self.between, s, begin, length, gap)
+        rates, between = self.motion.rates, self.between
+        return self.method.advance(lambda at, given: rates(at, given, ways), between, s, begin, length, between.gap)
 
 
-def step_in_part(
-    motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, s: FloatArray
-) -> FloatArray:
-    """Return the states, (n_states, n_samples, n_columns), after a part of some steps; other columns stay as they are."""
+def step_in_part(motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, s: FloatArray) -> FloatArray:
+    """Return the states, (n_states, n_samples, n_columns), after a part of some steps; other columns stay as is."""
     columns, inputs, begin, length = part
     stepper = Stepper(motion, method, inputs)
     if columns is None:
@@ -170,3 +185,235 @@ def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> An
     """Return where a straight line through (low, at_low) and (high, at_high) is 0; `low` if it does not fall."""
     apart = at_low - at_high
     return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
+
+
+LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Values, Columns]]
+"""Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTrajectory:
+    """A trajectory solved over some steps, with some effects.
+
+    It has theta (n_params,), states (n_states, n_steps + 1, n_runs), and `bands`, its Jacobian, if known.
+    """
+
+    steps: Hashable
+    effects: Hashable
+    theta: FloatArray
+    states: FloatArray
+    bands: list[FloatArray] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Integrations:
+    """Memory of a law's integrations: counts, and solved trajectories, those of the last steps and effects last.
+
+    An evaluation is one of the rates of all samples and runs together. `n_failed` samples raised an error; `n_refused`
+    counts how often in a row the law raised one for all steps together, and none step by step. `cut_short` if work was
+    skipped; `too_stiff` if parameters that may fit the readings would need more integration steps than are taken.
+    """
+
+    known: list[KnownTrajectory] = field(default_factory=list, repr=False)
+    n_evaluations: int = 0
+    n_failed: int = 0
+    n_refused: int = 0
+    cut_short: bool = False
+    too_stiff: bool = False
+
+    def add(self, more: Sequence[KnownTrajectory]) -> None:
+        """Add trajectories of the same steps and effects; beyond 48 in all, drop the first."""
+        of = [(each.steps, each.effects) for each in more[:1]]
+        others, again = ([e for e in self.known if ((e.steps, e.effects) in of) is same] for same in (False, True))
+        self.known = [*others, *again, *more][-_MOST_KNOWN:]
+
+
+def integrate_from_known_trajectories(
+    law_and_inputs: LawAndInputs,
+    steps: Steps,
+    memory: Integrations,
+    *,
+    effects: Hashable,
+    theta: FloatArray,
+    n_own: int,
+) -> dict[str, FloatArray]:
+    """Integrate a law for samples, theta (n_samples, n_params); return states at the rows, (n_samples, n_points) each.
+
+    Up to 300 samples times runs are solved for all steps at once, from the trajectories in `memory` nearest to them;
+    the others, and those for which that does not converge, step by step. More trajectories are added to the memory, and
+    the evaluations that this takes. `effects` is what distinguishes the law with its effects from the same law with
+    others; the first `n_own` parameters are the system's.
+    """
+    n_samples, n_runs = len(theta), steps.gaps.shape[1]
+    motion, *given = law_and_inputs(np.arange(n_samples))
+    evaluations = evaluations_per_step(motion, steps.method)
+    n_parts = int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))  # a late column divides steps
+    if n_samples * n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
+        memory.n_evaluations += n_parts * evaluations
+        return integrate_states(motion, steps, *given)
+    states, left, cost, refused = np.zeros(0), np.arange(n_samples), 0, False
+    every = [each for each in memory.known if each.steps == steps]
+    known, width = [each for each in every if each.effects == effects], theta.shape[1]
+    if not known:  # those of other effects, compared by the system's parameters
+        known, width = every, n_own
+    if known:
+        there = np.stack([each.theta[:width] for each in known])
+        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
+        nearest = np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
+        try:
+            with np.errstate(all="ignore"):
+                solved, new = _solve_all_steps(law_and_inputs, steps, known, nearest)
+            states, left = solved.states, np.flatnonzero(~solved.done)
+            cost = -(-solved.n_evaluated // _WORTH_A_STEP)
+            own = ((theta[k].copy(), states[:, k].copy(), bands) for k, bands in new.items())
+            memory.add([KnownTrajectory(steps, effects, *each) for each in own])
+            memory.n_refused = 0
+        except Exception:  # of the law: for these samples, or for more columns than there are runs
+            refused = True
+    if left.size:
+        motion, *given = law_and_inputs(left)
+        stepped = np.stack([*states_by_step(motion, steps, *given)], axis=2)
+        memory.n_refused += refused
+        if len(left) == n_samples:
+            states = stepped
+        else:
+            states[:, left] = stepped
+        cost += n_parts
+        finite = np.flatnonzero(np.isfinite(stepped).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
+        memory.add([KnownTrajectory(steps, effects, theta[left[k]], stepped[:, k]) for k in finite])
+    memory.n_evaluations += cost * evaluations
+    at_rows = states[:, :, steps.n_before[steps.place], steps.table.scan]
+    return dict(zip(motion.law.states, at_rows, strict=True))
+
+
+def _solve_all_steps(
+    law_and_inputs: LawAndInputs, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray
+) -> tuple[_NewtonState, dict[int, list[FloatArray]]]:
+    """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known.
+
+    With the solution come up to eight converged samples that are far from the trajectories they began from, each with
+    its last Jacobian, as of `jacobian_bands`, where one was computed.
+    """
+    guess = np.stack([each.states for each in known], axis=1)[:, nearest]
+    search = _NewtonState(law_and_inputs, steps, guess.copy())
+    for _ in range(_CHORDS):  # each sample with the Jacobian of the known trajectory nearest to it
+        active = search.active_mask & ((search.rate < _SLOW) | ~np.isfinite(search.change))
+        samples = np.flatnonzero(active)
+        if not samples.size:
+            break
+        missed = search.step_residuals(samples)
+        correction = np.empty_like(missed)
+        for number in np.unique(nearest[samples]).tolist():
+            own = nearest[samples] == number
+            if not known[number].bands:
+                at = known[number].states[:, None]
+                known[number].bands.append(search.jacobian_bands(samples[own][:1], at)[0])
+            correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
+        search.apply_correction(samples, correction)
+        far = ~(search.change < _FAR)
+        if samples.size == len(nearest) and far.sum() * steps.gaps.shape[1] > _FEW_FAR:
+            search.possible &= ~far
+    # A chord that led away is no better a start than the trajectory that it began from.
+    astray = search.active_mask & ~(search.rate < 1)
+    search.states[:, astray, 1:] = guess[:, astray, 1:]
+    search.change[~search.done] = np.inf
+    last: dict[int, FloatArray] = {}
+    for k in range(_NEWTONS):  # each sample with its own Jacobian
+        if k == _HOPELESS:
+            search.possible &= search.change < _SLOW
+        samples = np.flatnonzero(search.active_mask)
+        if not samples.size:
+            break
+        bands = search.jacobian_bands(samples, search.states[:, samples])
+        correction = _solved_corrections(np.concatenate(bands), search.step_residuals(samples), shared=False)
+        last |= dict(zip(samples.tolist(), bands, strict=True))
+        search.apply_correction(samples, correction)
+    far = search.done & (_largest_relative_change(search.states - guess, guess) > _FAR)
+    return search, {k: [last[k]] if k in last else [] for k in np.flatnonzero(far)[:_MOST_NEW].tolist()}
+
+
+@dataclass(eq=False)
+class _NewtonState:
+    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample."""
+
+    law_and_inputs: LawAndInputs
+    steps: Steps
+    states: FloatArray
+    n_evaluated: int = 0
+
+    def __post_init__(self) -> None:
+        n_samples = self.states.shape[1]
+        self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
+        self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
+        self._chosen, self._parts = np.zeros(0, dtype=np.int64), list[StepPart]()
+        self._motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
+        self.states[:, :, 0] = initial_states(self._motion, self.steps, parameters, n_samples)
+
+    @property
+    def active_mask(self) -> BoolArray:
+        """Mask of the samples that have not converged and may yet, (n_samples,)."""
+        return self.possible & ~self.done
+
+    def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
+        """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
+        steps, begins = self.steps, states[:, :, :-1]
+        if not np.array_equal(samples, self._chosen):
+            self._motion, parameters, columns = self.law_and_inputs(samples)
+            given = LawInputs(self._motion, steps, parameters, columns)
+            inputs = given.of_gaps(steps.gap, len(steps.gap))
+            self._parts = [*given.parts_of_steps(inputs, steps.gap, steps.begin, steps.length)]
+            self._chosen = samples
+        after = begins.reshape(len(begins), len(samples), -1)
+        for part in self._parts:
+            self.n_evaluated += len(samples) * (len(steps.begin) if part[0] is None else len(part[0]))
+            after = step_in_part(self._motion, steps.method, part, after)
+        return after.reshape(begins.shape)
+
+    def step_residuals(self, samples: IntArray) -> FloatArray:
+        """Return each step's end minus the trajectory's state there, (n_states, n, n_steps, n_runs); 0 if solved."""
+        states = self.states[:, samples]
+        return self.states_at_step_ends(samples, states) - states[:, :, 1:]
+
+    def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
+        """Return samples' Jacobians of the equations of all steps, as bands, (n_unknowns, 2 n_states) each.
+
+        They are those at states (n_states, n, n_steps + 1, n_runs). Column k holds the k-th subdiagonal; the diagonal
+        is 1 throughout, and column 0 is not used. Unknowns are ordered by run, then by step, then by state.
+        """
+        at_end = self.states_at_step_ends(samples, states)
+        n_states, n, n_steps, n_runs = at_end.shape
+        out = np.zeros((n, n_runs, n_steps, n_states, 2 * n_states))
+        for j, values in enumerate(states):
+            nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
+            before = values.copy()
+            values += nudge
+            slopes = (self.states_at_step_ends(samples, states) - at_end) / nudge
+            values[:] = before
+            for i in range(n_states):
+                out[:, :, :-1, j, n_states + i - j] = -slopes[i, :, 1:].transpose(0, 2, 1)
+        return list(out.reshape(n, -1, 2 * n_states))
+
+    def apply_correction(self, samples: IntArray, correction: FloatArray) -> None:
+        """Add a correction (n_states, n, n_steps, n_runs) to samples' states, and mark those that have converged."""
+        change = _largest_relative_change(correction, self.states[:, samples])
+        self.states[:, samples, 1:] += correction
+        with np.errstate(all="ignore"):
+            rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
+        first = ~np.isfinite(self.change[samples])
+        self.possible[samples] = np.isfinite(change)
+        self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < _SETTLED)
+        self.change[samples], self.rate[samples] = change, rate
+
+
+def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:
+    """Return each sample's largest change of a state, relative to that state's largest absolute value, (n_samples,)."""
+    size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
+    return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
+
+
+def _solved_corrections(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
+    """Return corrections for residuals `missed`, (n_states, n_samples, n_steps, n_runs); `shared`: by one Jacobian."""
+    n_states, n_samples, n_steps, n_runs = missed.shape
+    right = missed.transpose(1, 3, 2, 0).reshape((n_samples, -1) if shared else (1, -1))
+    solved, _ = dtbtrs(bands.T, right.T, uplo="L", diag="U")
+    return np.asarray(solved.T.reshape(n_samples, n_runs, n_steps, n_states).transpose(3, 0, 2, 1))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
-from probewise.systems.calls import call_on_read_only, read_only_views
+from probewise.systems.calls import call_on_read_only, call_on_views, read_only_views
 from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import Steps
 from probewise.systems.table import RunTable
@@ -67,7 +67,7 @@ class LawWithEffects:
 
     def plus(self, **more: Any) -> LawWithEffects:
         """Return the law with more `terms`, `limits` or `jumps`, or values by name, of which two of one name add up."""
-        own = {}
+        own: dict[str, Any] = {}
         for what, new in more.items():
             known = getattr(self, what)
             if isinstance(new, tuple):
@@ -101,8 +101,9 @@ class LawWithEffects:
 
         `given` are parameters and columns, read-only, as `StepInputs` returns them.
         """
-        at, out = s.view(), np.empty(s.shape)
+        at: Any = s.view()
         at.setflags(False)  # of writing; a keyword would double the time
+        out = np.empty(s.shape)
         by_name, rate = dict(zip(self.law.states, at, strict=True)), dict(zip(self.law.states, out, strict=True))
         found = call_on_read_only(self.law.rates, by_name, *given)
         for state in rate:
@@ -139,17 +140,12 @@ def readings_of_states(law: Law, states: Values, parameters: Values, columns: Va
     if law.observe is None:
         return first
     with np.errstate(all="ignore"):
-        given = map(read_only_views, (states, parameters, columns))
-        out = np.asarray(call_on_read_only(law.observe, *given), dtype=np.float64)
+        out = np.asarray(call_on_views(law.observe, states, parameters, columns), dtype=np.float64)
     try:
         return np.array(np.broadcast_to(out, first.shape))
     except ValueError:
         allowed = f"{first.shape} or one that broadcasts to it: a number for each sample and row"
         raise ShapeError(f"observe returns an array of shape {out.shape}; allowed: {allowed}") from None
-
-
-Line = tuple[Any, Any]
-"""A value at the beginning of a gap between rows, and its rise over the gap or its slope in time."""
 
 
 def rounding_of_times(times: FloatArray) -> float:
@@ -195,7 +191,7 @@ class LateColumn:
         at = np.append(self.breaks, np.inf)[np.searchsorted(self.breaks, sought, side="right")]
         return np.asarray(at - self.shift[run] + self.dead_time)
 
-    def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> Line:
+    def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> tuple[Any, Any]:
         """Return its straight line around the times `at`, (n_samples, n_columns): value at `start`, slope in time."""
         earlier = at - self.dead_time
         before = earlier < self.first[run]
@@ -216,46 +212,44 @@ def _of_rows(values: FloatArray, row: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """Parameters and columns, in that order, by name: `held` over a gap, read-only, or on straight `lines` over it.
+    """Parameters and columns by name, in that order, read-only: at the start of a gap, and their rise over it if any.
 
     Over a table arrays are (1 or n_samples, n_places, n_runs), those of a constant (1 or n_samples, 1, 1 or n_runs);
     of some steps (1 or n_samples, n_columns), with a column for each step and run, the runs of a step in turn, or 1.
-    `time` is the name of the time, which is always on such a line.
+    `time` is the name of the time, which always rises.
     """
 
     time: str
-    held: tuple[Values, Values]
-    lines: tuple[Mapping[str, Line], Mapping[str, Line]]
+    start: tuple[Values, Values]
+    rise: tuple[Values, Values]
 
     @property
     def gap(self) -> Any:
         """Time of the gap by the time column, which an effect on the clock changes, (1 or n_samples, n_columns)."""
-        return self.lines[1][self.time][1]
+        return self.rise[1][self.time]
 
     def __call__(self, share: Any) -> tuple[Values, Values]:
         """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
-        (p, u), (moving, sloping) = self.held, self.lines
-        return _values_on_lines(p, moving, share), _values_on_lines(u, sloping, share)
+        return _at_share(self.start[0], self.rise[0], share), _at_share(self.start[1], self.rise[1], share)
 
     def mapped(self, chosen: Callable[[Any], Any]) -> StepInputs:
         """Return them with a function applied to every array."""
-        p, u = ({name: chosen(values) for name, values in each.items()} for each in self.held)
+        p, u, dp, du = ({name: chosen(v) for name, v in each.items()} for each in (*self.start, *self.rise))
         for values in (*p.values(), *u.values()):
             values.setflags(False)
-        moving, sloping = ({name: (chosen(v), chosen(d)) for name, (v, d) in each.items()} for each in self.lines)
-        return replace(self, held=(p, u), lines=(moving, sloping))
+        return StepInputs(self.time, (p, u), (dp, du))
 
     def of_columns(self, columns: IntArray) -> StepInputs:
         """Return them in some of the columns."""
         return self.mapped(partial(of_columns, columns=columns))
 
 
-def _values_on_lines(held: Values, lines: Mapping[str, Line], share: Any) -> Values:
-    if not lines:
-        return held
-    out = dict(held)
-    for name, (low, rise) in lines.items():
-        out[name] = value = low + share * rise
+def _at_share(start: Values, rise: Values, share: Any) -> Values:
+    if not rise:
+        return start
+    out = dict(start)
+    for name, by in rise.items():
+        out[name] = value = out[name] + share * by
         value.setflags(False)  # of writing; a keyword would double the time
     return out
 
@@ -277,36 +271,26 @@ class LawInputs:
 
     def __init__(self, motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns) -> None:
         rows, table, linear = steps.rows, steps.table, motion.law.hold == "linear"
-        held: dict[str, Any] = {}
-        moving: dict[str, Line] = {}
+        p, u, dp, du = ({} for _ in range(4))
         for name, values in parameters.items():
             for jump in motion.jumps:
                 if jump.parameter == name:  # it is added where it is, within a gap
                     values = values - jump.size * (table.time_s > jump.at)
-            own = values_at_rows(values, rows)
+            p[name] = own = values_at_rows(values, rows)
             if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
-                held[name] = own[:, :1]
+                p[name] = own[:, :1]
             elif linear:
-                moving[name] = own, np.diff(own, axis=1)
+                dp[name] = np.diff(own, axis=1)
             elif name in motion.drifts:
-                moving[name] = own, motion.drifts[name][:, :, None] * steps.gaps
-            else:
-                held[name] = own
-        still: dict[str, Any] = {}
-        sloping: dict[str, Line] = {}
+                dp[name] = motion.drifts[name][:, :, None] * steps.gaps
         for name, values in columns.items():
-            own = values_at_rows(values, rows)
+            u[name] = own = values_at_rows(values, rows)
             if name == table.time or (linear and values.dtype == np.float64):
-                sloping[name] = own, np.diff(own, axis=1)
-            else:
-                still[name] = own
-        values_at_places = read_only_views(held), read_only_views(still)
+                du[name] = np.diff(own, axis=1)
         self.steps, self.jumps = steps, motion.jumps
-        self.over_table = StepInputs(str(table.time), values_at_places, (moving, sloping))
-        self.late = {
-            name: LateColumn(table, columns[name], dead_time, linear=linear)
-            for name, dead_time in motion.dead_times.items()
-        }
+        self.over_table = StepInputs(str(table.time), (p, u), (dp, du))
+        late = motion.dead_times.items()
+        self.late = {name: LateColumn(table, columns[name], by, linear=linear) for name, by in late}
 
     def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
         """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""
@@ -319,14 +303,11 @@ class LawInputs:
 
         return self.over_table.mapped(in_gaps)
 
-    def parts_of_steps(
-        self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any, *, whole: bool
-    ) -> Iterator[StepPart]:
+    def parts_of_steps(self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any) -> Iterator[StepPart]:
         """Divide steps where inputs jump or bend, a late column or a parameter with a jump; yield the parts in turn.
 
         `gap` is that of each step, (n_steps,), with the shares of it at which the step begins, and that it takes:
-        numbers, or one per step and run. Each part has all columns of the states if `whole`, so that runs are together;
-        else those alone that have one.
+        numbers, or one per step and run.
         """
         if not (self.late or self.jumps):
             yield None, inputs, begin, length
@@ -353,31 +334,22 @@ class LawInputs:
             going = ~over.all(axis=0)
             if not going.any():
                 return
-            share = until
-            if not whole:
-                some = np.flatnonzero(going)
-                columns, run = columns[some], run[some]
-                start, gap_s, end, share = start[some], gap_s[some], end[some], share[:, some]
-                inputs = inputs.of_columns(some)
+            some = np.flatnonzero(going)
+            columns, run, inputs = columns[some], run[some], inputs.of_columns(some)
+            start, gap_s, end, share = start[some], gap_s[some], end[some], until[:, some]
 
     def _with_breaks(
         self, inputs: StepInputs, at: FloatArray, run: IntArray, start: FloatArray, gap_s: FloatArray
     ) -> StepInputs:
         """Return inputs with the late columns and the parameters with jumps as they are around the times `at`."""
-        (p, u), (moving, sloping) = map(dict, inputs.held), map(dict, inputs.lines)
+        (p, u), (dp, du) = map(dict, inputs.start), map(dict, inputs.rise)
         for name, late in self.late.items():
-            value, slope = late.line_at(at, run, start)
+            u[name], slope = late.line_at(at, run, start)
             if late.linear:
-                sloping[name] = value, slope * gap_s
-            else:
-                u[name] = value
+                du[name] = slope * gap_s
         for jump in self.jumps:
-            name, own = jump.parameter, jump.size * (at > jump.at)
-            if name in moving:
-                moving[name] = moving[name][0] + own, moving[name][1]
-            else:
-                p[name] = p[name] + own
-        return replace(inputs, held=(read_only_views(p), read_only_views(u)), lines=(moving, sloping))
+            p[jump.parameter] = p[jump.parameter] + jump.size * (at > jump.at)
+        return replace(inputs, start=(read_only_views(p), read_only_views(u)), rise=(dp, du))
 
 
 def of_columns(values: Any, columns: IntArray) -> Any:

@@ -108,15 +108,9 @@ class Caller:
     ) -> Caller:
         """Find by trial calls the fastest way to call a function for many samples; return a caller that uses it.
 
-        `samples` are parameters by name, (n_samples, 1 or n_points) each. The function's own exception is raised if it
-        raises one at a trial call and no other gives a finite reading.
-
-        Raises
-        ------
-        ParameterError
-            If no reading is finite, or another call with the same parameters returns other readings.
-        ShapeError
-            If it does not return one number per row.
+        `samples` are parameters by name, (n_samples, 1 or n_points) each. Raises the function's own exception if it
+        raises one at a trial call and no other gives a finite reading, ParameterError if none is finite or another call
+        with the same parameters returns others, and ShapeError unless it returns one number per row.
         """
         together, taken = cls(simulate, broadcasts=True), set(per_run)
         if broadcasts:

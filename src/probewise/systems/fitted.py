@@ -105,11 +105,7 @@ class FittedSystem(NamedSamples):
 
         In its own coordinate, the value or its logarithm, a uniform or log-uniform prior is flat: with such priors it
         is the point of least squares. Of points that are equally high it is the one nearest to the middle of the prior.
-
-        Raises
-        ------
-        ParameterError
-            If the model is that of a diagnosis, which keeps samples only.
+        Raises ParameterError if the model is that of a diagnosis, which keeps samples only.
         """
         require(self.best, "mode", None, "a model of `probewise fit` or fit_simulator(...).fitted; take median()")
         return dict(zip(self.names, self.best, strict=True))
@@ -173,13 +169,8 @@ class FittedSystem(NamedSamples):
     ) -> FittedSystem:
         """Parse the text from `to_json`; error messages name `path`.
 
-        A simulator given as its file, FILE.py, is run only if its fingerprint is that of the text.
-
-        Raises
-        ------
-        FileError
-            If the text is damaged, has another format, belongs to another simulator, or counts effects from old
-            origins.
+        A simulator given as its file, FILE.py, is run only if its fingerprint is that of the text. Raises FileError if
+        the text is damaged, has another format, belongs to another simulator, or is of an earlier version's rules.
         """
         document = parse_json_file_text(str(path), text, _WHAT)
         found = document.get("format") if isinstance(document, dict) else None

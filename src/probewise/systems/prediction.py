@@ -76,10 +76,7 @@ class SystemPrediction(ShowsItself):
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     """Build a recording from a table, with the simulator's unit, range and step; readings are NaN without a column.
 
-    Raises
-    ------
-    ParameterError
-        If the column of the readings holds texts, or a declared sd is not positive where there is a reading.
+    Raises ParameterError if the readings are texts, or a declared sd is not positive where there is a reading.
     """
     (low, high), step, sd = simulator.noise.range, simulator.noise.step, simulator.noise.sd
     instrument = Instrumentation(unit=simulator.unit, min=low, max=high, step=step, controls=simulator.controls)

@@ -256,10 +256,7 @@ def _is_finite_number(value: object) -> bool:
 def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     """Run a user's file and return the simulator that it describes.
 
-    Raises
-    ------
-    FileError
-        If it cannot be read or run, or is inconsistent; the message names the line, if there is one.
+    Raises FileError if it cannot be read or run, or is inconsistent; the message names the line, if there is one.
     """
     path = checked_path("path", path, "the name of a Python file that describes a simulator")
     return run_simulator_text(read_text(path, "a Python file that describes a simulator"), path)

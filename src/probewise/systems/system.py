@@ -369,12 +369,8 @@ def with_converged_step(
     returned as it is. `theta` are parameters of the system and of the `effects` added to its law, (n_samples,
     n_params); samples without finite predictions do not count, unless half the step makes them finite. The `tolerance`
     is in the unit of a reading. With `or_finest`, the finest step within reach is returned, instead of an error, if
-    predictions converge but still change by more.
-
-    Raises
-    ------
-    ParameterError
-        If predictions still change with 4,096 more steps than rows in the longest run.
+    predictions converge but still change by more. Raises ParameterError if they still change with 4,096 more steps than
+    rows in the longest run.
     """
     if system.simulator.law is None:
         return system

@@ -298,13 +298,8 @@ def read_run_table(
 
     Loggers and spreadsheets write tables in many ways; `notes` of the result says how one was read that is not plain
     CSV. The names `time`, `run` and `reading` show which row is the header. Names of runs are texts. Dates and clocks
-    in the time column count from the first row, in `time_unit`.
-
-    Raises
-    ------
-    FileError
-        If the file is unusable, lacks the column `time` or `run`, a time is no number, or a cell can be read in several
-        ways; the message says where.
+    in the time column count from the first row, in `time_unit`. Raises FileError, which says where, if the file is
+    unusable, lacks the column `time` or `run`, a time is no number, or a cell can be read in several ways.
     """
     path = checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)")
     own = [name for name in (time, run) if name is not None]
@@ -339,12 +334,8 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
     runs, each of several tables is one run.
 
     `tables`, one or more, have the same time and run; `sources` are their names in messages. Returns the table, and
-    notes on missing and omitted columns and on renamed runs.
-
-    Raises
-    ------
-    ParameterError
-        If there is no table, two are the same, or a column of numbers in the first has texts in another.
+    notes on missing and omitted columns and on renamed runs. Raises ParameterError if there is no table, two are the
+    same, or a column of numbers in the first has texts in another.
     """
     require(tables, "tables", (), "one or more")
     if len(tables) == 1:

@@ -47,10 +47,7 @@ _LEAST_ANGLE_RAD, _ONE_DIRECTION_RAD = np.radians([-89.5, 1.0])
 @light_effect("edge_misplacement", Stage.SCENE, "misplaced edges", ("slope",))
 def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
     """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
-
-    def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return _with_shifted_patterns(value, theta * np.ones(len(plan)), plan)
-
+    act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * np.ones(len(plan)), plan))
     says = in_words("the printed edges lie {0} mm from their described place, in all scans")
     return kind.linear(of, {"offset_mm": "mm"}, 0.003 * of.length_mm, act, says)
 
@@ -60,9 +57,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
     """In one scan the pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X."""
 
     def in_scan(name: str) -> Effect:
-        def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-            return _with_shifted_patterns(value, theta * scan_indicator(plan, (name,)), plan)
-
+        act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * scan_indicator(plan, (name,)), plan))
         says = in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others")
         return kind.linear(of, {"offset_mm": "mm"}, 0.003 * of.length_mm, act, says, scans=(name,))
 
@@ -398,10 +393,7 @@ def slow_sinking(kind: LightEffect, of: Extent) -> Effect:
 
     t is the time since the origin in hours; h0 and h are those of `height_gradient`.
     """
-
-    def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_added_height(value, theta[:, :1] * of.origin.hours(plan), plan)
-
+    act = acting(lambda value, plan, rate: footprint_at_added_height(value, rate * of.origin.hours(plan), plan))
     says = "the sensor {rises/sinks} by {|0|} % of its height per hour: it is loose in its holder"
     return kind.linear(of, {"per_hour": "1/h"}, 0.01 / (of.duration_s / 3600), act, in_words(says, factors=(100,)))
 

@@ -56,24 +56,19 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
     The width is positive: the arm lags behind the motion, never ahead.
     """
 
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return _moved(value, *(-(theta[:, :1] / 2) * d for d in plan.direction_of_motion.T))
-
     def says(mean: FloatArray, sd: FloatArray) -> str:
         half, whole = (value_with_sd(mean[0], sd[0], factor=factor) for factor in (0.5, 1.0))
         side = f"{half} mm short of where it was sent, on the side it came from"
         return f"the arm comes to rest {side}: gear play of {whole} mm"
 
+    act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * d for d in plan.direction_of_motion.T)))
     return kind.linear(of, {"width_mm": "mm"}, 0.005 * of.length_mm, act, says, positive=True)
 
 
 @light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
 def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
     """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
-
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return _moved(value, *(-(theta[:, :1] / 2) * side for side in _side_of_each_axis(plan)))
-
+    act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * side for side in _side_of_each_axis(plan))))
     return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
 
 
@@ -122,9 +117,7 @@ def scan_angle_error(kind: LightEffect, of: Extent) -> Effect | None:
     """The sensor is turned by deg more than was commanded in one mounting (scans of one orientation) or one scan."""
 
     def in_scans(scans: tuple[str, ...]) -> Effect:
-        def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-            return _turned(value, np.radians(theta) * scan_indicator(plan, scans))
-
+        act = acting(lambda value, plan, deg: _turned(value, np.radians(deg) * scan_indicator(plan, scans)))
         says, sizes = in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"), (1, -8, 8, -14, 14)
         return kind.linear(of, {"deg": "deg"}, _TURN_DEG, act, says, sizes=sizes, scans=scans)
 
@@ -214,10 +207,7 @@ def arm_knock(kind: LightEffect, of: Extent) -> Effect | None:
 @light_effect("slow_turn", Stage.POSE, "a sensor that slowly turns", ("time", "orientation"), counts="time")
 def slow_turn(kind: LightEffect, of: Extent) -> Effect:
     """The sensor turns in its holder: orientation + deg_per_hour t, t the hours since the origin."""
-
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return _turned(value, np.deg2rad(theta[:, :1]) * of.origin.hours(plan))
-
+    act = acting(lambda value, plan, rate: _turned(value, np.deg2rad(rate) * of.origin.hours(plan)))
     says = in_words("the sensor turns by {0} degrees per hour: it is loose in its holder")
     return kind.linear(of, {"deg_per_hour": "deg/h"}, 2.0 / (of.duration_s / 3600), act, says)
 

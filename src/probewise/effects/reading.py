@@ -50,14 +50,18 @@ def decaying_sum(added: FloatArray, kept: FloatArray, *, longest: int) -> FloatA
 @light_effect("nonlinearity", Stage.RESPONSE, "a bent response curve", ("level",))
 def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
     """A bent response curve: u -> u^gamma, u the seen white fraction clipped to 0..1."""
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        half = f"a half-white view reads as {100 * 0.5 ** mean[0]:.1f} % white"
-        return f"the response is bent with exponent {value_with_sd(mean[0], sd[0])}: {half}"
-
-    act = acting(lambda value, plan, gamma: np.clip(value, 0.0, 1.0) ** gamma)
-    parameters, bank = {"gamma": (LogHeavyTailedPrior(0.1), "1")}, single_column_bank(np.exp([-0.1, 0.1]))
-    return kind.bind(of, parameters, act, bank, says, amplitudes=(), absent={0: 1.0})
+    return kind.bind(
+        of,
+        {"gamma": (LogHeavyTailedPrior(0.1), "1")},
+        acting(lambda value, plan, gamma: np.clip(value, 0.0, 1.0) ** gamma),
+        single_column_bank(np.exp([-0.1, 0.1])),
+        lambda mean, sd: (
+            f"the response is bent with exponent {value_with_sd(mean[0], sd[0])}: "
+            f"a half-white view reads as {100 * 0.5 ** mean[0]:.1f} % white"
+        ),
+        amplitudes=(),
+        absent={0: 1.0},
+    )
 
 
 _DARK, _GAIN = "another dark level than at the calibration", "another gain than at the calibration"
@@ -203,16 +207,18 @@ def flicker(kind: LightEffect, of: Extent) -> Effect | None:
         return None
     n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, _MOST_FREQUENCIES))
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        size, hz = value_with_sd(mean[0], sd[0], of.reading_unit), f"{value_with_sd(mean[1], sd[1])} Hz"
-        wave = f"an amplitude of {size} at {hz} (a period of {1 / mean[1]:.4g} s)"
-        return f"the reading oscillates with {wave}, {_ALIKE}: a lamp flickers"
-
     amp, alias_hz = HeavyTailedPrior(typical, positive=True), Uniform(_LOWEST_HZ, highest)
-    parameters: Declared = {"amp": (amp, "reading"), "alias_hz": (alias_hz, "Hz"), "phase": (PHASE, "rad")}
-    bank = sine_and_cosine_entries(typical, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1])
-    act = acting(lambda value, plan, a, hz, at: value + a * np.sin(2 * np.pi * hz * of.origin.seconds(plan) + at))
-    return kind.bind(of, parameters, act, bank, says, kind=WaveEffect)
+    return kind.bind(
+        of,
+        {"amp": (amp, "reading"), "alias_hz": (alias_hz, "Hz"), "phase": (PHASE, "rad")},
+        acting(lambda value, plan, a, hz, at: value + a * np.sin(2 * np.pi * hz * of.origin.seconds(plan) + at)),
+        sine_and_cosine_entries(typical, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1]),
+        lambda mean, sd: (
+            f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], of.reading_unit)} at "
+            f"{value_with_sd(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), {_ALIKE}: a lamp flickers"
+        ),
+        kind=WaveEffect,
+    )
 
 
 @light_effect("hysteresis", Stage.OFFSET, "an offset that depends on the direction", ("direction",))
@@ -290,12 +296,15 @@ def saturation(kind: LightEffect, of: Extent) -> Effect:
     sharp = [(top - share * 0.8 * span, sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]
     soft = [(top + share * span, 0.1 * span) for share in (-0.2, -0.05, 0.1, 0.25)]
 
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        limit, below = value_with_sd(mean[0], sd[0], unit), f"{mean[1]:.2g} {unit}".rstrip()
-        return f"no reading rises above {limit}: the electronics saturate, from about {below} below that limit"
-
-    level, softness = Uniform(lowest, highest), LogUniform(sharpest, softest)
-    parameters: Declared = {"level": (level, "reading"), "softness": (softness, "reading")}
-    act = acting(lambda value, plan, level, soft: level - soft * np.logaddexp(0.0, (level - value) / soft))
-    nowhere = {0: highest + 100 * softest}
-    return kind.bind(of, parameters, act, np.array([*sharp, *soft])[:, None, :], says, amplitudes=(), absent=nowhere)
+    return kind.bind(
+        of,
+        {"level": (Uniform(lowest, highest), "reading"), "softness": (LogUniform(sharpest, softest), "reading")},
+        acting(lambda value, plan, level, soft: level - soft * np.logaddexp(0.0, (level - value) / soft)),
+        np.array([*sharp, *soft])[:, None, :],
+        lambda mean, sd: (
+            f"no reading rises above {value_with_sd(mean[0], sd[0], unit)}: the electronics saturate, "
+            f"from about {f'{mean[1]:.2g} {unit}'.rstrip()} below that limit"
+        ),
+        amplitudes=(),
+        absent={0: highest + 100 * softest},
+    )

@@ -249,7 +249,7 @@ class Caller:
             for _, fixed in self._interpolation(own, n_points):
                 asked[_digest_of_arguments(fixed, columns)] = fixed, columns
         unknown = {key: given for key, given in asked.items() if key not in self._known}
-        for key, readings in zip(unknown, self.simulate.many(list(unknown.values())), strict=True):
+        for key, readings in zip(unknown, self.simulate.many([*unknown.values()]), strict=True):
             if readings is not None and readings.shape == (n_points,):
                 self._count_call()
                 self._known[key] = readings
@@ -288,23 +288,19 @@ class SpreadCalls:
 
     def many(self, given: Sequence[tuple[Values, Values]]) -> Iterator[FloatArray | None]:
         """Yield what it returns for each parameters and columns, in this order; None where it raises an error."""
-        chunks = [given[k :: self._n_chunks] for k in range(min(self._n_chunks, len(given)))]
-        done = list(self._executor.map(partial(_call_each, self._path), chunks))
-        return (done[k % len(done)][k // len(done)] for k in range(len(given)))
+        each, chunk = partial(_readings_or_none, self._path), max(len(given) // self._n_chunks, 1)
+        return self._executor.map(each, given, chunksize=chunk)
 
 
 _simulate_of_file: Callable[[Path], Any] = cache(lambda path: read_simulator(path).simulate)
 
 
-def _call_each(path: Path, given: Sequence[tuple[Values, Values]]) -> list[FloatArray | None]:
-    out: list[FloatArray | None] = []
-    with np.errstate(all="ignore"):
-        for each in given:
-            try:
-                out.append(np.array(call_on_views(_simulate_of_file(path), *each), float))
-            except Exception:
-                out.append(None)
-    return out
+def _readings_or_none(path: Path, given: tuple[Values, Values]) -> FloatArray | None:
+    try:
+        with np.errstate(all="ignore"):
+            return np.array(call_on_views(_simulate_of_file(path), *given), float)
+    except Exception:
+        return None
 
 
 def _digest_of_arguments(own: Values, columns: Columns) -> bytes:

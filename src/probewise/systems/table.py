@@ -70,9 +70,8 @@ class RunTable:
     first_line: int = 2
 
     def __post_init__(self) -> None:
-        if not hasattr(self.columns, "items"):
-            allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
-            raise ParameterError("table", self.columns, allowed)
+        allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
+        require(hasattr(self.columns, "items"), "table", self.columns, allowed)
         columns, notes = dict[str, NDArray[Any]](), [*self.notes]
         for name, given in self.columns.items():
             values: Any = given
@@ -82,9 +81,7 @@ class RunTable:
                 notes += [note] if note else []
             columns[name] = _checked_column(name, values, are_names=name == self.run)
             if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
-                notes.append(
-                    f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
-                )
+                notes += [f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"]
         require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
         for name, values in columns.items():
@@ -171,10 +168,10 @@ class RunTable:
             if falls.size:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
                 where = f"column {self.time!r} in row {at + self.first_line}"
-                own = "its run" if self.run is None else f"run {name}"
+                anew = 'its run; where it begins anew name the runs: run = "..."'
+                own = anew if self.run is None else f"run {name}"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
-                cure = "" if self.run is not None else '; where it begins anew name the runs: run = "..."'
-                raise ParameterError(where, float(self.time_s[at]), f"{allowed}{cure}")
+                raise ParameterError(where, float(self.time_s[at]), allowed)
 
     def interpolated_within_runs(self, values: FloatArray) -> FloatArray:
         """Return a column, (n_points,), with its missing values interpolated linearly from row to row of each run.

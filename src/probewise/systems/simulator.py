@@ -275,7 +275,7 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
     given: dict[str, Any] = dict.fromkeys(("reading", "unit", "parameters"))
     given |= {name: said[name] for name in _OF_SYSTEM if name in said}
     try:
-        law, extra = None, said.get("extra", {})
+        law, extra, effects = None, said.get("extra", {}), {}
         require_mapping("extra", extra, 'effects by name, each a dict with "prior", "null" and "says"')
         if "rates" in said or "states" in said:
             of_law: dict[str, Any] = {"states": None} | {name: said[name] for name in _OF_LAW if name in said}
@@ -283,9 +283,9 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
         for name, own in extra.items():
             is_whole = isinstance(own, Mapping) and own.keys() == {"prior", "null", "says"}
             require(is_whole, f"extra[{name!r}]", own, 'a dict with "prior", "null" and "says"')
-            extra = {**extra, name: Extra(own["prior"], float(own["null"]), str(own["says"]))}
+            effects[name] = Extra(own["prior"], float(own["null"]), str(own["says"]))
         given |= {"vectorized": bool(said.get("vectorized", False)), "source": printable(path.name)}
-        return Simulator(simulate=simulate, law=law, extra=extra, fingerprint=fingerprint_of_text(text), **given)
+        return Simulator(simulate=simulate, law=law, extra=effects, fingerprint=fingerprint_of_text(text), **given)
     except ParameterError as error:
         found = f"{error.name} is {shown(error.value)}" if error.value is not None else f"{error.name} is missing"
         like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []

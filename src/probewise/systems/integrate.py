@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
@@ -297,8 +297,7 @@ def _solve_all_steps(
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
     for _ in range(_CHORDS):  # each sample with the Jacobian of the known trajectory nearest to it
-        active = search.active_mask & ((search.rate < _SLOW) | ~np.isfinite(search.change))
-        samples = np.flatnonzero(active)
+        samples = np.flatnonzero(search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change)))
         if not samples.size:
             break
         missed = search.step_residuals(samples)
@@ -312,16 +311,16 @@ def _solve_all_steps(
         search.apply_correction(samples, correction)
         far = ~(search.change < _FAR)
         if samples.size == len(nearest) and far.sum() * steps.gaps.shape[1] > _FEW_FAR:
-            search.possible &= ~far
+            search.active &= ~far
     # A chord that led away is no better a start than the trajectory that it began from.
-    astray = search.active_mask & ~(search.rate < 1)
+    astray = search.active & ~(search.rate < 1)
     search.states[:, astray, 1:] = guess[:, astray, 1:]
     search.change[~search.done] = np.inf
     last: dict[int, FloatArray] = {}
     for k in range(_NEWTONS):  # each sample with its own Jacobian
         if k == _HOPELESS:
-            search.possible &= search.change < _SLOW
-        samples = np.flatnonzero(search.active_mask)
+            search.active &= search.change < _SLOW
+        samples = np.flatnonzero(search.active)
         if not samples.size:
             break
         bands = search.jacobian_bands(samples, search.states[:, samples])
@@ -334,7 +333,10 @@ def _solve_all_steps(
 
 @dataclass(eq=False)
 class _NewtonState:
-    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample."""
+    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample.
+
+    A sample is `done` when it has converged, and `active` while it may yet.
+    """
 
     law_and_inputs: LawAndInputs
     steps: Steps
@@ -344,15 +346,10 @@ class _NewtonState:
     def __post_init__(self) -> None:
         n_samples = self.states.shape[1]
         self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
-        self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
+        self.done, self.active = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen, self._parts = np.zeros(0, dtype=np.int64), list[StepPart]()
         self._motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
         self.states[:, :, 0] = initial_states(self._motion, self.steps, parameters, n_samples)
-
-    @property
-    def active_mask(self) -> BoolArray:
-        """Mask of the samples that have not converged and may yet, (n_samples,)."""
-        return self.possible & ~self.done
 
     def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
@@ -400,8 +397,8 @@ class _NewtonState:
         with np.errstate(all="ignore"):
             rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
         first = ~np.isfinite(self.change[samples])
-        self.possible[samples] = np.isfinite(change)
         self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < _SETTLED)
+        self.active[samples] = np.isfinite(change) & ~self.done[samples]
         self.change[samples], self.rate[samples] = change, rate
 
 

@@ -10,7 +10,7 @@ from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import _notes_on_integration, recording_from_table
 from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
 from probewise.systems import Law, RunTable, Simulator, System
-from probewise.systems.all_steps import Integrations
+from probewise.systems.integrate import Integrations
 
 
 def _rates(s, p, u):

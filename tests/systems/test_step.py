@@ -14,16 +14,16 @@ SWINGS = LawWithEffects(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], 
 
 def _between(gap, **parameters):
     """Return the inputs in a gap of this time, from time 0 on."""
-    return StepInputs("t", (parameters, {}), ({}, {"t": (np.zeros(np.shape(gap)), np.asarray(gap))}))
+    return StepInputs("t", (parameters, {"t": np.zeros(np.shape(gap))}), ({}, {"t": np.asarray(gap)}))
 
 
 def _error(method, n_steps):
     """Return the error of a swing of 4 rad, of which the closed form is a cosine."""
     stepper = Stepper(SWINGS, method, _between([[4.0]]))
-    s = {"x": np.ones((1, 1)), "v": np.zeros((1, 1))}
+    s = np.array([[[1.0]], [[0.0]]])
     for k in range(n_steps):
         s = stepper.step(s, k / n_steps, 1 / n_steps)
-    return float(np.hypot(s["x"] - np.cos(4.0), s["v"] + np.sin(4.0))[0, 0])
+    return float(np.hypot(s[0] - np.cos(4.0), s[1] + np.sin(4.0))[0, 0])
 
 
 @pytest.mark.parametrize(("method", "order"), [(FOURTH_ORDER, 4), (EIGHTH_ORDER, 8)])
@@ -53,10 +53,10 @@ def test_a_state_that_meets_its_bound_within_a_step_of_eighth_order_stays_there(
         limits=(Limit("x", np.array([[2.5]])),)
     )
     stepper = Stepper(fills, EIGHTH_ORDER, _between([[1.0]]))
-    s, found = {"x": np.zeros((1, 1))}, []
+    s, found = np.zeros((1, 1, 1)), []
     for _ in range(4):
         s = stepper.step(s, 0.0, 1.0)
-        found.append(float(s["x"][0, 0]))
+        found.append(float(s[0, 0, 0]))
     assert found == pytest.approx([1.0, 2.0, 2.5, 2.5])
 
 
@@ -66,7 +66,7 @@ END = 2.0
 def _after(law, n_steps):
     """Return the states after a gap in a number of steps."""
     stepper = Stepper(LawWithEffects(law), RODAS, _between([[END]]))
-    s = {name: np.full((1, 1), float(value)) for name, value in law.states.items()}
+    s = np.array([[[float(value)]] for value in law.states.values()])
     with np.errstate(all="ignore"):
         for k in range(n_steps):
             s = stepper.step(s, k / n_steps, 1 / n_steps)
@@ -82,7 +82,7 @@ def test_the_error_falls_by_the_fourth_order_in_a_bent_law_with_an_input_in_time
 
     def error(n_steps):
         s = _after(law, n_steps)
-        return np.array([s["x"][0, 0] - np.tan(1.25), s["y"][0, 0] - np.sin(END)])
+        return s[:, 0, 0] - [np.tan(1.25), np.sin(END)]
 
     orders = np.log2(np.abs(error(16) / error(32)))
     assert (orders > 3.6).all()
@@ -95,10 +95,10 @@ def test_a_run_that_ended_stands_still_and_one_that_runs_away_leaves_the_others(
 
     between = _between([[1.0, 0.0, 2.0]], k=np.array([[0.0], [1e200]]))
     stepper = Stepper(LawWithEffects(Law({"x": 1.0}, rates)), RODAS, between)
-    s = {"x": np.array([[1.0, 7.0, 1.0], [1.0, 7.0, 1e200]])}
+    s = np.array([[[1.0, 7.0, 1.0], [1.0, 7.0, 1e200]]])
     with np.errstate(all="ignore"):
         for k in range(10):
             s = stepper.step(s, k / 10, 0.1)
-    np.testing.assert_allclose(s["x"][0], [np.exp(-1.0), 7.0, np.exp(-2.0)], rtol=1e-4)
-    assert s["x"][1, 1] == 7.0
-    assert not np.isfinite(s["x"][1, 2])
+    np.testing.assert_allclose(s[0][0], [np.exp(-1.0), 7.0, np.exp(-2.0)], rtol=1e-4)
+    assert s[0][1, 1] == 7.0
+    assert not np.isfinite(s[0][1, 2])

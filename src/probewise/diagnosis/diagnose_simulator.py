@@ -31,11 +31,11 @@ from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, masks_of_readings_at_ends
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.all_steps import Integrations
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.binding import sorting_column
 from probewise.systems.forms.reference import note_on_row_order
 from probewise.systems.forms.stop import MeterStop, is_signal_beyond, meter_stops_and_masks
+from probewise.systems.integrate import Integrations
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
 NEAR_END = 2.0  # noise sds from an end of the declared range to a prediction whose noise the end may cut off

@@ -81,7 +81,6 @@ A diagnosis names it where hardly anything else out of vocabulary explains the r
 form of the unknown.
 """
 
-
 EFFECTS: Mapping[str, LightEffect] = MappingProxyType({**VOCABULARY, **RARE_EFFECTS})
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 

@@ -318,7 +318,7 @@ class WaveEffect(Effect):
         return self._without_suggested if self.suggested.size else self
 
     @cached_property
-    def _without_suggested(self) -> Self:
+    def _without_suggested(self) -> Self:  # one object at each call, as `variants` returns
         return replace(self, suggested=np.zeros(0))
 
 
@@ -410,19 +410,13 @@ class LightEffect:
             return None
         points, n = ChangePoints.of(of.plan.time_s), len(sizes)
         low, high = points.at[0], points.at[-1]
-        entries = np.diag([size for size, _ in sizes.values()])
-        return self.bind(
-            of,
-            {name: (HeavyTailedPrior(size), unit) for name, (size, unit) in sizes.items()}
-            | {"at_s": (Uniform(low, high), "s")},
-            lambda value, theta, plan: act(value, theta, plan.time_s > theta[:, -1:]),
-            np.column_stack([entries, np.full(n, (low + high) / 2)])[None, :, :],
-            says,
-            kind=StepEffect,
-            amplitudes=tuple(range(n)),
-            change_points=points,
-            is_thinned=is_thinned,
-        )
+        parameters: dict[str, tuple[Marginal, str]]
+        parameters = {name: (HeavyTailedPrior(size), unit) for name, (size, unit) in sizes.items()}
+        parameters["at_s"] = Uniform(low, high), "s"
+        entries = np.column_stack([np.diag([size for size, _ in sizes.values()]), np.full(n, (low + high) / 2)])
+        own = (of, parameters, lambda value, theta, plan: act(value, theta, plan.time_s > theta[:, -1:]), entries[None])
+        more: dict[str, Any] = {"amplitudes": tuple(range(n)), "change_points": points, "is_thinned": is_thinned}
+        return self.bind(*own, says, kind=StepEffect, **more)
 
 
 def _effect_there(kind: LightEffect, of: Extent, scans: tuple[str, ...]) -> Effect:
@@ -449,10 +443,9 @@ def require_effect_kinds(effects: object) -> None:
     allowed = "effects by name, such as {**VOCABULARY, 'overflow': overflow}, of probewise.effects"
     require_mapping("effects", effects, allowed)
     assert isinstance(effects, Mapping)
+    decorated = "a function decorated with probewise.effects.light_effect"
     for name, kind in effects.items():
-        require_kind(
-            f"effects[{name!r}]", kind, LightEffect, "a function decorated with probewise.effects.light_effect"
-        )
+        require_kind(f"effects[{name!r}]", kind, LightEffect, decorated)
         require(kind.name == name, "effects", name, f"{kind.name!r}, the name of that effect")
 
 

@@ -18,6 +18,7 @@ from probewise.effects.effect import (
     LightEffect,
     NoiseEffect,
     Say,
+    acting,
     in_words,
     light_effect,
     priors_and_units,
@@ -37,16 +38,10 @@ _DIGITS = 1e-6  # of a step: below this a difference is rounding
 
 
 def _on_noise(
-    kind: LightEffect,
-    of: Extent,
-    parameters: Declared,
-    act: Act,
-    says: Say,
-    n_nodes: tuple[int, ...] = (10,),
-    *,
+    kind: LightEffect, of: Extent, parameters: Declared, act: Act, says: Say, n_nodes: tuple[int, ...] = (10,), *,
     from_prior: bool = True,
     **more: Any,
-) -> Effect:
+) -> Effect:  # fmt: skip
     """Return an effect with nodes of its prior: midpoints of `n_nodes` equal shares along each parameter.
 
     Unless `from_prior`, the nodes under which evidence is computed are from elsewhere.
@@ -88,29 +83,21 @@ def noise_sd(kind: LightEffect, of: Extent) -> Effect:
 def correlated_noise(kind: LightEffect, of: Extent) -> Effect:
     """Correlated noise, AR(1) within a scan: e_k = rho e_(k-1) + new noise."""
     says = "the noise of successive readings has correlation {0}: part of each error returns in the next reading"
-    return _on_noise(
-        kind,
-        of,
-        {"rho": (Uniform(-0.5, 0.95), "1")},
-        lambda noise, theta, plan: replace(noise, rho=theta[:, :1]),
-        in_words(says),
-        (28,),  # dense enough to integrate the posterior of a thousand readings
-    )
+    n = (28,)  # dense enough to integrate the posterior of a thousand readings
+    act = acting(lambda noise, plan, rho: replace(noise, rho=rho))
+    return _on_noise(kind, of, {"rho": (Uniform(-0.5, 0.95), "1")}, act, in_words(says), n)
 
 
 @light_effect("signal_dependent_noise", Stage.NOISE, "noise that grows with the signal", ("level",))
 def signal_dependent_noise(kind: LightEffect, of: Extent) -> Effect:
     """Noise that grows with the light: variance x (1 + ratio u), u the seen white fraction."""
-    return _on_noise(
-        kind,
-        of,
-        {"ratio": (LogUniform(0.05, 50.0), "1")},
-        lambda noise, theta, plan: replace(noise, sd=noise.sd * np.sqrt(1 + theta[:, :1] * np.clip(noise.seen, 0, 1))),
-        lambda mean, sd: (
-            "the noise grows with the reading: its variance at the highest level is "
-            f"{value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
-        ),
-    )
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        times = f"its variance at the highest level is {value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
+        return f"the noise grows with the reading: {times}"
+
+    act = acting(lambda noise, plan, r: replace(noise, sd=noise.sd * np.sqrt(1 + r * np.clip(noise.seen, 0, 1))))
+    return _on_noise(kind, of, {"ratio": (LogUniform(0.05, 50.0), "1")}, act, says)
 
 
 @light_effect("drifting_noise", Stage.NOISE, "noise that changes in time", ("time",))
@@ -133,14 +120,9 @@ def drifting_noise(kind: LightEffect, of: Extent) -> Effect:
 @light_effect("random_walk", Stage.NOISE, "a random walk of the zero", ("time", "row", "run"))
 def random_walk(kind: LightEffect, of: Extent) -> Effect:
     """A random walk of the offset of a table's readings: a normal step from each row to the next, across runs too."""
-    return _on_noise(
-        kind,
-        of,
-        {"sd_per_row": (LogUniform(5e-3, 3.0), "noise sd")},
-        lambda noise, theta, _: replace(noise, walk=theta[:, :1]),
-        in_words("the offset is a random walk with steps of sd {0} noise sds from row to row"),
-        (16,),
-    )
+    says = in_words("the offset is a random walk with steps of sd {0} noise sds from row to row")
+    act = acting(lambda noise, plan, walk: replace(noise, walk=walk))
+    return _on_noise(kind, of, {"sd_per_row": (LogUniform(5e-3, 3.0), "noise sd")}, act, says, (16,))
 
 
 @light_effect("noise_per_run", Stage.NOISE, "noise that differs from run to run", ("run",))
@@ -164,10 +146,9 @@ def noise_of_runs(runs: tuple[str, ...], n_rows: Any = 1) -> NoiseEffect:
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         low, high = int(np.argmin(mean)), int(np.argmax(mean))
-        return (
-            f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
-            f"in run {runs[high]} and {value_with_sd(mean[low], sd[low])} times in run {runs[low]}"
-        )
+        most, least = value_with_sd(mean[high], sd[high]), value_with_sd(mean[low], sd[low])
+        there = f"{most} times the typical one in run {runs[high]} and {least} times in run {runs[low]}"
+        return f"the noise differs from run to run: its sd is {there}"
 
     return NoiseEffect(
         noise_per_run.name,
@@ -243,14 +224,10 @@ _SHARES = LogUniform(2e-3, MOST_OUTLYING)
 @light_effect("outliers", Stage.NOISE, "outlying readings", ("level", "time"))
 def outliers(kind: LightEffect, of: Extent) -> Effect:
     """A heavy tail: with probability `share`, a reading's noise is `size` times as wide (sd)."""
-    return _on_noise(
-        kind,
-        of,
-        {"share": (_SHARES, "1"), "size": (LogUniform(2.5, LARGEST_SIZE), "noise sd")},
-        lambda noise, theta, plan: replace(noise, wide_share=theta[:, :1], wide_times=theta[:, 1:2]),
-        in_words("outliers: {0} % of the readings scatter {1} times as widely as the others", factors=(100,)),
-        (4, 4),
-    )
+    says = in_words("outliers: {0} % of the readings scatter {1} times as widely as the others", factors=(100,))
+    act = acting(lambda noise, plan, share, size: replace(noise, wide_share=share, wide_times=size))
+    parameters = {"share": (_SHARES, "1"), "size": (LogUniform(2.5, LARGEST_SIZE), "noise sd")}
+    return _on_noise(kind, of, parameters, act, says, (4, 4))
 
 
 @light_effect("dropouts", Stage.NOISE, "lost readings", ("level", "time"))
@@ -268,9 +245,10 @@ def readings_lost_beyond_doubt(lost: FloatArray, n_readings: int, distance: floa
     """
     wide = 0.01 * max(float(np.ptp(lost)), float(np.abs(lost).max()), 1e-300)
     values = tuple(lost.tolist())
+    low, high = float(lost.min()) - wide, float(lost.max()) + wide
     return _dropouts(
-        float(lost.min()) - wide,
-        float(lost.max()) + wide,
+        low,
+        high,
         unit,
         values,
         nodes_about=partial(_commonest_far_value, ()),
@@ -346,15 +324,9 @@ def quantisation(kind: LightEffect, of: Extent) -> Effect | None:
     """Readings rounded to a step that was not declared: step round(reading / step), after the noise."""
     if of.plan.instrumentation.step is not None:
         return None
-    return _on_noise(
-        kind,
-        of,
-        {"step": (LogUniform(1e-3 * of.span, 0.2 * of.span), "reading")},
-        lambda noise, theta, plan: replace(noise, step=theta[:, :1]),
-        in_words("the readings are rounded to steps of {0}, which were not declared", of.reading_unit),
-        (16,),
-        from_prior=False,  # one, from the readings
-    )
+    says = in_words("the readings are rounded to steps of {0}, which were not declared", of.reading_unit)
+    step, act = LogUniform(1e-3 * of.span, 0.2 * of.span), acting(lambda noise, plan, step: replace(noise, step=step))
+    return _on_noise(kind, of, {"step": (step, "reading")}, act, says, (16,), from_prior=False)  # from the readings
 
 
 def lattice_step(readings: FloatArray) -> float:
@@ -380,13 +352,10 @@ def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     """
     values = np.unique(readings[np.isfinite(readings)])
     first = max(math.floor(-math.log10(step)), 0)  # the digits are no coarser than the step, which may be tiny
-    digits = (
-        10.0**-n
-        for n in range(first, first + 10)
-        if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n)
-    )
+    fits = (np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n) for n in range(first, first + 10))
+    digit = next((10.0**-n for n, fit in enumerate(fits, first) if fit), 0.0)
     reach = float(np.linalg.norm(values - values.mean())) / step
-    return max(next(digits, 0.0) / math.sqrt(12) / reach, _DIGITS * step)
+    return max(digit / math.sqrt(12) / reach, _DIGITS * step)
 
 
 def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:

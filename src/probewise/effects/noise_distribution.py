@@ -31,8 +31,7 @@ def log_rounding_cell_density(
 
     The two tail masses are subtracted in logs, so the result stays finite however far the reading lies from the mean.
     """
-    low = (readings - step / 2 - mean) / sd
-    high = (readings + step / 2 - mean) / sd
+    low, high = (readings - step / 2 - mean) / sd, (readings + step / 2 - mean) / sd
     # Mirror cells above the mean: log_ndtr keeps its precision in the lower tail only.
     above = low + high > 0
     near, far = np.where(above, -low, high), np.where(above, -high, low)
@@ -195,10 +194,8 @@ def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high
     `predicted` are noise-free readings of an unlimited instrument, of that shape.
     """
     beside = np.hypot(noise.offset_sd, noise.step / np.sqrt(12))
-    own, wide = (
-        _mean_of_limited_normal(predicted, np.hypot(sd, beside), low, high)
-        for sd in (noise.sd, noise.sd * noise.wide_times)
-    )
+    sds = (np.hypot(sd, beside) for sd in (noise.sd, noise.sd * noise.wide_times))
+    own, wide = (_mean_of_limited_normal(predicted, sd, low, high) for sd in sds)
     return np.asarray((1 - noise.wide_share) * own + noise.wide_share * wide)
 
 
@@ -266,8 +263,5 @@ class PredictiveMixture:
         sd = np.sqrt(share @ (variances + (means - mean) ** 2))
         scores = np.full(len(self.readings), np.nan)
         scores[self.scored] = np.logaddexp.reduce(log_sums, axis=0) - math.log(counts.sum())
-        return (
-            np.clip(share @ limited, *self.ends),
-            sd,
-            np.where(np.any(self._at_ends, axis=0), np.minimum(scores, 0.0), scores),
-        )
+        scores = np.where(np.any(self._at_ends, axis=0), np.minimum(scores, 0.0), scores)
+        return np.clip(share @ limited, *self.ends), sd, scores

@@ -14,6 +14,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.effect import (
     Act,
+    Declared,
     Effect,
     LightEffect,
     Say,
@@ -24,13 +25,7 @@ from probewise.effects.effect import (
     scans_in_words,
     single_column_bank,
 )
-from probewise.effects.reference import (
-    Extent,
-    Origin,
-    candidate_scan_groups,
-    distinct_positions_mm,
-    scan_indicator,
-)
+from probewise.effects.reference import Extent, Origin, candidate_scan_groups, distinct_positions_mm, scan_indicator
 from probewise.priors import HeavyTailedPrior, LogUniform, Normal, Product, Uniform
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Ramp, Stripes
 from probewise.recordings.plan import Plan
@@ -52,13 +47,9 @@ _LEAST_ANGLE_RAD, _ONE_DIRECTION_RAD = np.radians([-89.5, 1.0])
 @light_effect("edge_misplacement", Stage.SCENE, "misplaced edges", ("slope",))
 def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
     """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
-    return kind.linear(
-        of,
-        {"offset_mm": "mm"},
-        0.003 * of.length_mm,
-        lambda value, theta, plan: _with_shifted_patterns(value, theta * np.ones(len(plan)), plan),
-        in_words("the printed edges lie {0} mm from their described place, in all scans"),
-    )
+    act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * np.ones(len(plan)), plan))
+    says = in_words("the printed edges lie {0} mm from their described place, in all scans")
+    return kind.linear(of, {"offset_mm": "mm"}, 0.003 * of.length_mm, act, says)
 
 
 @light_effect("scan_misplacement", Stage.SCENE, "a misplaced pattern in one scan", ("scan", "slope"))
@@ -66,14 +57,9 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
     """In one scan the pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X."""
 
     def in_scan(name: str) -> Effect:
-        return kind.linear(
-            of,
-            {"offset_mm": "mm"},
-            0.003 * of.length_mm,
-            lambda value, theta, plan: _with_shifted_patterns(value, theta * scan_indicator(plan, (name,)), plan),
-            in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others"),
-            scans=(name,),
-        )
+        act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * scan_indicator(plan, (name,)), plan))
+        says = in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others")
+        return kind.linear(of, {"offset_mm": "mm"}, 0.003 * of.length_mm, act, says, scans=(name,))
 
     names = tuple(dict.fromkeys(of.plan.scan_names))
     return one_of([in_scan(name) for name in names]) if len(names) > 1 else None
@@ -182,15 +168,9 @@ class PatchPrior:
     @cached_property
     def _prior_seen_by_scan(self) -> Product:
         """Prior over what the scan shows: height on the line, place along it, distance in radii, radius."""
-        line, length = self.line, self.line.length_mm
-        return Product(
-            {
-                "on_line": HeavyTailedPrior(self.typical),
-                "along": Uniform(line.low_mm - _MARGIN * length, line.high_mm + _MARGIN * length),
-                "beside": self.BESIDE,
-                "r": self.radius_prior,
-            }
-        )
+        line, margin, on_line = self.line, _MARGIN * self.line.length_mm, HeavyTailedPrior(self.typical)
+        along = Uniform(line.low_mm - margin, line.high_mm + margin)
+        return Product({"on_line": on_line, "along": along, "beside": self.BESIDE, "r": self.radius_prior})
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map unit-cube coordinates to height, x, y, r; both (n_samples, 4)."""
@@ -259,10 +239,8 @@ def albedo_gradient(kind: LightEffect, of: Extent) -> Effect:
     def act(value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return _with_changed_regions(value, plan, lambda region: RegionWithGradient(region, theta, of.origin))
 
-    says = (
-        "the signal over white changes by {0} % per 100 mm along X and by {1} % per 100 mm along Y, that over black "
-        "does not: the paper or its illumination is uneven"
-    )
+    white = "the signal over white changes by {0} % per 100 mm along X and by {1} % per 100 mm along Y"
+    says = f"{white}, that over black does not: the paper or its illumination is uneven"
     units = {"per_mm_x": "1/mm", "per_mm_y": "1/mm"}
     return kind.linear(of, units, 0.02 / of.length_mm, act, in_words(says, factors=(1e4, 1e4)))
 
@@ -381,16 +359,9 @@ def height_gradient(kind: LightEffect, of: Extent) -> Effect:
         added = theta[:, :1] * (plan.x_mm - of.origin.x_mm) / _nominal_height_mm(plan)
         return footprint_at_added_height(value, added, plan)
 
-    return kind.linear(
-        of,
-        {"mm_per_mm": "mm/mm"},
-        0.01 * _nominal_height_mm(of.plan) / of.length_mm,
-        act,
-        in_words(
-            "the sensor's height above the surface {grows/shrinks} by {|0|} mm per 100 mm along X: the table slopes",
-            factors=(100,),
-        ),
-    )
+    says = "the sensor's height above the surface {grows/shrinks} by {|0|} mm per 100 mm along X: the table slopes"
+    typical = 0.01 * _nominal_height_mm(of.plan) / of.length_mm
+    return kind.linear(of, {"mm_per_mm": "mm/mm"}, typical, act, in_words(says, factors=(100,)))
 
 
 @light_effect("height_offset", Stage.FOOTPRINT, "another sensor height in some scans", ("scan",))
@@ -405,14 +376,8 @@ def height_offset(kind: LightEffect, of: Extent) -> Effect | None:
             added = theta * scan_indicator(plan, scans) / _nominal_height_mm(plan)
             return footprint_at_added_height(value, added, plan)
 
-        return kind.linear(
-            of,
-            {"mm": "mm"},
-            0.01 * _nominal_height_mm(of.plan),
-            act,
-            in_words(f"in {scans_in_words(scans)} the sensor hangs {{|0|}} mm {{higher/lower}} than in the others"),
-            scans=scans,
-        )
+        says = in_words(f"in {scans_in_words(scans)} the sensor hangs {{|0|}} mm {{higher/lower}} than in the others")
+        return kind.linear(of, {"mm": "mm"}, 0.01 * _nominal_height_mm(of.plan), act, says, scans=scans)
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
 
@@ -428,15 +393,9 @@ def slow_sinking(kind: LightEffect, of: Extent) -> Effect:
 
     t is the time since the origin in hours; h0 and h are those of `height_gradient`.
     """
-    return kind.linear(
-        of,
-        {"per_hour": "1/h"},
-        0.01 / (of.duration_s / 3600),
-        lambda value, theta, plan: footprint_at_added_height(value, theta[:, :1] * of.origin.hours(plan), plan),
-        in_words(
-            "the sensor {rises/sinks} by {|0|} % of its height per hour: it is loose in its holder", factors=(100,)
-        ),
-    )
+    act = acting(lambda value, plan, rate: footprint_at_added_height(value, rate * of.origin.hours(plan), plan))
+    says = "the sensor {rises/sinks} by {|0|} % of its height per hour: it is loose in its holder"
+    return kind.linear(of, {"per_hour": "1/h"}, 0.01 / (of.duration_s / 3600), act, in_words(says, factors=(100,)))
 
 
 def _has_one_height(plan: Plan) -> bool:
@@ -444,9 +403,10 @@ def _has_one_height(plan: Plan) -> bool:
     return ratio is None or float(np.ptp(ratio)) == 0.0
 
 
-@light_effect(
-    "edge_blur", Stage.FOOTPRINT, "soft printed edges", ("edge_distance",), is_absorbed_by_ssf=_has_one_height
-)
+_EDGE = ("edge_distance",)
+
+
+@light_effect("edge_blur", Stage.FOOTPRINT, "soft printed edges", _EDGE, is_absorbed_by_ssf=_has_one_height)
 def edge_blur(kind: LightEffect, of: Extent) -> Effect:
     """Printed edges are blurred by a Gaussian of sd_mm, which acts as a wider footprint over sharp edges would.
 
@@ -458,15 +418,8 @@ def edge_blur(kind: LightEffect, of: Extent) -> Effect:
         wider = theta[:, :, None] ** 2
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
 
-    return kind.linear(
-        of,
-        {"sd_mm": "mm"},
-        0.02 * of.length_mm,
-        act,
-        in_words("the printed edges are soft: blurred by {0} mm (sd)"),
-        positive=True,
-        kind=_BlurEffect,
-    )
+    says, typical = in_words("the printed edges are soft: blurred by {0} mm (sd)"), 0.02 * of.length_mm
+    return kind.linear(of, {"sd_mm": "mm"}, typical, act, says, positive=True, kind=_BlurEffect)
 
 
 class _BlurEffect(Effect):
@@ -486,16 +439,10 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
         more = Footprint(share, u_mm, v_mm, variance, variance, np.zeros((1, 1, 1)))
         return _with_more_gaussians(value, (1 - share) * value.weight, more)
 
-    return kind.bind(
-        of,
-        {"share": (LogUniform(1e-3, 0.7), "1"), "r_mm": (LogUniform(narrowest_mm, widest_mm), "mm")},
-        act,
-        single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5)),
-        in_words(
-            "a wide halo around the sensor's spot, of sd {1} mm, contributes {0} % of the light: the lens scatters it",
-            factors=(100,),
-        ),
-    )
+    says = "a wide halo around the sensor's spot, of sd {1} mm, contributes {0} % of the light: the lens scatters it"
+    parameters = {"share": (LogUniform(1e-3, 0.7), "1"), "r_mm": (LogUniform(narrowest_mm, widest_mm), "mm")}
+    bank = single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5))
+    return kind.bind(of, parameters, act, bank, in_words(says, factors=(100,)))
 
 
 def _with_more_gaussians(value: Footprint, weight: FloatArray, more: Footprint) -> Footprint:
@@ -544,19 +491,12 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
         return replace(value, seen=value.seen - theta[:, :1] * gaussian_bump(distance**2, theta[:, 1:2]))
 
     where = f"of an edge of pattern {', '.join(patterns)}" if patterns else "of an edge"
-    says = (
-        f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains: the edge "
-        "{casts a shadow/reflects light}"
-    )
-    return kind.bind(
-        of,
-        {"amp": (HeavyTailedPrior(typical), "1"), "w": (LogUniform(narrowest_mm, widest_mm), "mm")},
-        act,
-        single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6)),
-        in_words(says, factors=(100,)),
-        patterns=patterns,
-        source=partial(edge_shadow_of_patterns, kind, of, patterns),
-    )
+    looks = f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains"
+    says = in_words(f"{looks}: the edge {{casts a shadow/reflects light}}", factors=(100,))
+    parameters: Declared = {"amp": (HeavyTailedPrior(typical), "1"), "w": (LogUniform(narrowest_mm, widest_mm), "mm")}
+    bank = single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6))
+    source = partial(edge_shadow_of_patterns, kind, of, patterns)
+    return kind.bind(of, parameters, act, bank, says, patterns=patterns, source=source)
 
 
 def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
@@ -582,14 +522,8 @@ def reflection(kind: LightEffect, of: Extent) -> Effect:
 
     angles, reach = 2 * math.pi * np.arange(_ANGLES) / _ANGLES, Uniform(-farthest_mm, farthest_mm)
     far = farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
-    return kind.bind(
-        of,
-        {"share": (HeavyTailedPrior(typical, positive=True), "1"), "dx_mm": (reach, "mm"), "dy_mm": (reach, "mm")},
-        act,
-        single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()),
-        in_words(
-            "a second spot, {1} mm along X and {2} mm along Y from the first, contributes {0} % of the light: a "
-            "reflection",
-            factors=(100,),
-        ),
-    )
+    share = HeavyTailedPrior(typical, positive=True), "1"
+    bank = single_column_bank(typical, (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel())
+    spot = "a second spot, {1} mm along X and {2} mm along Y from the first, contributes {0} % of the light"
+    says = in_words(f"{spot}: a reflection", factors=(100,))
+    return kind.bind(of, {"share": share, "dx_mm": (reach, "mm"), "dy_mm": (reach, "mm")}, act, bank, says)

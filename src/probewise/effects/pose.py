@@ -12,6 +12,7 @@ from probewise._arrays import FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     PHASE,
+    Declared,
     Effect,
     LightEffect,
     WaveEffect,
@@ -54,26 +55,20 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
 
     The width is positive: the arm lags behind the motion, never ahead.
     """
-    return kind.linear(
-        of,
-        {"width_mm": "mm"},
-        0.005 * of.length_mm,
-        lambda value, theta, plan: _moved(value, *(-(theta[:, :1] / 2) * d for d in plan.direction_of_motion.T)),
-        lambda mean, sd: (
-            f"the arm comes to rest {value_with_sd(mean[0], sd[0], factor=0.5)} mm short of where it was sent, "
-            f"on the side it came from: gear play of {value_with_sd(mean[0], sd[0])} mm"
-        ),
-        positive=True,
-    )
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        half, whole = (value_with_sd(mean[0], sd[0], factor=factor) for factor in (0.5, 1.0))
+        side = f"{half} mm short of where it was sent, on the side it came from"
+        return f"the arm comes to rest {side}: gear play of {whole} mm"
+
+    act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * d for d in plan.direction_of_motion.T)))
+    return kind.linear(of, {"width_mm": "mm"}, 0.005 * of.length_mm, act, says, positive=True)
 
 
 @light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
 def play_of_axes(kind: LightEffect, of: Extent) -> Effect:
     """Play in the gears of each axis: position = commanded - (width_mm / 2) s, s the side it last moved to."""
-
-    def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return _moved(value, *(-(theta[:, :1] / 2) * side for side in _side_of_each_axis(plan)))
-
+    act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * side for side in _side_of_each_axis(plan))))
     return replace(cast(Effect, backlash.build(kind, of)), apply=act, form="of each axis")
 
 
@@ -103,27 +98,18 @@ def position_scale(kind: LightEffect, of: Extent) -> Effect:
         return replace(value, x_mm=x, y_mm=y)
 
     says = "the arm moves {0} % too far along X and {1} % along Y: the scale of its positions is wrong"
-    return kind.linear(
-        of, {"x": "1", "y": "1"}, typical, act, in_words(says, factors=(100, 100)), sizes=(1, -30, -10, 10, 30)
-    )
+    words = in_words(says, factors=(100, 100))
+    return kind.linear(of, {"x": "1", "y": "1"}, typical, act, words, sizes=(1, -30, -10, 10, 30))
 
 
-@light_effect(
-    "orientation_error",
-    Stage.POSE,
-    "a wrong sensor angle in all scans",
-    ("orientation",),
-    is_absorbed_by_ssf=lambda plan: True,
-)
+_TURNED = "a wrong sensor angle in all scans"
+
+
+@light_effect("orientation_error", Stage.POSE, _TURNED, ("orientation",), is_absorbed_by_ssf=lambda plan: True)
 def orientation_error(kind: LightEffect, of: Extent) -> Effect:
     """The sensor is turned by deg more than was commanded, in all scans, anticlockwise: its SSF absorbs this."""
-    return kind.linear(
-        of,
-        {"deg": "deg"},
-        _TURN_DEG,
-        lambda value, theta, plan: _turned(value, np.radians(theta)),
-        in_words(f"in all scans the sensor is turned {_FURTHER}"),
-    )
+    says = in_words(f"in all scans the sensor is turned {_FURTHER}")
+    return kind.linear(of, {"deg": "deg"}, _TURN_DEG, lambda value, theta, _: _turned(value, np.radians(theta)), says)
 
 
 @light_effect("scan_angle_error", Stage.POSE, "a wrong sensor angle in some scans", ("scan", "orientation"))
@@ -131,15 +117,9 @@ def scan_angle_error(kind: LightEffect, of: Extent) -> Effect | None:
     """The sensor is turned by deg more than was commanded in one mounting (scans of one orientation) or one scan."""
 
     def in_scans(scans: tuple[str, ...]) -> Effect:
-        return kind.linear(
-            of,
-            {"deg": "deg"},
-            _TURN_DEG,
-            lambda value, theta, plan: _turned(value, np.radians(theta) * scan_indicator(plan, scans)),
-            in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"),
-            sizes=(1.0, -8.0, 8.0, -14.0, 14.0),
-            scans=scans,
-        )
+        act = acting(lambda value, plan, deg: _turned(value, np.radians(deg) * scan_indicator(plan, scans)))
+        says, sizes = in_words(f"in {scans_in_words(scans)} the sensor is turned {_FURTHER}"), (1, -8, 8, -14, 14)
+        return kind.linear(of, {"deg": "deg"}, _TURN_DEG, act, says, sizes=sizes, scans=scans)
 
     return one_of([in_scans(scans) for scans in candidate_scan_groups(of.plan)])
 
@@ -155,9 +135,8 @@ def sensor_tilt(kind: LightEffect, of: Extent) -> Effect:
         ratio = height_ratio(plan)
         return _moved(value, *(theta[:, k : k + 1] if ratio is None else theta[:, k : k + 1] * ratio for k in (0, 1)))
 
-    says = in_words(
-        "the sensor's spot is off by {0} mm along X and {1} mm along Y, whatever the orientation: the sensor is tilted"
-    )
+    off = "the sensor's spot is off by {0} mm along X and {1} mm along Y"
+    says = in_words(f"{off}, whatever the orientation: the sensor is tilted")
     return kind.linear(of, {"dx_mm": "mm", "dy_mm": "mm"}, 0.003 * of.length_mm, act, says)
 
 
@@ -170,11 +149,8 @@ def bent_rails(kind: LightEffect, of: Extent) -> Effect:
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         x, y = (plan.x_mm - of.origin.x_mm) / _UNIT_MM, (plan.y_mm - of.origin.y_mm) / _UNIT_MM
-        return replace(
-            value,
-            x_mm=value.x_mm + theta[:, :1] * x**2 + theta[:, 1:2] * x**3,
-            y_mm=value.y_mm + theta[:, 2:3] * y**2 + theta[:, 3:4] * y**3,
-        )
+        x_mm = value.x_mm + theta[:, :1] * x**2 + theta[:, 1:2] * x**3
+        return replace(value, x_mm=x_mm, y_mm=value.y_mm + theta[:, 2:3] * y**2 + theta[:, 3:4] * y**3)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         of_x, of_y = (value_with_sd(mean[k] + mean[k + 1], float(np.hypot(sd[k], sd[k + 1]))) for k in (0, 2))
@@ -222,10 +198,8 @@ def arm_knock(kind: LightEffect, of: Extent) -> Effect | None:
         moved = _moved(value, theta[:, :1] * after, theta[:, 1:2] * after)
         return _turned(moved, np.deg2rad(theta[:, 2:3]) * after)
 
-    says = in_words(
-        "from {3} s on, all positions are off by {0} mm along X and {1} mm along Y, and the sensor is turned by {2} "
-        "degrees: the arm or the paper was pushed"
-    )
+    off = "from {3} s on, all positions are off by {0} mm along X and {1} mm along Y, and the sensor is turned by {2}"
+    says = in_words(f"{off} degrees: the arm or the paper was pushed")
     typical = 0.005 * of.length_mm, "mm"
     return kind.step(of, {"dx_mm": typical, "dy_mm": typical, "turn_deg": (2.0, "deg")}, act, says)
 
@@ -233,18 +207,15 @@ def arm_knock(kind: LightEffect, of: Extent) -> Effect | None:
 @light_effect("slow_turn", Stage.POSE, "a sensor that slowly turns", ("time", "orientation"), counts="time")
 def slow_turn(kind: LightEffect, of: Extent) -> Effect:
     """The sensor turns in its holder: orientation + deg_per_hour t, t the hours since the origin."""
-    return kind.linear(
-        of,
-        {"deg_per_hour": "deg/h"},
-        2.0 / (of.duration_s / 3600),
-        lambda value, theta, plan: _turned(value, np.deg2rad(theta[:, :1]) * of.origin.hours(plan)),
-        in_words("the sensor turns by {0} degrees per hour: it is loose in its holder"),
-    )
+    act = acting(lambda value, plan, rate: _turned(value, np.deg2rad(rate) * of.origin.hours(plan)))
+    says = in_words("the sensor turns by {0} degrees per hour: it is loose in its holder")
+    return kind.linear(of, {"deg_per_hour": "deg/h"}, 2.0 / (of.duration_s / 3600), act, says)
 
 
-@light_effect(
-    "periodic_position_error", Stage.POSE, "a periodic position error of the arm", ("place", "slope"), counts="place"
-)
+_PERIODIC = "a periodic position error of the arm"
+
+
+@light_effect("periodic_position_error", Stage.POSE, _PERIODIC, ("place", "slope"), counts="place")
 def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
     """A gear or lead screw that is not round: X + amp_mm sin(2 pi (X - X0) / period_mm + phase), X0 of the origin."""
     shortest_mm, reach_mm = _shortest_period_and_range_mm(of.plan)
@@ -260,17 +231,11 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
     waves = np.linspace(1.0, longest_mm / 2 / shortest_mm, _N_PERIODS + 1)[1:]
     periods = np.append(longest_mm / 2 / waves, longest_mm / np.geomspace(1.05, 2.0, _N_LONG))
     amp, period = HeavyTailedPrior(typical_mm, positive=True), LogUniform(shortest_mm, longest_mm)
-    return kind.bind(
-        of,
-        {"amp_mm": (amp, "mm"), "period_mm": (period, "mm"), "phase": (PHASE, "rad")},
-        act,
-        sine_and_cosine_entries(typical_mm, np.maximum(periods, shortest_mm * 1.001)),
-        in_words(
-            "the arm's position along X is off by up to {0} mm, with a period of {1} mm: a gear or lead screw is not "
-            "round"
-        ),
-        kind=WaveEffect,
-    )
+    parameters: Declared = {"amp_mm": (amp, "mm"), "period_mm": (period, "mm"), "phase": (PHASE, "rad")}
+    bank = sine_and_cosine_entries(typical_mm, np.maximum(periods, shortest_mm * 1.001))
+    off = "the arm's position along X is off by up to {0} mm, with a period of {1} mm"
+    says = in_words(f"{off}: a gear or lead screw is not round")
+    return kind.bind(of, parameters, act, bank, says, kind=WaveEffect)
 
 
 @light_effect("stick_slip", Stage.POSE, "a slide that sticks and jumps", ("place", "slope"), counts="place")
@@ -288,16 +253,11 @@ def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
 
     waves = np.linspace(1.0 / longest_mm, 1.0 / shortest_mm, _N_WAVES + 2)[1:-1]
     periods, phases = np.meshgrid(1 / waves, np.arange(_N_PHASES) / _N_PHASES - 0.5, indexing="ij")
-    period, phase = LogUniform(shortest_mm, longest_mm), Uniform(-1.0, 1.0)
-    return kind.bind(
-        of,
-        {"amp_mm": (HeavyTailedPrior(typical_mm), "mm"), "period_mm": (period, "mm"), "phase": (phase, "1")},
-        act,
-        single_column_bank(typical_mm, periods.ravel(), phases.ravel()),
-        in_words(
-            "the slide sticks and then jumps by {|0|} mm, once every {1} mm along X: it lacks lubrication", factors=(2,)
-        ),
-    )
+    amp, period, phase = HeavyTailedPrior(typical_mm), LogUniform(shortest_mm, longest_mm), Uniform(-1.0, 1.0)
+    parameters: Declared = {"amp_mm": (amp, "mm"), "period_mm": (period, "mm"), "phase": (phase, "1")}
+    bank = single_column_bank(typical_mm, periods.ravel(), phases.ravel())
+    says = "the slide sticks and then jumps by {|0|} mm, once every {1} mm along X: it lacks lubrication"
+    return kind.bind(of, parameters, act, bank, in_words(says, factors=(2,)))
 
 
 def _shortest_period_and_range_mm(plan: Plan) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     PHASE,
+    Declared,
     Effect,
     LightEffect,
     WaveEffect,
@@ -52,8 +53,8 @@ def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
     return kind.bind(
         of,
         {"gamma": (LogHeavyTailedPrior(0.1), "1")},
-        lambda value, theta, plan: np.clip(value, 0.0, 1.0) ** theta[:, :1],
-        single_column_bank(np.exp(0.1 * np.array([-1.0, 1.0]))),
+        acting(lambda value, plan, gamma: np.clip(value, 0.0, 1.0) ** gamma),
+        single_column_bank(np.exp([-0.1, 0.1])),
         lambda mean, sd: (
             f"the response is bent with exponent {value_with_sd(mean[0], sd[0])}: "
             f"a half-white view reads as {100 * 0.5 ** mean[0]:.1f} % white"
@@ -63,13 +64,10 @@ def nonlinearity(kind: LightEffect, of: Extent) -> Effect:
     )
 
 
-@light_effect(
-    "dark_level",
-    Stage.OFFSET,
-    "another dark level than at the calibration",
-    ("level",),
-    is_absorbed_by_ssf=lambda plan: True,
-)
+_DARK, _GAIN = "another dark level than at the calibration", "another gain than at the calibration"
+
+
+@light_effect("dark_level", Stage.OFFSET, _DARK, ("level",), is_absorbed_by_ssf=lambda plan: True)
 def dark_level(kind: LightEffect, of: Extent) -> Effect:
     """Another dark level than at the calibration: reading + offset."""
 
@@ -80,9 +78,7 @@ def dark_level(kind: LightEffect, of: Extent) -> Effect:
     return kind.linear(of, {"offset": "reading"}, 0.01 * of.span, lambda value, theta, plan: value + theta[:, :1], says)
 
 
-@light_effect(
-    "gain", Stage.GAIN, "another gain than at the calibration", ("level",), is_absorbed_by_ssf=lambda plan: True
-)
+@light_effect("gain", Stage.GAIN, _GAIN, ("level",), is_absorbed_by_ssf=lambda plan: True)
 def gain(kind: LightEffect, of: Extent) -> Effect:
     """Another gain than at the calibration: signal x (1 + frac)."""
 
@@ -102,17 +98,11 @@ def gain_drift(kind: LightEffect, of: Extent) -> Effect:
     def since(plan: Plan) -> FloatArray:
         return np.maximum(of.origin.seconds(plan), 0.0)  # a negative time would let the exponential overflow
 
-    return kind.bind(
-        of,
-        {"frac": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")},
-        acting(lambda value, plan, frac, tau_s: value * (1 + frac * np.exp(-since(plan) / tau_s))),
-        single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 7)),
-        in_words(
-            "the signal starts {|0|} % {too strong/too weak} at time 0 and settles with a time constant of {1} s: the "
-            "lamp warms up",
-            factors=(100,),
-        ),
-    )
+    says = "the signal starts {|0|} % {too strong/too weak} at time 0 and settles with a time constant of {1} s: "
+    act = acting(lambda value, plan, frac, tau_s: value * (1 + frac * np.exp(-since(plan) / tau_s)))
+    parameters: Declared = {"frac": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")}
+    bank = single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 7))
+    return kind.bind(of, parameters, act, bank, in_words(f"{says}the lamp warms up", factors=(100,)))
 
 
 @light_effect("battery_sag", Stage.GAIN, "a signal that follows the battery", (_BATTERY,), reads=(_BATTERY,))
@@ -127,16 +117,9 @@ def battery_sag(kind: LightEffect, of: Extent) -> Effect | None:
     fall = float(np.ptp(recorded)) if recorded.size else 0.0
     if not fall > 0:
         return None
-    return kind.linear(
-        of,
-        {"per_volt": "1/V"},
-        _SHARE / fall,
-        lambda value, theta, plan: value * (1 + theta[:, :1] * _volts_above_reference(plan)),
-        in_words(
-            "the signal {loses/gains} {|0|} % for each volt that the battery falls: the lamp follows the battery",
-            factors=(100,),
-        ),
-    )
+    says = "the signal {loses/gains} {|0|} % for each volt that the battery falls: the lamp follows the battery"
+    act = acting(lambda value, plan, per_volt: value * (1 + per_volt * _volts_above_reference(plan)))
+    return kind.linear(of, {"per_volt": "1/V"}, _SHARE / fall, act, in_words(says, factors=(100,)))
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
@@ -154,15 +137,9 @@ def _volts_above_reference(plan: Plan) -> FloatArray:
 @light_effect("gain_jump", Stage.GAIN, "a sudden change of the signal's strength", ("time", "level"))
 def gain_jump(kind: LightEffect, of: Extent) -> Effect | None:
     """The lamp or lens changes suddenly: signal x (1 + frac 1(t > at_s))."""
-    return kind.step(
-        of,
-        {"frac": (_SHARE, "1")},
-        lambda value, theta, after: value * (1 + theta[:, :1] * after),
-        in_words(
-            "from {1} s on, the signal is {|0|} % {stronger/weaker}: the lamp or the lens changed suddenly",
-            factors=(100,),
-        ),
-    )
+    says = "from {1} s on, the signal is {|0|} % {stronger/weaker}: the lamp or the lens changed suddenly"
+    words = in_words(says, factors=(100,))
+    return kind.step(of, {"frac": (_SHARE, "1")}, lambda v, theta, after: v * (1 + theta[:, :1] * after), words)
 
 
 @light_effect("polarisation", Stage.GAIN, "a signal that depends on the orientation", ("orientation",))
@@ -195,49 +172,28 @@ def ambient_gradient(kind: LightEffect, of: Extent) -> Effect | None:
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame, from the origin."""
     if not (varies(of.plan.x_mm) or varies(of.plan.y_mm)):
         return None
-    at = of.origin
-    return kind.linear(
-        of,
-        {"per_mm_x": "reading/mm", "per_mm_y": "reading/mm"},
-        0.01 * of.span / of.length_mm,
-        lambda value, theta, plan: value + theta[:, :1] * (plan.x_mm - at.x_mm) + theta[:, 1:2] * (plan.y_mm - at.y_mm),
-        in_words(
-            f"the reading changes by {{0}} per 100 mm along X and by {{1}} per 100 mm along Y, {_ALIKE}: stray light "
-            "from one side",
-            *(of.reading_unit, of.reading_unit),
-            factors=(100, 100),
-        ),
-    )
+    at, unit, units = of.origin, of.reading_unit, {"per_mm_x": "reading/mm", "per_mm_y": "reading/mm"}
+    says = f"the reading changes by {{0}} per 100 mm along X and by {{1}} per 100 mm along Y, {_ALIKE}: stray light "
+    words = in_words(f"{says}from one side", unit, unit, factors=(100, 100))
+    act = acting(lambda value, plan, x, y: value + x * (plan.x_mm - at.x_mm) + y * (plan.y_mm - at.y_mm))
+    return kind.linear(of, units, 0.01 * of.span / of.length_mm, act, words)
 
 
 @light_effect("offset_drift", Stage.OFFSET, "a slow drift of all readings", ("time",), counts="time")
 def offset_drift(kind: LightEffect, of: Extent) -> Effect:
     """A slow drift: reading + per_hour t, t the plan's time since the origin in hours."""
-    return kind.linear(
-        of,
-        {"per_hour": "reading/h"},
-        0.01 * of.span / (of.duration_s / 3600),
-        lambda value, theta, plan: value + theta[:, :1] * of.origin.hours(plan),
-        in_words(
-            f"the reading {{rises/falls}} by {{|0|}} per hour, {_ALIKE}: the electronics or the room light drift",
-            of.reading_unit,
-        ),
-    )
+    says = f"the reading {{rises/falls}} by {{|0|}} per hour, {_ALIKE}: the electronics or the room light drift"
+    typical, words = 0.01 * of.span / (of.duration_s / 3600), in_words(says, of.reading_unit)
+    act = acting(lambda value, plan, per_hour: value + per_hour * of.origin.hours(plan))
+    return kind.linear(of, {"per_hour": "reading/h"}, typical, act, words)
 
 
 @light_effect("ambient_step", Stage.OFFSET, "a sudden change of the room light", ("time",))
 def ambient_step(kind: LightEffect, of: Extent) -> Effect | None:
     """Light switched on or off in the room: reading + amp 1(t > at_s)."""
-    return kind.step(
-        of,
-        {"amp": (0.01 * of.span, "reading")},
-        lambda value, theta, after: value + theta[:, :1] * after,
-        in_words(
-            f"the reading {{jumps up/drops}} by {{|0|}} at {{1}} s and stays there, {_ALIKE}: the room light changed",
-            of.reading_unit,
-        ),
-        is_thinned=False,
-    )
+    says = f"the reading {{jumps up/drops}} by {{|0|}} at {{1}} s and stays there, {_ALIKE}: the room light changed"
+    words, sizes = in_words(says, of.reading_unit), {"amp": (0.01 * of.span, "reading")}
+    return kind.step(of, sizes, lambda value, theta, after: value + theta[:, :1] * after, words, is_thinned=False)
 
 
 @light_effect("flicker", Stage.OFFSET, "a flickering lamp", ("time",), counts="time")
@@ -255,7 +211,7 @@ def flicker(kind: LightEffect, of: Extent) -> Effect | None:
     return kind.bind(
         of,
         {"amp": (amp, "reading"), "alias_hz": (alias_hz, "Hz"), "phase": (PHASE, "rad")},
-        acting(lambda value, plan, a, hz, phase: value + a * np.sin(2 * np.pi * hz * of.origin.seconds(plan) + phase)),
+        acting(lambda value, plan, a, hz, at: value + a * np.sin(2 * np.pi * hz * of.origin.seconds(plan) + at)),
         sine_and_cosine_entries(typical, np.linspace(_LOWEST_HZ, highest, n + 2)[1:-1]),
         lambda mean, sd: (
             f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], of.reading_unit)} at "
@@ -274,19 +230,11 @@ def hysteresis(kind: LightEffect, of: Extent) -> Effect | None:
     least, *more = np.unique(sign_of_motion(of.plan)).tolist()
     if not more:
         return None
-    most = more[-1]
-    return kind.linear(
-        of,
-        {"amp": "reading"},
-        0.01 * of.span,
-        lambda value, theta, plan: value + theta[:, :1] * sign_of_motion(plan),
-        in_words(
-            f"readings {_IN_DIRECTION[most]} are {{|0|}} {{higher/lower}} than those {_IN_DIRECTION[least]}, {_ALIKE}: "
-            "hysteresis",
-            of.reading_unit,
-            factors=(most - least,),
-        ),
-    )
+    way, other = _IN_DIRECTION[more[-1]], _IN_DIRECTION[least]
+    says = f"readings {way} are {{|0|}} {{higher/lower}} than those {other}, {_ALIKE}: hysteresis"
+    words = in_words(says, of.reading_unit, factors=(more[-1] - least,))
+    act = acting(lambda value, plan, amp: value + amp * sign_of_motion(plan))
+    return kind.linear(of, {"amp": "reading"}, 0.01 * of.span, act, words)
 
 
 @light_effect("lag", Stage.LAG, "a sensor that follows slowly", ("slope", "direction"))
@@ -303,15 +251,10 @@ def lag(kind: LightEffect, of: Extent) -> Effect:
         kept = np.where(tau_s > 0, np.exp(-waited_s / np.where(tau_s > 0, tau_s, 1.0)), 0.0)  # 0 where a scan begins
         return decaying_sum((1 - kept) * value, kept, longest=int(np.bincount(plan.scan).max(initial=1)))
 
-    return kind.bind(
-        of,
-        {"tau_s": (LogUniform(shortest_s, longest_s), "s")},
-        act,
-        single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7)),
-        in_words("each reading keeps part of the previous one, with a time constant of {0} s: the electronics lag"),
-        amplitudes=(),
-        absent={0: 0.0},
-    )
+    says = in_words("each reading keeps part of the previous one, with a time constant of {0} s: the electronics lag")
+    parameters: Declared = {"tau_s": (LogUniform(shortest_s, longest_s), "s")}
+    bank = single_column_bank(np.geomspace(shortest_s * 1.5, longest_s / 3, 7))
+    return kind.bind(of, parameters, act, bank, says, amplitudes=(), absent={0: 0.0})
 
 
 @light_effect("overshoot", Stage.OFFSET, "an overshoot where the light grows", ("time", "direction", "level"))
@@ -330,17 +273,14 @@ def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
         rise = np.maximum(np.diff(value, axis=1, prepend=value[:, :1]), 0.0)
         return value + theta[:, :1] * decaying_sum(rise, np.exp(-waited_s / theta[:, 1:2]), longest=value.shape[1])
 
-    above = "each rise of the signal overshoots by {0} %, which decay"
-    late = "{|0|} % of each rise of the signal comes late,"
-    return kind.bind(
-        of,
-        {"share": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")},
-        act,
-        single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 6)),
-        lambda mean, sd: in_words(f"{above if mean[0] > 0 else late} with a time constant of {{1}} s", factors=(100,))(
-            mean, sd
-        ),
-    )
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        above = "each rise of the signal overshoots by {0} %, which decay"
+        how = above if mean[0] > 0 else "{|0|} % of each rise of the signal comes late,"
+        return in_words(f"{how} with a time constant of {{1}} s", factors=(100,))(mean, sd)
+
+    parameters: Declared = {"share": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")}
+    bank = single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 6))
+    return kind.bind(of, parameters, act, bank, says)
 
 
 @light_effect("saturation", Stage.SATURATION, "readings cut off at a limit", ("level",))

@@ -401,7 +401,7 @@ def predict_runs(
     `about`: the reference fit of the diagnosis, from which its effects have their scales.
     """
     chain = cast(SystemChain, samples.chain)
-    system = chain.system.with_added_runs(table)
+    system = replace(chain.system, runs=tuple(dict.fromkeys((*chain.system.runs, *table.scan_names))))
     own = [effect.name for effect in chain.effects if has_value_per_run(effect.name)]
     longer = rebind_forms(own, system.simulator, extract_stored_fit(about), more_runs=table.scan_names)
     effects = tuple(longer.get(effect.name, effect) for effect in chain.effects)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from scipy.special import ndtri
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.diagnose_simulator import recording_from_table
@@ -243,7 +244,7 @@ class SystemRefit:
             values |= {f"{name}[{run}]": float(by_run[int(run)]) for run in table.scan_names}
         theta = np.array([[values[name] for name in system.marginals]])
         system = with_converged_step(system, table, theta, tolerance=STANDS_STILL * kind.sd)
-        self.model, self._true_z = Model(system, (), cast(Plan, table)), system.coordinates(theta)[0]
+        self.model, self._true_z = Model(system, (), cast(Plan, table)), ndtri(system.prior.to_unit_cube(theta))[0]
         self._error = self.model.predict(self._true_z[None, :])[0] - true.readings
         self._recording = recording_from_table(simulator, table)
         self._law = white_noise(len(table), least=_LEAST_SD * kind.sd)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import itertools
@@ -54,14 +55,16 @@ def call_on_read_only(function: Callable[..., Any], *given: Values) -> Any:
     except ValueError as error:
         if "read-only" not in str(error):
             raise
-    return function(*map(_CopyingDict, given))
+    return function(*(_CopyingDict({name: _copied(v) for name, v in values.items()}) for values in given))
+
+
+def call_on_views(function: Callable[..., Any], *given: Values) -> Any:
+    """Call a user's function with values by name, of which it gets read-only views."""
+    return call_on_read_only(function, *map(read_only_views, given))
 
 
 class _CopyingDict(dict[str, Any]):
     """A dict of arrays and numbers that returns a new copy of an array whenever it is asked for one."""
-
-    def __init__(self, values: Values) -> None:
-        super().__init__({name: _copied(value) for name, value in values.items()})
 
     def __getitem__(self, name: str) -> Any:
         return _copied(super().__getitem__(name))
@@ -95,74 +98,55 @@ class Caller:
     n_failed: int = 0
     interpolated: set[str] = field(default_factory=set)
     cut_short: bool = False
-    name: str = "simulate"
     on_call: Callable[[], None] = lambda: None
     _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
     _taken_together: dict[frozenset[str], bool] = field(default_factory=dict, repr=False)
 
     @classmethod
     def from_trial_calls(
-        cls,
-        simulate: Simulate,
-        samples: Values,
-        columns: Columns,
-        *,
-        per_run: tuple[str, ...],
-        broadcasts: bool,
-        name: str = "simulate",
+        cls, simulate: Simulate, samples: Values, columns: Columns, *, per_run: tuple[str, ...], broadcasts: bool
     ) -> Caller:
         """Find by trial calls the fastest way to call a function for many samples; return a caller that uses it.
 
-        `samples` are parameters by name, (n_samples, 1 or n_points) each. The function's own exception is raised if it
-        raises one at a trial call and no other gives a finite reading.
-
-        Raises
-        ------
-        ParameterError
-            If no reading is finite, or another call with the same parameters returns other readings.
-        ShapeError
-            If it does not return one number per row.
+        `samples` are parameters by name, (n_samples, 1 or n_points) each. Raises the function's own exception if it
+        raises one at a trial call and no other gives a finite reading, ParameterError if none is finite or another call
+        with the same parameters returns others, and ShapeError unless it returns one number per row.
         """
-        together = cls(simulate, broadcasts=True, name=name)
+        together, taken = cls(simulate, broadcasts=True), set(per_run)
         if broadcasts:
             readings = together(samples, columns)
             if not np.isfinite(readings).any():
                 together(samples, columns, strict=True)  # raises its own error, if there is one
-            together._require_finite_and_repeatable(readings, samples, columns)
-            return together
-        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
+            return together._if_finite_and_repeatable(readings, samples, columns)
+        one = cls(simulate, broadcasts=False, by_row=frozenset(per_run))
         alone = one(samples, columns, strict=True)
-        one._require_finite_and_repeatable(alone, samples, columns)
+        one._if_finite_and_repeatable(alone, samples, columns)
         if together._returns(alone, samples, columns):
             return together
-        taken = set(per_run)
-        for own in [
-            own for own in samples if own not in taken
-        ]:  # parameters that may be arrays (n_points,) in a call for one sample
+        for own in (own for own in samples if own not in per_run):  # may it be (n_points,) in a call for one sample?
             by_row = {**samples, own: np.broadcast_to(samples[own], alone.shape)}
             if cls(simulate, broadcasts=False, by_row=frozenset({*per_run, own}))._returns(alone, by_row, columns):
                 taken.add(own)
-        return cls(simulate, broadcasts=False, by_row=frozenset(taken), name=name)
+        return cls(simulate, broadcasts=False, by_row=frozenset(taken))
 
     def _returns(self, readings: FloatArray, samples: Values, columns: Columns) -> bool:
-        """Return whether a call for samples returns these readings; False if it raises an error."""
         try:
             return nearly_equal(self(samples, columns, strict=True), readings)
         except Exception:
             return False
 
-    def _require_finite_and_repeatable(self, readings: FloatArray, samples: Values, columns: Columns) -> None:
-        """Raise ParameterError unless readings of samples hold a finite number, and another call for one returns it."""
+    def _if_finite_and_repeatable(self, readings: FloatArray, samples: Values, columns: Columns) -> Caller:
+        """Return this caller; raise ParameterError if no reading is finite, or another call returns another one."""
         sound = np.isfinite(readings).any(axis=1)
         found = f"not finite at any of the {sound.size} points of the prior that were tried"
         allowed = "finite readings: look for empty cells, divisions by 0 and priors that are too wide"
-        require(sound.any(), self.name, found, allowed)
-        at = int(np.argmax(sound))
-        again = Caller(self.simulate, self.broadcasts, self.by_row, name=self.name)
+        require(sound.any(), "simulate", found, allowed)
+        at, again = int(np.argmax(sound)), Caller(self.simulate, self.broadcasts, self.by_row)
         same = nearly_equal(again(*_values_of_sample(samples, columns, at), strict=True), readings[[at]])
         no_state = "no random numbers (declare the noise instead), no state kept between calls"
         found = "different when it is called again with the same parameters"
-        require(same, self.name, found, f"the same readings each time: {no_state}")
+        require(same, "simulate", found, f"the same readings each time: {no_state}")
+        return self
 
     def __call__(self, parameters: Values, columns: Columns, *, strict: bool = False) -> FloatArray:
         """Simulate parameters (n_samples, 1 or n_points) over columns (n_points,) or (n_samples, n_points).
@@ -206,24 +190,22 @@ class Caller:
         self, parameters: Values, columns: Columns, shape: tuple[int, int], *, strict: bool
     ) -> FloatArray:
         """Call a broadcasting `simulate` once; if it raises, halve the samples until failing ones are alone: NaN."""
-        n_samples = shape[0]
+        n_samples, n_points = shape
         self._count_call()
         try:
-            readings = np.asarray(self._simulated(parameters, columns), dtype=np.float64)
+            readings = np.asarray(call_on_views(self.simulate, parameters, columns), dtype=np.float64)
         except Exception:
             if strict:
                 raise
             if n_samples == 1:
                 self.n_failed += 1
                 return np.full(shape, np.nan)
-            middle = n_samples // 2
-            halves = slice(0, middle), slice(middle, n_samples)
-            parts = [(take_samples(parameters, own), take_samples(columns, own)) for own in halves]
-            sizes = (middle, shape[1]), (n_samples - middle, shape[1])
-            return np.concatenate(
-                [self._call_together(*own, n, strict=False) for own, n in zip(parts, sizes, strict=True)]
-            )
-        return _readings_broadcast_to_shape(readings, shape, self.name)
+            parts = []
+            for low, high in ((0, n_samples // 2), (n_samples // 2, n_samples)):
+                p, u = (take_samples(values, slice(low, high)) for values in (parameters, columns))
+                parts.append(self._call_together(p, u, (high - low, n_points), strict=False))
+            return np.concatenate(parts)
+        return _readings_broadcast_to_shape(readings, shape)
 
     def _takes_changed_columns_together(self, parameters: Values, columns: Columns) -> bool:
         """Return whether samples may be simulated together if some columns, (n_samples, n_points), differ among them.
@@ -238,7 +220,7 @@ class Caller:
             for name in changed:  # a column, and a copy raised by about 1 % of its size
                 size = float(np.nanmax(np.abs(columns[name][0]), initial=0.0)) or 1.0
                 given[name] = np.stack([columns[name][0], 1.01 * columns[name][0] + 0.01 * size])
-            trial = Caller(self.simulate, broadcasts=True, name=self.name, _taken_together={changed: True})
+            trial = Caller(self.simulate, broadcasts=True, _taken_together={changed: True})
             try:
                 apart = [trial(*_values_of_sample(own, given, k), strict=True) for k in range(2)]
                 self._taken_together[changed] = trial._returns(np.concatenate(apart), own, given)
@@ -247,11 +229,12 @@ class Caller:
         return not changed or self._taken_together[changed]
 
     def _cached_call(self, own: Values, columns: Columns, n_points: int) -> FloatArray:
-        """Return the readings of one sample, (n_points,), by a call or from an earlier one with the same arguments."""
         known = self._known.pop(key := _digest_of_arguments(own, columns), None)
         if known is None:
             self._count_call()
-            known = _readings_broadcast_to_shape(np.array(self._simulated(own, columns), float), (n_points,), self.name)
+            known = _readings_broadcast_to_shape(
+                np.array(call_on_views(self.simulate, own, columns), float), (n_points,)
+            )
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -266,23 +249,17 @@ class Caller:
             for _, fixed in self._interpolation(own, n_points):
                 asked[_digest_of_arguments(fixed, columns)] = fixed, columns
         unknown = {key: given for key, given in asked.items() if key not in self._known}
-        for key, readings in zip(unknown, self.simulate.many(list(unknown.values())), strict=True):
+        for key, readings in zip(unknown, self.simulate.many([*unknown.values()]), strict=True):
             if readings is not None and readings.shape == (n_points,):
                 self._count_call()
                 self._known[key] = readings
-
-    def _simulated(self, parameters: Values, columns: Columns) -> Any:
-        return call_on_read_only(self.simulate, read_only_views(parameters), read_only_views(columns))
 
     def _count_call(self) -> None:
         self.n_calls += 1
         self.on_call()
 
     def _interpolation(self, own: Values, n_points: int) -> Iterator[tuple[FloatArray | None, Values]]:
-        """Yield arguments of calls for one sample, and the share of each in every reading; None for a single call.
-
-        A share is that of Lagrange's interpolation.
-        """
+        """Yield each share, by Lagrange, in the readings of a sample, None of a single call, and the call's values."""
         vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
         if not vary:
             yield None, own
@@ -311,23 +288,19 @@ class SpreadCalls:
 
     def many(self, given: Sequence[tuple[Values, Values]]) -> Iterator[FloatArray | None]:
         """Yield what it returns for each parameters and columns, in this order; None where it raises an error."""
-        chunks = [given[k :: self._n_chunks] for k in range(min(self._n_chunks, len(given)))]
-        done = list(self._executor.map(partial(_call_each, self._path), chunks))
-        return (done[k % len(done)][k // len(done)] for k in range(len(given)))
+        each, chunk = partial(_readings_or_none, self._path), max(len(given) // self._n_chunks, 1)
+        return self._executor.map(each, given, chunksize=chunk)
 
 
 _simulate_of_file: Callable[[Path], Any] = cache(lambda path: read_simulator(path).simulate)
 
 
-def _call_each(path: Path, given: Sequence[tuple[Values, Values]]) -> list[FloatArray | None]:
-    out: list[FloatArray | None] = []
-    with np.errstate(all="ignore"):
-        for each in given:
-            try:
-                out.append(np.array(call_on_read_only(_simulate_of_file(path), *map(read_only_views, each)), float))
-            except Exception:
-                out.append(None)
-    return out
+def _readings_or_none(path: Path, given: tuple[Values, Values]) -> FloatArray | None:
+    try:
+        with np.errstate(all="ignore"):
+            return np.array(call_on_views(_simulate_of_file(path), *given), float)
+    except Exception:
+        return None
 
 
 def _digest_of_arguments(own: Values, columns: Columns) -> bytes:
@@ -344,15 +317,11 @@ class ProgressWithCallCount:
     def __init__(self, progress: Progress, caller: Caller) -> None:
         self._progress, self._caller = progress, caller
         self._now = ("calling simulate", 0, 0, "")
-        caller.on_call = self._report_call_count
+        caller.on_call = lambda: self(*self._now)
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         """Report the progress of a stage."""
         self._now = stage, done, total, note
-        self._report_call_count()
-
-    def _report_call_count(self) -> None:
-        stage, done, total, note = self._now
         most = "" if self._caller.broadcasts else f" of about {MOST_CALLS:,}"
         calls = f"{self._caller.n_calls:,}{most} calls of simulate"
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
@@ -376,18 +345,15 @@ def _values_of_sample(
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
 
 
-def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
-    """Return the readings broadcast to the wanted shape; raise ShapeError if they do not fit it."""
+def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
     if readings.shape == wanted:
         return readings
     if readings.ndim == len(wanted):
-        try:
+        with contextlib.suppress(ValueError):
             return np.array(np.broadcast_to(readings, wanted))
-        except ValueError:
-            pass
     together = "for each sample and row: it is called with parameters (n_samples, 1), as vectorized = True says"
     one = together if len(wanted) > 1 else "for each row"
-    raise ShapeError(f"{name} returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")
+    raise ShapeError(f"simulate returns an array of shape {readings.shape}; allowed: {wanted}, one number {one}")
 
 
 def user_function_error(what: str, error: Exception, simulator: Simulator, columns: Columns) -> FileError:
@@ -401,8 +367,7 @@ def user_function_error(what: str, error: Exception, simulator: Simulator, colum
         what = "observe" if codes[1] in raised_in else what
     frames, name = traceback.extract_tb(error.__traceback__), simulator.source or what
     lines = [f.lineno for f in frames if f.filename in where]
-    said = message_of(error, kind=False)
-    states = "" if law is None else ", ".join(law.states)
+    said, states = message_of(error, kind=False), "" if law is None else ", ".join(law.states)
     if law is not None and (not frames or frames[-1].filename not in where):
         by_name = f"a dict with a rate for each state, under its name: {states}"
         if isinstance(error, KeyError) and error.args and error.args[0] in law.states:
@@ -413,10 +378,8 @@ def user_function_error(what: str, error: Exception, simulator: Simulator, colum
     way_out = next((out for words, out in _WAY_OUT_BY_WORDS.items() if words in said), "")
     texts = {name: values.tolist() for name, values in columns.items() if values.dtype != np.float64}
     if isinstance(error, KeyError):
-        parameters = ", ".join((*simulator.parameters, *simulator.extra))
-        allowed = (
-            f"columns {', '.join(columns) or 'none'}, parameters {parameters}{f', states {states}' if law else ''}"
-        )
+        parameters, of_law = ", ".join((*simulator.parameters, *simulator.extra)), f", states {states}" if law else ""
+        allowed = f"columns {', '.join(columns) or 'none'}, parameters {parameters}{of_law}"
     elif is_of_values and way_out:
         allowed = way_out
     elif is_of_values and texts:

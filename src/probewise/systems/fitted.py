@@ -95,25 +95,19 @@ class FittedSystem(NamedSamples):
 
     def summary(self) -> str:
         """Return a plain-text summary: simulator, effects, number of samples, noise sd, and the table of parameters."""
-        own, unit = self.simulator, self.simulator.unit
-        effects = f", with {', '.join(self.effects)}" if self.effects else ""
-        lines = [f"{own.source or 'a simulator'} of {own.reading} ({unit}){effects}; {len(self.samples)} samples"]
-        lines.append(f"noise of a new reading {np.median(self.noise_sd):.4g} {unit}")
-        return "\n".join([*lines, self.parameter_table()])
+        own, effects = self.simulator, f", with {', '.join(self.effects)}" if self.effects else ""
+        what = f"{own.source or 'a simulator'} of {own.reading} ({own.unit}){effects}; {len(self.samples)} samples"
+        noise = f"noise of a new reading {np.median(self.noise_sd):.4g} {own.unit}"
+        return "\n".join([what, noise, self.parameter_table()])
 
     def mode(self) -> dict[str, float]:
         """Return the point of highest posterior density in the priors' own coordinates, by name of the parameter.
 
         In its own coordinate, the value or its logarithm, a uniform or log-uniform prior is flat: with such priors it
         is the point of least squares. Of points that are equally high it is the one nearest to the middle of the prior.
-
-        Raises
-        ------
-        ParameterError
-            If the model is that of a diagnosis, which keeps samples only.
+        Raises ParameterError if the model is that of a diagnosis, which keeps samples only.
         """
-        allowed = "a model of `probewise fit` or fit_simulator(...).fitted; take median()"
-        require(self.best, "mode", None, allowed)
+        require(self.best, "mode", None, "a model of `probewise fit` or fit_simulator(...).fitted; take median()")
         return dict(zip(self.names, self.best, strict=True))
 
     def parameter_table(self) -> str:
@@ -126,15 +120,24 @@ class FittedSystem(NamedSamples):
         return "\n".join(lines)
 
     @property
-    def _counts_from_far_origin(self) -> bool:
-        return self.known is not None and counts_from_far_origin(self.effects, self.simulator, self.known)
-
-    @property
-    def _has_bend(self) -> bool:
-        return any(name_without_copy_suffix(name) == "nonlinearity" for name in self.effects)
+    def _rules(self) -> dict[str, int]:
+        """Rules by which its effects count and bend, by their keys in files: those of earlier versions mean others."""
+        is_far = self.known is not None and counts_from_far_origin(self.effects, self.simulator, self.known)
+        is_bent = any(name_without_copy_suffix(name) == "nonlinearity" for name in self.effects)
+        return ({"origins": _ORIGINS} if is_far else {}) | ({"bend": _BEND} if is_bent else {})
 
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""
+        known = self.known
+        bound_about = known and {
+            "time": known.table.time,
+            "run": known.table.run,
+            "columns": {name: _column_to_json(values) for name, values in known.table.columns.items()},
+            "predicted": _column_to_json(known.predicted),
+            "sd": known.sd,
+            "states": {name: _column_to_json(values) for name, values in known.states.items()},
+            "held": list(known.held),
+        }
         document = {
             "format": FORMAT,
             "version": self.version,
@@ -153,9 +156,8 @@ class FittedSystem(NamedSamples):
             "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},
             **({"mode": self.mode()} if self.best else {}),
             "level": list(self.level),
-            "bound_about": None if self.known is None else _stored_fit_to_json(self.known),
-            **({"origins": _ORIGINS} if self._counts_from_far_origin else {}),
-            **({"bend": _BEND} if self._has_bend else {}),
+            "bound_about": bound_about,
+            **self._rules,
             "notes": list(self.notes),
             "samples": self.samples.tolist(),
         }
@@ -167,13 +169,8 @@ class FittedSystem(NamedSamples):
     ) -> FittedSystem:
         """Parse the text from `to_json`; error messages name `path`.
 
-        A simulator given as its file, FILE.py, is run only if its fingerprint is that of the text.
-
-        Raises
-        ------
-        FileError
-            If the text is damaged, has another format, belongs to another simulator, or counts effects from old
-            origins.
+        A simulator given as its file, FILE.py, is run only if its fingerprint is that of the text. Raises FileError if
+        the text is damaged, has another format, belongs to another simulator, or is of an earlier version's rules.
         """
         document = parse_json_file_text(str(path), text, _WHAT)
         found = document.get("format") if isinstance(document, dict) else None
@@ -192,7 +189,14 @@ class FittedSystem(NamedSamples):
             if fitted_to != here:  # simulators made in Python have no fingerprint
                 raise FileError(path, f"fitted to {fitted_to}", f"a model of {here}, as the simulator predicts")
             _require_fingerprint(simulator.fingerprint, simulator.source, own, path)
-            samples, known = np.array(document["samples"], dtype=np.float64), document["bound_about"]
+            samples, bound = np.array(document["samples"], dtype=np.float64), document["bound_about"]
+            known = bound and StoredFit(
+                RunTable({k: _column_from_json(v) for k, v in bound["columns"].items()}, bound["time"], bound["run"]),
+                _column_from_json(bound["predicted"]),
+                float(bound["sd"]),
+                {name: _column_from_json(values) for name, values in bound["states"].items()},
+                tuple(bound["held"]),
+            )
             fitted = cls(
                 simulator,
                 names=tuple(each["name"] for each in document["parameters"]),
@@ -203,22 +207,18 @@ class FittedSystem(NamedSamples):
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
                 stiff=bool(own["stiff"]),
-                known=None if known is None else _stored_fit_from_json(known),
+                known=known,
                 best=tuple(float(value) for value in document.get("mode", {}).values()),
                 recording=str(document["recording"]["fingerprint"]),
                 source=str(document["recording"]["source"]),
                 notes=tuple(document["notes"]),
                 version=str(document["version"]),
             )
-            origins, bend = document.get("origins", 0), document.get("bend")
-            for is_older, rule in (  # samples of a drift or of a phase would mean other ones
-                (fitted._counts_from_far_origin and origins != _ORIGINS,
-                 f"(origins {origins!r}), which counted from another origin"),
-                (fitted._has_bend and bend != _BEND, f"(bend {bend!r}), whose bend had other ends"),
-            ):  # fmt: skip
-                if is_older:
+            for rule, number in fitted._rules.items():  # samples of a drift or of a phase would mean other ones
+                if (found := document.get(rule, 0)) != number:
+                    which = f"({rule} {found!r}), which counted from another origin, or whose bend had other ends"
                     allowed = "a model written by this version; diagnose again"
-                    raise FileError(path, f"written by an earlier version {rule}", allowed)
+                    raise FileError(path, f"written by an earlier version {which}", allowed)
             return fitted
         except FileError:
             raise
@@ -231,7 +231,6 @@ class FittedSystem(NamedSamples):
 
 
 def _require_fingerprint(here: str, source: str, own: Mapping[str, Any], path: object) -> None:
-    """Raise FileError unless `here`, the fingerprint of `source`, is that of the simulator `own` in the file `path`."""
     if own["fingerprint"] != here:
         found = f"fitted with {own['source']} of fingerprint {own['fingerprint']}"
         raise FileError(path, found, f"that file unchanged; {source} has {here}: diagnose or fit again")
@@ -261,37 +260,15 @@ def require_fitted_system(fitted: object) -> None:
     require_kind("fitted", fitted, FittedSystem, allowed)
 
 
-def _stored_fit_to_json(known: StoredFit) -> dict[str, Any]:
-    table = known.table
-    return {
-        "time": table.time,
-        "run": table.run,
-        "columns": {name: _column_to_json(values) for name, values in table.columns.items()},
-        "predicted": _column_to_json(known.predicted),
-        "sd": known.sd,
-        "states": {name: _column_to_json(values) for name, values in known.states.items()},
-        "held": list(known.held),
-    }
-
-
 def _column_to_json(values: NDArray[Any]) -> list[Any]:
-    """Return a column as a list for JSON: numbers, None where one is not finite; or texts."""
     if values.dtype != np.float64:
-        return [str(value) for value in values.tolist()]
+        return [*map(str, values.tolist())]
     return [value if math.isfinite(value) else None for value in values.tolist()]
-
-
-def _stored_fit_from_json(document: Mapping[str, Any]) -> StoredFit:
-    columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
-    table = RunTable(columns, document["time"], document["run"])
-    states = {name: _column_from_json(values) for name, values in document["states"].items()}
-    predicted = _column_from_json(document["predicted"])
-    return StoredFit(table, predicted, float(document["sd"]), states, tuple(document["held"]))
 
 
 def _column_from_json(values: list[Any]) -> NDArray[Any]:
     if any(isinstance(value, str) for value in values):
-        return np.array([str(value) for value in values])
+        return np.array(values, dtype=np.str_)
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 

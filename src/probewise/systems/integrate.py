@@ -1,20 +1,42 @@
-"""Integrate a law between the rows of each run, for all samples and runs at once."""
+"""Integrate a law between the rows of each run, for all samples and runs at once: by steps, or all steps at once.
+
+A trajectory of a fixed-step method satisfies s[k + 1] = step(s[k]) for every k: a system of equations whose only
+solution is what stepping gives. Newton's method solves it from a trajectory nearby. Its Jacobian is block bidiagonal,
+so an iteration is one evaluation of all steps together and one banded triangular solve. Samples near a known trajectory
+share its Jacobian (chord iterations), the others have their own; those that do not converge are left to be stepped.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, StepPart, of_columns, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
-from probewise.systems.step import FOURTH_ORDER, N_LONGER, Rosenbrock, RungeKutta, Steps, Terms
+from probewise.systems.step import FOURTH_ORDER, N_LONGER, RODAS, Rosenbrock, RungeKutta, Steps
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
+_CHORDS = 4  # iterations with the Jacobian of a known trajectory
+_NEWTONS = 8  # iterations with a sample's own Jacobian
+_HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped
+_SLOW = 0.1  # change of a chord iteration, in that of the one before, from which a sample needs its own Jacobian
+_CONVERGED = 1e-8  # largest change of a state by an iteration, in that state's largest value
+_SETTLED = 1e-12  # and by the next
+_NUDGE = 1e-7  # of each state's largest value, for the Jacobian
+_FAR = 1e-3  # change from a known trajectory, in a state's largest value, from which another one is remembered
+_MOST_NEW = 8  # trajectories remembered of one batch
+_MOST_KNOWN = 48  # trajectories remembered
+_REFUSALS = 3  # errors in a row of all steps together after which a law is only stepped; one may be of a sample far off
+_WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
+# Samples times runs up to which all steps at once cost less than one after another: near known trajectories, where two
+# evaluations of all steps suffice, and far from them, where a dozen are needed.
+_FEW_NEAR, _FEW_FAR = 300, 40
 
 
 def integrate_states(
@@ -25,20 +47,13 @@ def integrate_states(
     Parameters are (n_samples, 1), or (n_samples, n_points) if they vary by row; columns (n_points,), or
     (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
     """
-    motion = LawWithEffects(motion) if isinstance(motion, Law) else motion
-    at_row, place = steps.n_steps_before_position, steps.position_by_row
-    every = enumerate(states_by_step(motion, steps, parameters, columns))
-    known = {*at_row.tolist()}
-    kept = [s for number, s in every if number in known]
-    return {
-        state: np.stack([s[state] for s in kept], axis=1)[:, place, steps.table.scan] for state in motion.law.states
-    }
+    motion, known = LawWithEffects(motion) if isinstance(motion, Law) else motion, {*steps.n_before.tolist()}
+    kept = [s for k, s in enumerate(states_by_step(motion, steps, parameters, columns)) if k in known]
+    return dict(zip(motion.law.states, np.stack(kept, axis=2)[:, :, steps.place, steps.table.scan], strict=True))
 
 
-def states_by_step(
-    motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns
-) -> Iterator[dict[str, FloatArray]]:
-    """Integrate the law: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
+def states_by_step(motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns) -> Iterator[FloatArray]:
+    """Integrate the law: yield all states, (n_states, n_samples, n_runs), at the start and after each step."""
     s = initial_states(motion, steps, parameters, number_of_samples(parameters, columns))
     with np.errstate(all="ignore"):
         given = LawInputs(motion, steps, parameters, columns)
@@ -46,7 +61,7 @@ def states_by_step(
         for k, n in enumerate(steps.n_steps.tolist()):
             inputs = given.of_gaps(slice(k, k + 1), 1)
             for i in range(n):
-                for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n, whole=True):
+                for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n):
                     s = step_in_part(motion, steps.method, part, s)
                 yield s
 
@@ -59,24 +74,19 @@ def evaluations_per_step(motion: LawWithEffects, method: RungeKutta | Rosenbrock
     """
     if isinstance(method, Rosenbrock):
         n_stages = 13 + 2 * len(motion.law.states)  # its linear algebra included
-    elif motion.limits or motion.friction:
-        n_stages = len(method.b) if method is FOURTH_ORDER else N_LONGER * len(FOURTH_ORDER.b)
+    elif method is FOURTH_ORDER or not motion.may_halt:
+        n_stages = len(method.b)
     else:
-        return len(method.b)
+        n_stages = N_LONGER * len(FOURTH_ORDER.b)
     return n_stages + n_stages // 2 if motion.friction else n_stages
 
 
-def n_parts_of_steps(motion: LawWithEffects, steps: Steps) -> int:
-    """Return about how many steps and parts of steps are taken: a column that is late divides one in each gap."""
-    return int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))
-
-
-def initial_states(motion: LawWithEffects, steps: Steps, parameters: Values, n_samples: int) -> dict[str, FloatArray]:
-    """Return the states in which the runs start, within their bounds, by name, (n_samples, n_runs) each."""
-    start, first = {}, steps.row_by_position_and_run[:1]
-    for state, given in motion.law.states.items():
-        at = values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
-        start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
+def initial_states(motion: LawWithEffects, steps: Steps, parameters: Values, n_samples: int) -> FloatArray:
+    """Return the states in which the runs start, within their bounds, (n_states, n_samples, n_runs)."""
+    starts, first = motion.law.states.values(), steps.rows[:1]
+    start = np.empty((len(starts), n_samples, first.shape[1]))
+    for state, at in zip(start, starts, strict=True):
+        state[:] = values_at_rows(parameters[at], first)[:, 0] if isinstance(at, str) else float(at)
     return motion.clip_and_stop_states({}, start)
 
 
@@ -84,41 +94,34 @@ def initial_states(motion: LawWithEffects, steps: Steps, parameters: Values, n_s
 class Stepper:
     """Steps of a law, by a Runge-Kutta or a Rosenbrock method, with its inputs `between` two rows.
 
-    In the methods `begin` and `length` are shares of the gap: numbers, or one for each column of the states.
+    States are (n_states, n_samples, n_columns). In the methods `begin` and `length` are shares of the gap: numbers, or
+    one for each column.
     """
 
     motion: LawWithEffects
     method: RungeKutta | Rosenbrock
     between: StepInputs
 
-    def step(self, s: dict[str, Any], begin: Any, length: Any) -> dict[str, Any]:
+    def step(self, s: FloatArray, begin: Any, length: Any) -> FloatArray:
         """Return the states after a step; it is split where friction brings a state to rest or lets it go.
 
         A motion that may come to a halt within a step takes one of eighth order as several of fourth order.
         """
         motion = self.motion
-        explicit = isinstance(self.method, RungeKutta)
-        if explicit and self.method is not FOURTH_ORDER and (motion.limits or motion.friction):
+        if motion.may_halt and self.method is not FOURTH_ORDER and self.method is not RODAS:
             shorter, part = replace(self, method=FOURTH_ORDER), length / N_LONGER
             for k in range(N_LONGER):
                 s = shorter.step(s, begin + k * part, part)
             return s
-        ways = motion.directions_of_motion(s, *self.between(begin))
+        ways = motion.directions_of_motion(s, self.between(begin))
         after = self._step_without_split(s, begin, length, ways)
         for state, way in ways.items():
             after, ways = self._split_at_transitions(state, way, s, after, begin, length, ways)
-        return motion.clip_and_stop_states(ways, after) if ways or motion.limits else after
+        return motion.clip_and_stop_states(ways, after)
 
     def _split_at_transitions(
-        self,
-        state: str,
-        way: Any,
-        s: dict[str, Any],
-        after: dict[str, Any],
-        begin: Any,
-        length: Any,
-        ways: dict[str, Any],
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        self, state: int, way: Any, s: FloatArray, after: FloatArray, begin: Any, length: Any, ways: dict[int, Any]
+    ) -> tuple[FloatArray, dict[int, Any]]:
         """Split steps from `s` to `after` where friction brings a state to rest or lets it go.
 
         The state begins them in the direction `way`; `ways` are the directions of all states that `after` results from.
@@ -126,13 +129,14 @@ class Stepper:
         """
         motion, between, at_rest = self.motion, self.between, way == 0
 
-        def margin_to_transition(at: Values, share: Any) -> Any:
+        def margin_to_transition(at: FloatArray, share: Any) -> Any:
             """Return the margin, negative after the transition, until the state comes to rest or breaks loose."""
             moving = way * at[state]
             if not at_rest.any():
                 return moving
-            free = motion.rates(at, *between(share), {})[state]
-            return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
+            return np.where(
+                at_rest, motion.friction_of[state] - np.abs(motion.rates(at, between(share))[state]), moving
+            )
 
         last = margin_to_transition(after, begin + length)
         ends = last < 0
@@ -140,75 +144,40 @@ class Stepper:
             return after, ways
         n_columns, some = ends.shape[1], np.flatnonzero(ends.any(axis=0))
         if n_columns > _MANY_COLUMNS and 2 * len(some) <= n_columns:
-            few = replace(self, between=self.between.of_columns(some))
-            s, own, ends_of = ({name: v[:, some] for name, v in each.items()} for each in (s, after, ways))
+            few, ends_of = replace(self, between=between.of_columns(some)), {k: v[:, some] for k, v in ways.items()}
             begin, length = of_columns(begin, some), of_columns(length, some)
-            split = few._split_at_transitions(state, way[:, some], s, own, begin, length, ends_of)
-            return _with_columns(after, some, split[0]), _with_columns(ways, some, split[1])
+            own = (state, way[:, some], s[:, :, some], after[:, :, some], begin, length, ends_of)
+            out, ways = after.copy(), {k: v.copy() for k, v in ways.items()}
+            out[:, :, some], changed = few._split_at_transitions(*own)
+            for k, new in changed.items():
+                ways[k][:, some] = new
+            return out, ways
         first = margin_to_transition(s, begin)
         until = np.where(ends, _zero_of_straight_line(0.0, first, 1.0, last), 1.0)
-        there = self._step_without_split(s, begin, until * length, ways)
-        left = margin_to_transition(there, begin + until * length)
-        closer = np.where(
-            left > 0, _zero_of_straight_line(until, left, 1.0, last), _zero_of_straight_line(0.0, first, until, left)
-        )
+        left = margin_to_transition(self._step_without_split(s, begin, until * length, ways), begin + until * length)
+        later, earlier = (until, left, 1.0, last), (0.0, first, until, left)
+        closer = np.where(left > 0, _zero_of_straight_line(*later), _zero_of_straight_line(*earlier))
         until = np.where(ends, closer, 1.0)
         there = self._step_without_split(s, begin, until * length, ways)
         there[state] = np.where(ends, 0.0, there[state])
-        anew = motion.directions_of_motion(there, *between(begin + until * length))
-        free = motion.rates(after, *between(begin + length), {})[state]
+        anew = motion.directions_of_motion(there, between(begin + until * length))
+        free = motion.rates(after, between(begin + length))[state]
         anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
         return self._step_without_split(there, begin + until * length, (1 - until) * length, anew), anew
 
-    def _step_without_split(self, s: Values, begin: Any, length: Any, ways: Values) -> dict[str, Any]:
-        """Return the states after one step of the method, with friction against the fixed directions `ways`."""
-        method = self.method
-        if isinstance(method, Rosenbrock):
-            return method.advanced(
-                lambda at, share: self.motion.rates(at, *self.between(share), ways), s, begin, length, self.between.gap
-            )
-        width, given = self.between.gap * length, self.between(begin)
-        _, *later, end = method.terms
-        rates = [self.motion.rates(s, *given, ways)]
-        for k, terms in enumerate(later, 1):
-            if method.c[k] != method.c[k - 1]:
-                given = self.between(begin + method.c[k] * length)
-            rates.append(self.motion.rates(_advanced_states(s, width, terms, rates), *given, ways))
-        return _advanced_states(s, width, end, rates)
+    def _step_without_split(self, s: FloatArray, begin: Any, length: Any, ways: dict[int, Any]) -> FloatArray:
+        rates, between = self.motion.rates, self.between
+        return self.method.advance(lambda at, given: rates(at, given, ways), between, s, begin, length, between.gap)
 
 
-def step_in_part(
-    motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, s: dict[str, Any]
-) -> dict[str, Any]:
-    """Return the states, (n_samples, n_columns), after a part of some steps; other columns stay as they are."""
+def step_in_part(motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, s: FloatArray) -> FloatArray:
+    """Return the states, (n_states, n_samples, n_columns), after a part of some steps; other columns stay as is."""
     columns, inputs, begin, length = part
     stepper = Stepper(motion, method, inputs)
     if columns is None:
         return stepper.step(s, begin, length)
-    some = {state: values[:, columns] for state, values in s.items()}
-    return _with_columns(s, columns, stepper.step(some, begin, length))
-
-
-def _with_columns(s: Values, columns: IntArray, new: Values) -> dict[str, Any]:
-    """Return arrays by state, (n_samples, n_columns), with the values `new` in some of their columns."""
-    out = {state: values.copy() for state, values in s.items()}
-    for state, values in new.items():
-        out[state][:, columns] = values
-    return out
-
-
-def _advanced_states(s: Values, width: Any, terms: Terms, rates: Sequence[Values]) -> dict[str, Any]:
-    """Return the states after the time `width` at a constant rate, the weighted sum `terms` of `rates`."""
-    (first, weight), *others = terms
-    if not others:  # of one stage, as all of fourth order are: one product less
-        share = weight * width
-        return {state: at + share * rates[first][state] for state, at in s.items()}
-    out = {}
-    for state, at in s.items():
-        rate = weight * rates[first][state]
-        for k, w in others:
-            rate = rate + w * rates[k][state]
-        out[state] = at + width * rate
+    out = s.copy()
+    out[:, :, columns] = stepper.step(s[:, :, columns], begin, length)
     return out
 
 
@@ -216,3 +185,232 @@ def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> An
     """Return where a straight line through (low, at_low) and (high, at_high) is 0; `low` if it does not fall."""
     apart = at_low - at_high
     return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
+
+
+LawAndInputs = Callable[[IntArray], tuple[LawWithEffects, Values, Columns]]
+"""Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTrajectory:
+    """A trajectory solved over some steps, with some effects.
+
+    It has theta (n_params,), states (n_states, n_steps + 1, n_runs), and `bands`, its Jacobian, if known.
+    """
+
+    steps: Hashable
+    effects: Hashable
+    theta: FloatArray
+    states: FloatArray
+    bands: list[FloatArray] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Integrations:
+    """Memory of a law's integrations: counts, and solved trajectories, those of the last steps and effects last.
+
+    An evaluation is one of the rates of all samples and runs together. `n_failed` samples raised an error; `n_refused`
+    counts how often in a row the law raised one for all steps together, and none step by step. `cut_short` if work was
+    skipped; `too_stiff` if parameters that may fit the readings would need more integration steps than are taken.
+    """
+
+    known: list[KnownTrajectory] = field(default_factory=list, repr=False)
+    n_evaluations: int = 0
+    n_failed: int = 0
+    n_refused: int = 0
+    cut_short: bool = False
+    too_stiff: bool = False
+
+    def add(self, more: Sequence[KnownTrajectory]) -> None:
+        """Add trajectories of the same steps and effects; beyond 48 in all, drop the first."""
+        of = [(each.steps, each.effects) for each in more[:1]]
+        others, again = ([e for e in self.known if ((e.steps, e.effects) in of) is same] for same in (False, True))
+        self.known = [*others, *again, *more][-_MOST_KNOWN:]
+
+
+def integrate_from_known_trajectories(
+    law_and_inputs: LawAndInputs,
+    steps: Steps,
+    memory: Integrations,
+    *,
+    effects: Hashable,
+    theta: FloatArray,
+    n_own: int,
+) -> dict[str, FloatArray]:
+    """Integrate a law for samples, theta (n_samples, n_params); return states at the rows, (n_samples, n_points) each.
+
+    Up to 300 samples times runs are solved for all steps at once, from the trajectories in `memory` nearest to them;
+    the others, and those for which that does not converge, step by step. More trajectories are added to the memory, and
+    the evaluations that this takes. `effects` is what distinguishes the law with its effects from the same law with
+    others; the first `n_own` parameters are the system's.
+    """
+    n_samples, n_runs = len(theta), steps.gaps.shape[1]
+    motion, *given = law_and_inputs(np.arange(n_samples))
+    evaluations = evaluations_per_step(motion, steps.method)
+    n_parts = int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))  # a late column divides steps
+    if n_samples * n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
+        memory.n_evaluations += n_parts * evaluations
+        return integrate_states(motion, steps, *given)
+    states, left, cost, refused = np.zeros(0), np.arange(n_samples), 0, False
+    every = [each for each in memory.known if each.steps == steps]
+    known, width = [each for each in every if each.effects == effects], theta.shape[1]
+    if not known:  # those of other effects, compared by the system's parameters
+        known, width = every, n_own
+    if known:
+        there = np.stack([each.theta[:width] for each in known])
+        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
+        nearest = np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
+        try:
+            with np.errstate(all="ignore"):
+                solved, new = _solve_all_steps(law_and_inputs, steps, known, nearest)
+            states, left = solved.states, np.flatnonzero(~solved.done)
+            cost = -(-solved.n_evaluated // _WORTH_A_STEP)
+            own = ((theta[k].copy(), states[:, k].copy(), bands) for k, bands in new.items())
+            memory.add([KnownTrajectory(steps, effects, *each) for each in own])
+            memory.n_refused = 0
+        except Exception:  # of the law: for these samples, or for more columns than there are runs
+            refused = True
+    if left.size:
+        motion, *given = law_and_inputs(left)
+        stepped = np.stack([*states_by_step(motion, steps, *given)], axis=2)
+        memory.n_refused += refused
+        if len(left) == n_samples:
+            states = stepped
+        else:
+            states[:, left] = stepped
+        cost += n_parts
+        finite = np.flatnonzero(np.isfinite(stepped).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
+        memory.add([KnownTrajectory(steps, effects, theta[left[k]], stepped[:, k]) for k in finite])
+    memory.n_evaluations += cost * evaluations
+    at_rows = states[:, :, steps.n_before[steps.place], steps.table.scan]
+    return dict(zip(motion.law.states, at_rows, strict=True))
+
+
+def _solve_all_steps(
+    law_and_inputs: LawAndInputs, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray
+) -> tuple[_NewtonState, dict[int, list[FloatArray]]]:
+    """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known.
+
+    With the solution come up to eight converged samples that are far from the trajectories they began from, each with
+    its last Jacobian, as of `jacobian_bands`, where one was computed.
+    """
+    guess = np.stack([each.states for each in known], axis=1)[:, nearest]
+    search = _NewtonState(law_and_inputs, steps, guess.copy())
+    for _ in range(_CHORDS):  # each sample with the Jacobian of the known trajectory nearest to it
+        samples = np.flatnonzero(search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change)))
+        if not samples.size:
+            break
+        missed = search.step_residuals(samples)
+        correction = np.empty_like(missed)
+        for number in np.unique(nearest[samples]).tolist():
+            own = nearest[samples] == number
+            if not known[number].bands:
+                at = known[number].states[:, None]
+                known[number].bands.append(search.jacobian_bands(samples[own][:1], at)[0])
+            correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
+        search.apply_correction(samples, correction)
+        far = ~(search.change < _FAR)
+        if samples.size == len(nearest) and far.sum() * steps.gaps.shape[1] > _FEW_FAR:
+            search.active &= ~far
+    # A chord that led away is no better a start than the trajectory that it began from.
+    astray = search.active & ~(search.rate < 1)
+    search.states[:, astray, 1:] = guess[:, astray, 1:]
+    search.change[~search.done] = np.inf
+    last: dict[int, FloatArray] = {}
+    for k in range(_NEWTONS):  # each sample with its own Jacobian
+        if k == _HOPELESS:
+            search.active &= search.change < _SLOW
+        samples = np.flatnonzero(search.active)
+        if not samples.size:
+            break
+        bands = search.jacobian_bands(samples, search.states[:, samples])
+        correction = _solved_corrections(np.concatenate(bands), search.step_residuals(samples), shared=False)
+        last |= dict(zip(samples.tolist(), bands, strict=True))
+        search.apply_correction(samples, correction)
+    far = search.done & (_largest_relative_change(search.states - guess, guess) > _FAR)
+    return search, {k: [last[k]] if k in last else [] for k in np.flatnonzero(far)[:_MOST_NEW].tolist()}
+
+
+@dataclass(eq=False)
+class _NewtonState:
+    """State of the Newton iteration: all samples' states at every step, and the convergence of each sample.
+
+    A sample is `done` when it has converged, and `active` while it may yet.
+    """
+
+    law_and_inputs: LawAndInputs
+    steps: Steps
+    states: FloatArray
+    n_evaluated: int = 0
+
+    def __post_init__(self) -> None:
+        n_samples = self.states.shape[1]
+        self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
+        self.done, self.active = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
+        self._chosen, self._parts = np.zeros(0, dtype=np.int64), list[StepPart]()
+        self._motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
+        self.states[:, :, 0] = initial_states(self._motion, self.steps, parameters, n_samples)
+
+    def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
+        """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
+        steps, begins = self.steps, states[:, :, :-1]
+        if not np.array_equal(samples, self._chosen):
+            self._motion, parameters, columns = self.law_and_inputs(samples)
+            given = LawInputs(self._motion, steps, parameters, columns)
+            inputs = given.of_gaps(steps.gap, len(steps.gap))
+            self._parts = [*given.parts_of_steps(inputs, steps.gap, steps.begin, steps.length)]
+            self._chosen = samples
+        after = begins.reshape(len(begins), len(samples), -1)
+        for part in self._parts:
+            self.n_evaluated += len(samples) * (len(steps.begin) if part[0] is None else len(part[0]))
+            after = step_in_part(self._motion, steps.method, part, after)
+        return after.reshape(begins.shape)
+
+    def step_residuals(self, samples: IntArray) -> FloatArray:
+        """Return each step's end minus the trajectory's state there, (n_states, n, n_steps, n_runs); 0 if solved."""
+        states = self.states[:, samples]
+        return self.states_at_step_ends(samples, states) - states[:, :, 1:]
+
+    def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
+        """Return samples' Jacobians of the equations of all steps, as bands, (n_unknowns, 2 n_states) each.
+
+        They are those at states (n_states, n, n_steps + 1, n_runs). Column k holds the k-th subdiagonal; the diagonal
+        is 1 throughout, and column 0 is not used. Unknowns are ordered by run, then by step, then by state.
+        """
+        at_end = self.states_at_step_ends(samples, states)
+        n_states, n, n_steps, n_runs = at_end.shape
+        out = np.zeros((n, n_runs, n_steps, n_states, 2 * n_states))
+        for j, values in enumerate(states):
+            nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
+            before = values.copy()
+            values += nudge
+            slopes = (self.states_at_step_ends(samples, states) - at_end) / nudge
+            values[:] = before
+            for i in range(n_states):
+                out[:, :, :-1, j, n_states + i - j] = -slopes[i, :, 1:].transpose(0, 2, 1)
+        return list(out.reshape(n, -1, 2 * n_states))
+
+    def apply_correction(self, samples: IntArray, correction: FloatArray) -> None:
+        """Add a correction (n_states, n, n_steps, n_runs) to samples' states, and mark those that have converged."""
+        change = _largest_relative_change(correction, self.states[:, samples])
+        self.states[:, samples, 1:] += correction
+        with np.errstate(all="ignore"):
+            rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
+        first = ~np.isfinite(self.change[samples])
+        self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < _SETTLED)
+        self.active[samples] = np.isfinite(change) & ~self.done[samples]
+        self.change[samples], self.rate[samples] = change, rate
+
+
+def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:
+    """Return each sample's largest change of a state, relative to that state's largest absolute value, (n_samples,)."""
+    size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
+    return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
+
+
+def _solved_corrections(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
+    """Return corrections for residuals `missed`, (n_states, n_samples, n_steps, n_runs); `shared`: by one Jacobian."""
+    n_states, n_samples, n_steps, n_runs = missed.shape
+    right = missed.transpose(1, 3, 2, 0).reshape((n_samples, -1) if shared else (1, -1))
+    solved, _ = dtbtrs(bands.T, right.T, uplo="L", diag="U")
+    return np.asarray(solved.T.reshape(n_samples, n_runs, n_steps, n_states).transpose(3, 0, 2, 1))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ShapeError
-from probewise.systems.calls import call_on_read_only, read_only_views
+from probewise.systems.calls import call_on_read_only, call_on_views, read_only_views
 from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import Steps
 from probewise.systems.table import RunTable
 
 _ROUNDING = 16  # last digits of a time by which two times may differ by rounding alone
+
+_NO_WAYS: Mapping[int, Any] = MappingProxyType({})
 
 Term = Callable[[Values, Values, Values], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -64,60 +67,70 @@ class LawWithEffects:
 
     def plus(self, **more: Any) -> LawWithEffects:
         """Return the law with more `terms`, `limits` or `jumps`, or values by name, of which two of one name add up."""
-
-        def with_more(known: Any, new: Any) -> Any:
+        own: dict[str, Any] = {}
+        for what, new in more.items():
+            known = getattr(self, what)
             if isinstance(new, tuple):
-                return (*known, *new)
-            return {**known, **{name: known[name] + value if name in known else value for name, value in new.items()}}
+                own[what] = (*known, *new)
+            else:
+                own[what] = {**known, **{name: known[name] + v if name in known else v for name, v in new.items()}}
+        return replace(self, **own)
 
-        return replace(self, **{name: with_more(getattr(self, name), new) for name, new in more.items()})
+    @property
+    def may_halt(self) -> bool:
+        """Whether a state may come to a halt within a step."""
+        return bool(self.limits or self.friction)
 
-    def directions_of_motion(self, s: Values, p: Values, u: Values) -> dict[str, Any]:
-        """Return, by state with friction, the direction of motion in the next step: 1, -1, or 0 if it sticks."""
-        if not self.friction:
-            return {}
-        if all((s[state] != 0).all() for state in self.friction):
-            return {state: np.sign(s[state]) for state in self.friction}
-        free = self.rates(s, p, u, {})
-        return {
-            state: np.where(
-                s[state] != 0, np.sign(s[state]), np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0)
-            )
-            for state, size in self.friction.items()
-        }
+    @cached_property
+    def friction_of(self) -> dict[int, FloatArray]:
+        """The size of the friction by the number of the state."""
+        return {[*self.law.states].index(state): size for state, size in self.friction.items()}
 
-    def rates(self, s: Values, p: Values, u: Values, ways: Values) -> Values:
-        """Return the rates by state, from states, parameters and columns, with bounds, and friction against `ways`.
+    def directions_of_motion(self, s: FloatArray, given: tuple[Values, Values]) -> dict[int, Any]:
+        """Return, by number of the state with friction, the direction of its next motion: 1, -1, or 0 if it sticks."""
+        ways: dict[int, Any] = {state: np.sign(s[state]) for state in self.friction_of}
+        if any((way == 0).any() for way in ways.values()):
+            free = self.rates(s, given)
+            for state, size in self.friction_of.items():
+                breaks_loose = np.where(np.abs(free[state]) > size, np.sign(free[state]), 0.0)
+                ways[state] = np.where(s[state] != 0, ways[state], breaks_loose)
+        return ways
 
-        `p` and `u` are read-only, as an interpolator of `LawInputs` returns them; so are the states `s` afterwards.
+    def rates(self, s: FloatArray, given: tuple[Values, Values], ways: Mapping[int, Any] = _NO_WAYS) -> FloatArray:
+        """Return the rates of states, (n_states, n_samples, n_columns), with bounds, and friction against `ways`.
+
+        `given` are parameters and columns, read-only, as `StepInputs` returns them.
         """
-        for values in s.values():
-            values.setflags(False)  # of writing; a keyword would double the time
-        given: Values = call_on_read_only(self.law.rates, s, p, u)
-        if not (self.terms or self.friction or self.limits):
-            return given
-        out = {state: given[state] for state in self.law.states}
+        at: Any = s.view()
+        at.setflags(False)  # of writing; a keyword would double the time
+        out = np.empty(s.shape)
+        by_name, rate = dict(zip(self.law.states, at, strict=True)), dict(zip(self.law.states, out, strict=True))
+        found = call_on_read_only(self.law.rates, by_name, *given)
+        for state in rate:
+            rate[state][:] = found[state]
         for state, term in self.terms:
-            out[state] = out[state] + term(s, p, u)
-        for state, way in ways.items():
-            out[state] = np.where(way == 0, 0.0, out[state] - self.friction[state] * way)
+            rate[state] += term(by_name, *given)
+        for number, way in ways.items():
+            out[number] = np.where(way == 0, 0.0, out[number] - self.friction_of[number] * way)
         for limit in self.limits:
-            rate, at = out[limit.state], s[limit.state]
-            stopped = (at >= limit.level) & (rate > 0) if limit.upper else (at <= limit.level) & (rate < 0)
-            out[limit.state] = np.where(stopped, 0.0, rate)
+            own, here = rate[limit.state], by_name[limit.state]
+            stopped = (here >= limit.level) & (own > 0) if limit.upper else (here <= limit.level) & (own < 0)
+            lost = np.where(stopped, own, 0.0)
+            own[stopped] = 0.0
             for other, share in limit.spilt.items():
-                out[other] = out[other] + share * np.where(stopped, rate, 0.0)
+                rate[other] += share * lost
         return out
 
-    def clip_and_stop_states(self, ways: Values, after: dict[str, Any]) -> dict[str, Any]:
-        """Return the states after a step: clipped to their bounds, and 0 where they reversed against friction."""
-        for state, way in ways.items():
-            after[state] = np.where(way * after[state] < 0, 0.0, after[state])
+    def clip_and_stop_states(self, ways: Mapping[int, Any], after: FloatArray) -> FloatArray:
+        """Clip states after a step to their bounds, and set those to 0 that reversed against friction, in place."""
+        for number, way in ways.items():
+            after[number] = np.where(way * after[number] < 0, 0.0, after[number])
+        state = dict(zip(self.law.states, after, strict=True))
         for limit in self.limits:
-            bound, before = np.minimum if limit.upper else np.maximum, after[limit.state]
-            after[limit.state] = bound(before, limit.level)
+            bound, before = np.minimum if limit.upper else np.maximum, state[limit.state].copy()
+            state[limit.state][:] = bound(before, limit.level)
             for other, share in limit.spilt.items():
-                after[other] = after[other] + share * (before - after[limit.state])
+                state[other] += share * (before - state[limit.state])
         return after
 
 
@@ -127,17 +140,12 @@ def readings_of_states(law: Law, states: Values, parameters: Values, columns: Va
     if law.observe is None:
         return first
     with np.errstate(all="ignore"):
-        given = map(read_only_views, (states, parameters, columns))
-        out = np.asarray(call_on_read_only(law.observe, *given), dtype=np.float64)
+        out = np.asarray(call_on_views(law.observe, states, parameters, columns), dtype=np.float64)
     try:
         return np.array(np.broadcast_to(out, first.shape))
     except ValueError:
         allowed = f"{first.shape} or one that broadcasts to it: a number for each sample and row"
         raise ShapeError(f"observe returns an array of shape {out.shape}; allowed: {allowed}") from None
-
-
-Line = tuple[Any, Any]
-"""A value at the beginning of a gap between rows, and its rise over the gap or its slope in time."""
 
 
 def rounding_of_times(times: FloatArray) -> float:
@@ -183,7 +191,7 @@ class LateColumn:
         at = np.append(self.breaks, np.inf)[np.searchsorted(self.breaks, sought, side="right")]
         return np.asarray(at - self.shift[run] + self.dead_time)
 
-    def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> Line:
+    def line_at(self, at: FloatArray, run: IntArray, start: FloatArray) -> tuple[Any, Any]:
         """Return its straight line around the times `at`, (n_samples, n_columns): value at `start`, slope in time."""
         earlier = at - self.dead_time
         before = earlier < self.first[run]
@@ -204,46 +212,44 @@ def _of_rows(values: FloatArray, row: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """Parameters and columns, in that order, by name: `held` over a gap, read-only, or on straight `lines` over it.
+    """Parameters and columns by name, in that order, read-only: at the start of a gap, and their rise over it if any.
 
     Over a table arrays are (1 or n_samples, n_places, n_runs), those of a constant (1 or n_samples, 1, 1 or n_runs);
     of some steps (1 or n_samples, n_columns), with a column for each step and run, the runs of a step in turn, or 1.
-    `time` is the name of the time, which is always on such a line.
+    `time` is the name of the time, which always rises.
     """
 
     time: str
-    held: tuple[Values, Values]
-    lines: tuple[Mapping[str, Line], Mapping[str, Line]]
+    start: tuple[Values, Values]
+    rise: tuple[Values, Values]
 
     @property
     def gap(self) -> Any:
         """Time of the gap by the time column, which an effect on the clock changes, (1 or n_samples, n_columns)."""
-        return self.lines[1][self.time][1]
+        return self.rise[1][self.time]
 
     def __call__(self, share: Any) -> tuple[Values, Values]:
         """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
-        (p, u), (moving, sloping) = self.held, self.lines
-        return _values_on_lines(p, moving, share), _values_on_lines(u, sloping, share)
+        return _at_share(self.start[0], self.rise[0], share), _at_share(self.start[1], self.rise[1], share)
 
     def mapped(self, chosen: Callable[[Any], Any]) -> StepInputs:
         """Return them with a function applied to every array."""
-        p, u = ({name: chosen(values) for name, values in each.items()} for each in self.held)
+        p, u, dp, du = ({name: chosen(v) for name, v in each.items()} for each in (*self.start, *self.rise))
         for values in (*p.values(), *u.values()):
             values.setflags(False)
-        moving, sloping = ({name: (chosen(v), chosen(d)) for name, (v, d) in each.items()} for each in self.lines)
-        return replace(self, held=(p, u), lines=(moving, sloping))
+        return StepInputs(self.time, (p, u), (dp, du))
 
     def of_columns(self, columns: IntArray) -> StepInputs:
         """Return them in some of the columns."""
         return self.mapped(partial(of_columns, columns=columns))
 
 
-def _values_on_lines(held: Values, lines: Mapping[str, Line], share: Any) -> Values:
-    if not lines:
-        return held
-    out = dict(held)
-    for name, (low, rise) in lines.items():
-        out[name] = value = low + share * rise
+def _at_share(start: Values, rise: Values, share: Any) -> Values:
+    if not rise:
+        return start
+    out = dict(start)
+    for name, by in rise.items():
+        out[name] = value = out[name] + share * by
         value.setflags(False)  # of writing; a keyword would double the time
     return out
 
@@ -264,37 +270,27 @@ class LawInputs:
     """
 
     def __init__(self, motion: LawWithEffects, steps: Steps, parameters: Values, columns: Columns) -> None:
-        rows, table, linear = steps.row_by_position_and_run, steps.table, motion.law.hold == "linear"
-        held: dict[str, Any] = {}
-        moving: dict[str, Line] = {}
+        rows, table, linear = steps.rows, steps.table, motion.law.hold == "linear"
+        p, u, dp, du = ({} for _ in range(4))
         for name, values in parameters.items():
             for jump in motion.jumps:
                 if jump.parameter == name:  # it is added where it is, within a gap
                     values = values - jump.size * (table.time_s > jump.at)
-            own = values_at_rows(values, rows)
+            p[name] = own = values_at_rows(values, rows)
             if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
-                held[name] = own[:, :1]
+                p[name] = own[:, :1]
             elif linear:
-                moving[name] = own, np.diff(own, axis=1)
+                dp[name] = np.diff(own, axis=1)
             elif name in motion.drifts:
-                moving[name] = own, motion.drifts[name][:, :, None] * steps.gaps
-            else:
-                held[name] = own
-        still: dict[str, Any] = {}
-        sloping: dict[str, Line] = {}
+                dp[name] = motion.drifts[name][:, :, None] * steps.gaps
         for name, values in columns.items():
-            own = values_at_rows(values, rows)
+            u[name] = own = values_at_rows(values, rows)
             if name == table.time or (linear and values.dtype == np.float64):
-                sloping[name] = own, np.diff(own, axis=1)
-            else:
-                still[name] = own
-        values_at_places = read_only_views(held), read_only_views(still)
+                du[name] = np.diff(own, axis=1)
         self.steps, self.jumps = steps, motion.jumps
-        self.over_table = StepInputs(str(table.time), values_at_places, (moving, sloping))
-        self.late = {
-            name: LateColumn(table, columns[name], dead_time, linear=linear)
-            for name, dead_time in motion.dead_times.items()
-        }
+        self.over_table = StepInputs(str(table.time), (p, u), (dp, du))
+        late = motion.dead_times.items()
+        self.late = {name: LateColumn(table, columns[name], by, linear=linear) for name, by in late}
 
     def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
         """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""
@@ -307,19 +303,16 @@ class LawInputs:
 
         return self.over_table.mapped(in_gaps)
 
-    def parts_of_steps(
-        self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any, *, whole: bool
-    ) -> Iterator[StepPart]:
+    def parts_of_steps(self, inputs: StepInputs, gap: IntArray, begin: Any, length: Any) -> Iterator[StepPart]:
         """Divide steps where inputs jump or bend, a late column or a parameter with a jump; yield the parts in turn.
 
         `gap` is that of each step, (n_steps,), with the shares of it at which the step begins, and that it takes:
-        numbers, or one per step and run. Each part has all columns of the states if `whole`, so that runs are together;
-        else those alone that have one.
+        numbers, or one per step and run.
         """
         if not (self.late or self.jumps):
             yield None, inputs, begin, length
             return
-        rows, time = self.steps.row_by_position_and_run, self.steps.table.time_s
+        rows, time = self.steps.rows, self.steps.table.time_s
         run, rounding = np.tile(np.arange(rows.shape[1]), len(gap)), rounding_of_times(time)
         n_columns = len(run)
         start, gap_s = time[rows[gap]].ravel(), self.steps.gaps[gap].ravel()
@@ -341,31 +334,22 @@ class LawInputs:
             going = ~over.all(axis=0)
             if not going.any():
                 return
-            share = until
-            if not whole:
-                some = np.flatnonzero(going)
-                columns, run = columns[some], run[some]
-                start, gap_s, end, share = start[some], gap_s[some], end[some], share[:, some]
-                inputs = inputs.of_columns(some)
+            some = np.flatnonzero(going)
+            columns, run, inputs = columns[some], run[some], inputs.of_columns(some)
+            start, gap_s, end, share = start[some], gap_s[some], end[some], until[:, some]
 
     def _with_breaks(
         self, inputs: StepInputs, at: FloatArray, run: IntArray, start: FloatArray, gap_s: FloatArray
     ) -> StepInputs:
         """Return inputs with the late columns and the parameters with jumps as they are around the times `at`."""
-        (p, u), (moving, sloping) = map(dict, inputs.held), map(dict, inputs.lines)
+        (p, u), (dp, du) = map(dict, inputs.start), map(dict, inputs.rise)
         for name, late in self.late.items():
-            value, slope = late.line_at(at, run, start)
+            u[name], slope = late.line_at(at, run, start)
             if late.linear:
-                sloping[name] = value, slope * gap_s
-            else:
-                u[name] = value
+                du[name] = slope * gap_s
         for jump in self.jumps:
-            name, own = jump.parameter, jump.size * (at > jump.at)
-            if name in moving:
-                moving[name] = moving[name][0] + own, moving[name][1]
-            else:
-                p[name] = p[name] + own
-        return replace(inputs, held=(read_only_views(p), read_only_views(u)), lines=(moving, sloping))
+            p[jump.parameter] = p[jump.parameter] + jump.size * (at > jump.at)
+        return replace(inputs, start=(read_only_views(p), read_only_views(u)), rise=(dp, du))
 
 
 def of_columns(values: Any, columns: IntArray) -> Any:

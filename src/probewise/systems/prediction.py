@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -78,35 +78,23 @@ class SystemPrediction(ShowsItself):
 
     def summary(self) -> str:
         """Return a text: notes; number of predicted readings; chi-square and log density per recorded reading."""
-        found = prediction_summary(self.readings, self.mean, self.sd, self.log_density)
-        return "\n".join([*(f"note: {note}" for note in self.notes), found])
+        notes = (f"note: {note}" for note in self.notes)
+        return "\n".join([*notes, prediction_summary(self.readings, self.mean, self.sd, self.log_density)])
 
 
 def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     """Build a recording from a table, with the simulator's unit, range and step; readings are NaN without a column.
 
-    Raises
-    ------
-    ParameterError
-        If the column of the readings holds texts, or a declared sd is not positive where there is a reading.
+    Raises ParameterError if the readings are texts, or a declared sd is not positive where there is a reading.
     """
-    low, high = simulator.noise.range
-    own = replace(
-        table,
-        instrumentation=Instrumentation(
-            unit=simulator.unit, min=low, max=high, step=simulator.noise.step, controls=simulator.controls
-        ),
-    )
-    readings = table.columns.get(simulator.reading)
-    if readings is None:
-        readings = np.full(len(table), np.nan)
-    elif readings.dtype != np.float64:
+    (low, high), step, sd = simulator.noise.range, simulator.noise.step, simulator.noise.sd
+    instrument = Instrumentation(unit=simulator.unit, min=low, max=high, step=step, controls=simulator.controls)
+    readings = table.columns.get(simulator.reading, np.full(len(table), np.nan))
+    if readings.dtype != np.float64:
         allowed = "a number in each row, or nothing where it is missing"
         raise column_error(f"reading {simulator.reading!r}", readings, allowed, first=table.first_line)
-    sd = simulator.noise.sd
-    recording = RunRecording(
-        cast(Plan, own), np.array(readings), simulator.source, sd_column=sd if isinstance(sd, str) else ""
-    )
+    own, sd_column = replace(table, instrumentation=instrument), sd if isinstance(sd, str) else ""
+    recording = RunRecording(cast(Plan, own), np.array(readings), simulator.source, sd_column=sd_column)
     if recording.sd_column in table.covariates:
         values = table.covariates[recording.sd_column]
         wrong = np.flatnonzero(recording.usable & ~(np.isfinite(values) & (values > 0)))
@@ -167,7 +155,7 @@ def predict_system(
         stiff=fitted.stiff,
         limited=False,  # noise decides which readings are at an end of the range
     )
-    chain = system.chain(own, bind_effects(fitted, own))
+    chain = system.chain(own, _bound_effects(fitted, own))
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(whole)))
     given, lost = _filled_table_and_unpredictable_mask(chain, theta, whole)
@@ -214,8 +202,7 @@ def predict_system(
 def _with_recorded_rows_before(fitted: FittedSystem, table: RunTable) -> tuple[RunTable, IntArray]:
     """Put the recorded rows of a table's runs before their first rows in it first; also return their numbers, by time.
 
-    So a state, or an effect that looks back, goes on from where the recording left it. A column that the recording
-    lacks is missing in these rows.
+    A column that the recording lacks is missing in these rows.
     """
     if fitted.known is None or not (table.has_varying_time and fitted.known.table.has_varying_time):
         return table, np.zeros(0, dtype=np.int64)
@@ -241,21 +228,20 @@ def _recorded_before(
     later, last = np.arange(len(table)) + table.first_row, np.full(len(table), -1)
     n_since, usable, readings = np.zeros(len(table), dtype=np.int64), predicted, np.zeros(0)
     if fitted.known is not None and rows.size:
-        recording = as_recording(fitted.simulator, fitted.known.table)
-        recorded, readings = fitted.known.table, recording.readings[rows]
-        lost = [fitted.samples[:, k] for k, name in enumerate(fitted.names) if name == f"{dropouts.name}.value"]
+        recorded = fitted.known.table
+        recording = as_recording(fitted.simulator, recorded)
+        readings, values = recording.readings[rows], fitted.samples.T
+        lost = [own for own, name in zip(values, fitted.names, strict=True) if name == f"{dropouts.name}.value"]
         usable = predicted & (recording.usable & ~recording.censored)[rows] & ~np.isin(readings, lost)
         run = np.array(recorded.scan_names)[recorded.scan[rows]]
-        gap = recorded.median_gap
         for name, own in zip(table.scan_names, table.rows_by_scan(), strict=True):
             before = np.flatnonzero(run == name)
-            if not usable[before].any():
-                continue
-            last[own] = before[usable[before]][-1]
-            order = np.argsort(np.argsort(table.time_s[own], kind="stable")) + 1
-            elapsed = table.time_s[own] - recorded.time_s[rows[last[own]]]
-            in_rows = np.round(elapsed / gap).astype(np.int64)
-            n_since[own] = np.maximum(order + np.count_nonzero(before > last[own[0]]), in_rows)
+            if usable[before].any():
+                last[own] = before[usable[before]][-1]
+                order = np.argsort(np.argsort(table.time_s[own], kind="stable")) + 1
+                in_rows = (table.time_s[own] - recorded.time_s[rows[last[own]]]) / recorded.median_gap
+                n_of_run = order + np.count_nonzero(before > last[own[0]])
+                n_since[own] = np.maximum(n_of_run, np.round(in_rows).astype(np.int64))
     return RecordedBefore(rows, usable, later, last, n_since), readings
 
 
@@ -267,12 +253,12 @@ def _first_times(table: RunTable) -> dict[str, float]:
 def _note_on_runs_started_again(fitted: FittedSystem, table: RunTable) -> tuple[str, ...]:
     """Return a note where a law starts runs again that may have been recorded before their first rows here; else ().
 
-    A model without the recorded rows cannot tell. Runs that begin at time 0, or that have values of their own of which
-    none is recorded, are new ones.
+    Runs that begin at time 0, or that have values of their own of which none is recorded, are new ones.
     """
     if fitted.simulator.law is None or fitted.known is not None or fitted.recording == table_digest(table):
         return ()
-    known = {name.partition("[")[2][:-1] for name in fitted.names if name.partition("[")[0] in fitted.simulator.per_run}
+    own = (name.partition("[") for name in fitted.names)
+    known = {run[:-1] for name, _, run in own if name in fitted.simulator.per_run}
     again = [name for name, time in _first_times(table).items() if time > 0 and (not known or name in known)]
     runs = f"run{'s' * (len(again) > 1)} {', '.join(again)}" if table.run else "the run"
     how = "started again at its first row here, as `states` says; give the recorded rows before it to go on from them"
@@ -285,23 +271,17 @@ def _chain_with_converged_step(chain: SystemChain, theta: FloatArray, table: Run
     The step was chosen for the likeliest parameters and the gaps between the rows of the recording. Over longer gaps,
     and at the fastest rates that the samples hold, an integration may run away.
     """
-    effects = cast(Sequence[Effect], chain.effects)
+    effects, tolerance = cast(Sequence[Effect], chain.effects), STANDS_STILL * noise_sd
     extreme = theta[np.unique([theta.argmin(axis=0), theta.argmax(axis=0)])]
     try:
-        system = with_converged_step(
-            chain.system, table, extreme, effects, tolerance=STANDS_STILL * noise_sd, or_finest=True
-        )
+        system = with_converged_step(chain.system, table, extreme, effects, tolerance=tolerance, or_finest=True)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return chain
     return chain if system is chain.system else system.chain(table, effects)
 
 
 def _number_of_first_row(fitted: FittedSystem, recording: RunRecording) -> int:
-    """Return the number of a table's first row, counted from the first row of the recording of the fit.
-
-    A table that begins with the recording's rows, or is a contiguous part of them, readings included, is that
-    recording; any other comes after its end.
-    """
+    """Return the number of a table's first row, counted from the first row of the recording of the fit, as above."""
     reading, known = fitted.simulator.reading, fitted.known
     if known is None:
         return 0
@@ -327,10 +307,9 @@ def _filled_table_and_unpredictable_mask(
 ) -> tuple[RunTable, BoolArray]:
     """Interpolate the missing cells that predictions need, and find the rows that cannot be predicted without them.
 
-    Returns the table with these cells interpolated within runs, for effects with a memory in the rows after, and the
-    mask of the rows without a prediction, (n_points,): those that lack a cell which the simulator or an effect needs,
-    and those for which the simulator alone gives none, as a law from there to the end of the run. Raises ParameterError
-    if no row can be predicted.
+    Returns the table with these cells interpolated within runs, and the mask of the rows without a prediction,
+    (n_points,): those that lack a cell which the simulator or an effect needs, and those for which the simulator alone
+    gives none, as a law from there to the end of the run. Raises ParameterError if no row can be predicted.
     """
     few, lost, needed = theta[:_FEW], np.zeros(len(table), dtype=np.bool_), list[str]()
     filled = _interpolated_inputs(chain.system.simulator, table)
@@ -350,12 +329,11 @@ def _filled_table_and_unpredictable_mask(
 
 
 def _interpolated_inputs(simulator: Simulator, table: RunTable) -> dict[str, FloatArray]:
-    """Return, by name, the columns with missing cells, except readings and their sd, interpolated within runs."""
     columns = simulator.inputs(table.covariates).items()
     return {name: table.interpolated_within_runs(v) for name, v in columns if not np.isfinite(v).all()}
 
 
-def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
+def _bound_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
     """Bind the effects of a fitted simulator to the runs of a table, in the order of `fitted.effects`.
 
     Raises ParameterError if a column that an effect reads is missing, time falls within a run and an effect depends on
@@ -376,16 +354,12 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[Effect]:
             there = f"the table has {', '.join(table.columns)}"
             allowed = f"numbers in this column, which an effect of the model reads; {there}"
             raise ParameterError(f"column {min(lacking)!r}", "missing or without numbers", allowed)
-    seen = () if known is None else known.table.scan_names
-    own: dict[str, Callable[[], Any]] = {
-        **EFFECTS,
-        random_walk.name: random_walk,
-        noise_per_run.name: lambda: noise_of_runs(tuple(dict.fromkeys((*seen, *table.scan_names)))),
-    }
+    runs = dict.fromkeys((*(() if known is None else known.table.scan_names), *table.scan_names))
+    of_noise = {random_walk.name: random_walk(), noise_per_run.name: noise_of_runs(tuple(runs))}
     for name in fitted.effects:
-        is_known = name in forms or name in own
+        is_known = name in forms or name in of_noise or name in EFFECTS
         require(is_known, "effects", name, "an effect that this version knows; diagnose again with it")
-    return [forms[name] if name in forms else own[name]() for name in fitted.effects]
+    return [forms.get(name) or of_noise.get(name) or EFFECTS[name]() for name in fitted.effects]
 
 
 def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
@@ -406,11 +380,9 @@ def _smoothing_width_by_row(chain: SystemChain, theta: FloatArray, table: RunTab
 def _chain_samples_and_whether_drawn(
     fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
 ) -> tuple[FloatArray, bool]:
-    """Arrange the samples by the columns of a chain, and draw the parameters of runs outside the recording.
+    """Arrange the samples by the columns of a chain, (n_samples, n_params); also return whether any were drawn.
 
-    Returns
-    -------
-    The samples, (n_samples, n_params), and whether any parameter was drawn.
+    Drawn are the parameters of runs outside the recording.
     """
     at = {name: k for k, name in enumerate(fitted.names)}
     n, system, is_drawn = len(fitted.samples), chain.system, False
@@ -455,7 +427,6 @@ def draw_value_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> Fl
 def _noise_parameters(
     fitted: FittedSystem, chain: SystemChain, theta: FloatArray, mean: FloatArray, sd: FloatArray, table: RunTable
 ) -> NoiseParameters:
-    """Return the noise of each sample's readings: sd, scaled by a declared sd column, with noise effects applied."""
     low, high = fitted.level
     seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
     declared = fitted.simulator.noise.sd

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,19 +70,21 @@ class Noise:
         """Build from a user's dict with some of "sd", "step", "range", "zero"; a Noise is returned as it is."""
         if isinstance(given, Noise):
             return given
-        if not isinstance(given, Mapping) or given.keys() - {"sd", "step", "range", "zero"}:
-            meant = f"; was {{'sd': {given}}} meant?" if isinstance(given, int | float) else ""
-            raise ParameterError("noise", given, f'a dict with some of "sd", "step", "range", "zero"{meant}')
-        return cls(**given)
+        meant = f"; was {{'sd': {given}}} meant?" if isinstance(given, int | float) else ""
+        is_dict = isinstance(given, Mapping) and not given.keys() - {"sd", "step", "range", "zero"}
+        require(is_dict, "noise", given, f'a dict with some of "sd", "step", "range", "zero"{meant}')
+        return cls(**cast(Mapping[str, Any], given))
 
     def __post_init__(self) -> None:
-        is_sd = self.sd is None or isinstance(self.sd, str) or _is_positive_number(self.sd)
+        is_sd = self.sd is None or isinstance(self.sd, str) or (_is_finite_number(self.sd) and self.sd > 0)
         require(is_sd, 'noise["sd"]', self.sd, "a number greater than 0, the name of a column, or None")
-        is_step = self.step is None or _is_positive_number(self.step)
+        is_step = self.step is None or (_is_finite_number(self.step) and self.step > 0)
         require(is_step, 'noise["step"]', self.step, "a number greater than 0, or None")
         require(_is_finite_number(self.zero), 'noise["zero"]', self.zero, "a finite number, the reading at zero signal")
         is_pair = isinstance(self.range, Sequence) and not isinstance(self.range, str) and len(self.range) == 2
-        rises = is_pair and all(_is_number(end) for end in self.ends) and self.ends[0] < self.ends[1]
+        numbers = (int, float, np.integer, np.floating)
+        are_numbers = is_pair and all(isinstance(e, numbers) and not isinstance(e, bool) for e in self.ends)
+        rises = are_numbers and self.ends[0] < self.ends[1]
         require(rises, 'noise["range"]', self.range, "(low, high) with low < high; None for an open end")
         object.__setattr__(self, "range", tuple(self.range))
 
@@ -179,11 +181,10 @@ class Simulator:
     fingerprint: str = ""
 
     def __post_init__(self) -> None:
-        if (self.simulate is None) == (self.law is None):
-            found = "neither" if self.simulate is None else "both"
-            from_python = "simulate=..., or law=Law(states, rates)"
-            in_a_file = "def simulate(p, data), or states and def rates(s, p, u)"
-            raise ParameterError("simulate, rates", found, f"one of them: {from_python}; in a file {in_a_file}")
+        found, from_python = "neither" if self.simulate is None else "both", "simulate=..., or law=Law(states, rates)"
+        in_a_file = "def simulate(p, data), or states and def rates(s, p, u)"
+        allowed = f"one of them: {from_python}; in a file {in_a_file}"
+        require((self.simulate is None) != (self.law is None), "simulate, rates", found, allowed)
         checked_text("reading", self.reading, 'the name of the column that is predicted: reading = "..."')
         require_kind("unit", self.unit, str, 'a text: unit = "..."')
         checked_text("time_unit", self.time_unit, 'a text, such as "min"')
@@ -197,23 +198,25 @@ class Simulator:
             require_kind("law", self.law, Law, "a law of motion: Law(states, rates)")
         require_mapping("parameters", self.parameters, "the prior of each by name: {'tau_s': ('log', 1, 1000)}")
         require(self.parameters, "parameters", {}, "one parameter or more, each with its prior")
-        priors = {name: parse_prior(f"parameters[{name!r}]", prior) for name, prior in self.parameters.items()}
-        object.__setattr__(self, "parameters", priors)
-        object.__setattr__(self, "per_run", checked_texts("per_run", self.per_run, "names of parameters"))
-        object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
-        object.__setattr__(self, "noise", Noise.of(self.noise))
-        require_mapping("extra", self.extra, "effects by name: {'drag': Extra(prior, null, says)}")
         names = ", ".join(self.parameters)
-        for name in self.per_run:
+        priors = {name: parse_prior(f"parameters[{name!r}]", prior) for name, prior in self.parameters.items()}
+        given: dict[str, Any] = {
+            "parameters": priors,
+            "per_run": checked_texts("per_run", self.per_run, "names of parameters"),
+            "controls": checked_texts("controls", self.controls, "names of columns"),
+            "noise": Noise.of(self.noise),
+        }
+        for name in given["per_run"]:
             require(name in self.parameters, "per_run", name, f"a parameter: {names}")
         allowed = 'nothing, or run = "..." with the column that names the runs'
-        require(not self.per_run or self.run is not None, "per_run", list(self.per_run), allowed)
+        require(not given["per_run"] or self.run is not None, "per_run", list(given["per_run"]), allowed)
         if self.law is not None:
             require(self.time is not None, "time", None, "the column of time, which rates are integrated over")
             for state, start in self.law.states.items():
                 is_start = start in self.parameters if isinstance(start, str) else _is_finite_number(start)
                 require(is_start, f"states[{state!r}]", start, f"a number or a parameter: {names}")
-        own = {}
+        require_mapping("extra", self.extra, "effects by name: {'drag': Extra(prior, null, says)}")
+        own = given["extra"] = {}
         for name, effect in self.extra.items():
             require_kind(f"extra[{name!r}]", effect, Extra, "an Extra(prior, null, says), of probewise.systems")
             own[name] = replace(effect, prior=parse_prior(f"extra[{name!r}].prior", effect.prior))
@@ -222,7 +225,8 @@ class Simulator:
             require(name not in self.parameters, "extra", name, "names that no parameter has")
             allowed = f"names that no effect of this program has: {', '.join(_TAKEN)}"
             require(name not in _TAKEN, "extra", name, allowed)
-        object.__setattr__(self, "extra", own)
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
 
     def inputs(self, columns: Columns) -> dict[str, NDArray[Any]]:
         """Return columns by name without the reading and its declared sd."""
@@ -245,26 +249,14 @@ def read_table_for(simulator: Simulator, path: str | os.PathLike[str]) -> RunTab
 
 
 def _is_finite_number(value: object) -> bool:
-    """Return whether a value is a finite number, or an array without an axis that holds one."""
     array = np.asarray(value)
     return array.ndim == 0 and array.dtype.kind in "biuf" and bool(np.isfinite(array))
-
-
-def _is_positive_number(value: object) -> bool:
-    return _is_finite_number(value) and float(value) > 0  # type: ignore[arg-type]  # it is a number
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     """Run a user's file and return the simulator that it describes.
 
-    Raises
-    ------
-    FileError
-        If it cannot be read or run, or is inconsistent; the message names the line, if there is one.
+    Raises FileError if it cannot be read or run, or is inconsistent; the message names the line, if there is one.
     """
     path = checked_path("path", path, "the name of a Python file that describes a simulator")
     return run_simulator_text(read_text(path, "a Python file that describes a simulator"), path)
@@ -278,8 +270,22 @@ def fingerprint_of_text(text: str) -> str:
 def run_simulator_text(text: str, path: Path) -> Simulator:
     """Run the text of a user's file, as `read_simulator` does."""
     said = run_python_text(text, path)
+    functions = (said.get(name) for name in ("simulate", "rates", "observe"))
+    simulate, rates, observe = (cast(Any, raising_exceptions(f) if callable(f) else f) for f in functions)
+    given: dict[str, Any] = dict.fromkeys(("reading", "unit", "parameters"))
+    given |= {name: said[name] for name in _OF_SYSTEM if name in said}
     try:
-        return _build_simulator(said, path, text)
+        law, extra, effects = None, said.get("extra", {}), {}
+        require_mapping("extra", extra, 'effects by name, each a dict with "prior", "null" and "says"')
+        if "rates" in said or "states" in said:
+            of_law: dict[str, Any] = {"states": None} | {name: said[name] for name in _OF_LAW if name in said}
+            law = Law(rates=rates, observe=observe, **of_law)
+        for name, own in extra.items():
+            is_whole = isinstance(own, Mapping) and own.keys() == {"prior", "null", "says"}
+            require(is_whole, f"extra[{name!r}]", own, 'a dict with "prior", "null" and "says"')
+            effects[name] = Extra(own["prior"], float(own["null"]), str(own["says"]))
+        given |= {"vectorized": bool(said.get("vectorized", False)), "source": printable(path.name)}
+        return Simulator(simulate=simulate, law=law, extra=effects, fingerprint=fingerprint_of_text(text), **given)
     except ParameterError as error:
         found = f"{error.name} is {shown(error.value)}" if error.value is not None else f"{error.name} is missing"
         like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []
@@ -288,30 +294,3 @@ def run_simulator_text(text: str, path: Path) -> Simulator:
     except Exception as error:  # objects of the file may raise anything
         found = f"what it says does not fit together ({message_of(error)})"
         raise FileError(path, found, f"these names: {', '.join(_NAMES)}") from error
-
-
-def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
-    def function(name: str) -> Any:
-        return raising_exceptions(said[name]) if callable(said.get(name)) else said.get(name)
-
-    law, extra = None, said.get("extra", {})
-    require_mapping("extra", extra, 'effects by name, each a dict with "prior", "null" and "says"')
-    if "rates" in said or "states" in said:
-        given: dict[str, Any] = {"states": None} | {name: said[name] for name in _OF_LAW if name in said}
-        law = Law(rates=function("rates"), observe=function("observe"), **given)
-    given = dict.fromkeys(("reading", "unit", "parameters")) | {name: said[name] for name in _OF_SYSTEM if name in said}
-    return Simulator(
-        simulate=function("simulate"),
-        law=law,
-        extra={name: _parse_extra(name, each) for name, each in extra.items()},
-        vectorized=bool(said.get("vectorized", False)),
-        source=printable(path.name),
-        fingerprint=fingerprint_of_text(text),
-        **given,
-    )
-
-
-def _parse_extra(name: str, given: object) -> Extra:
-    if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
-        raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
-    return Extra(given["prior"], float(given["null"]), str(given["says"]))

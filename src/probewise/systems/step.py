@@ -8,7 +8,7 @@ need no product with the Jacobian (equation 7.25).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -44,53 +44,51 @@ _LATER = 1e-4  # of a step, for the rates' change with time: inputs between rows
 # Evaluations of the eighth order, in those of the fourth, up to which its far smaller error is worth them.
 _DEARER = 1.5
 
-Rates = Callable[[Mapping[str, Any], Any], Mapping[str, Any]]
-"""Rate of each state, from states (n_samples, n_runs) and a share of the gap between two rows."""
+Rates = Callable[[FloatArray, Any], FloatArray]
+"""Rate of each state, (n_states, n_samples, n_columns), from states of that shape and the inputs at some time."""
+
+Between = Callable[[Any], Any]
+"""Inputs at a share of the gap between two rows: a number, or one for each column of the states."""
 
 
 @dataclass(frozen=True)
 class Rosenbrock:
-    """The method RODAS; one step is one linear system for each sample and run, solved six times."""
+    """The method RODAS; one step is one linear system for each sample and column, solved six times."""
 
-    def advanced(self, rates: Rates, s: Mapping[str, Any], begin: Any, length: Any, gap: FloatArray) -> dict[str, Any]:
-        """Return the states after a step from `s`, (n_samples, n_runs) each, by name.
+    def advance(
+        self, rates: Rates, between: Between, s: FloatArray, begin: Any, length: Any, gap: FloatArray
+    ) -> FloatArray:
+        """Return the states after a step from `s`, (n_states, n_samples, n_columns).
 
-        `begin` and `length` are shares of the `gap`, the time from row to row, (1 or n_samples, n_runs): numbers, or
-        one for each run.
+        `begin` and `length` are shares of the `gap`, the time from row to row, (1 or n_samples, n_columns): numbers, or
+        one for each column.
         """
-        names, shape = list(s), np.broadcast_shapes(gap.shape, *(np.shape(values) for values in s.values()))
-        n = len(names)
+        n, *shape = s.shape
         width = np.broadcast_to(gap * length, shape)
         there = width > 0  # runs that ended stand still
         step = np.where(there, width, 1.0)
-
-        def rates_at(states: FloatArray, share: Any) -> FloatArray:
-            found = rates(dict(zip(names, states, strict=True)), share)
-            return np.stack([np.broadcast_to(found[name], shape) for name in names])
-
-        start = np.stack([np.broadcast_to(s[name], shape) for name in names])
-        first = rates_at(start, begin)
-        size = np.maximum(np.abs(start), np.abs(step * first))
+        given = between(begin)
+        first = rates(s, given)
+        size = np.maximum(np.abs(s), np.abs(step * first))
         nudge = _NUDGE * np.maximum(size, np.maximum(_LEAST_SIZE * size.max(axis=0), _TINY))
-        matrix = np.empty((n, n, *shape))
+        matrix = np.empty((n, *s.shape))
         for k in range(n):
-            less, more = start.copy(), start.copy()
+            less, more = s.copy(), s.copy()
             less[k] -= nudge[k]
             more[k] += nudge[k]
-            matrix[:, k] = (rates_at(more, begin) - rates_at(less, begin)) * (-step / (more[k] - less[k]))
+            matrix[:, k] = (rates(more, given) - rates(less, given)) * (-step / (more[k] - less[k]))
             matrix[k, k] += 1 / _GAMMA
         inverse = _inverse(matrix)
-        by_time = (rates_at(start, begin + _LATER * length) - first) / _LATER  # times the step's length
+        by_time = (rates(s, between(begin + _LATER * length)) - first) / _LATER  # times the step's length
         u: list[FloatArray] = []
-        at = start
+        at = s
         for k, (c, alpha, gamma) in enumerate(zip(_C, _ALPHA, _GAMMA_SUMS, strict=True)):
             if k:
-                at = _with_weighted(start, _A[k], u) if k < len(_A) else at + u[-1]
-            rate = first if k == 0 else rates_at(at, begin + alpha * length)
+                at = _with_weighted(s, _A[k], u) if k < len(_A) else at + u[-1]
+            rate = first if k == 0 else rates(at, between(begin + alpha * length))
             right = _with_weighted(step * (rate + gamma * by_time), c, u)
             u.append(inverse[0, 0] * right if n == 1 else np.einsum("ij...,j...->i...", inverse, right))
-        end = np.where(there, at + u[-1], start)
-        return dict(zip(names, end, strict=True))
+        return np.where(there, at + u[-1], s)
 
 
 RODAS = Rosenbrock()
@@ -121,10 +119,6 @@ def _inverse(matrices: FloatArray) -> FloatArray:
     return np.moveaxis(np.where(fine, inverse, np.nan), (-2, -1), (0, 1))
 
 
-Terms = tuple[tuple[int, float], ...]
-"""The stages of a sum of rates that have a weight, and their weights."""
-
-
 @dataclass(frozen=True)
 class RungeKutta:
     """Coefficients of a method: stages `a`, weights `b`, and the share `c` of the step at which each stage is."""
@@ -134,9 +128,28 @@ class RungeKutta:
     c: tuple[float, ...]
 
     @cached_property
-    def terms(self) -> tuple[Terms, ...]:
-        """The earlier stages whose rates lead to each stage, then those whose rates lead to the end of the step."""
-        return tuple(tuple((k, w) for k, w in enumerate(weights) if w) for weights in (*self.a, self.b))
+    def terms(self) -> list[list[tuple[int, float]]]:
+        """The earlier stages with a weight, and it, of each stage but the first, then of the end of the step."""
+        return [[(k, w) for k, w in enumerate(weights) if w] for weights in (*self.a[1:], self.b)]
+
+    def advance(
+        self, rates: Rates, between: Between, s: FloatArray, begin: Any, length: Any, gap: FloatArray
+    ) -> FloatArray:
+        """Return the states after a step, as `Rosenbrock.advance` does."""
+        width, given, at = gap * length, between(begin), s
+        known = [rates(s, given)]
+        for k, ((first, weight), *others) in enumerate(self.terms, 1):
+            if not others:  # of one stage, as all of fourth order are: one product less
+                at = s + weight * width * known[first]
+            else:
+                rate = weight * known[first]
+                for stage, w in others:
+                    rate += w * known[stage]
+                at = s + width * rate
+            if k < len(self.c):
+                given = given if self.c[k] == self.c[k - 1] else between(begin + self.c[k] * length)
+                known.append(rates(at, given))
+        return at
 
 
 FOURTH_ORDER = RungeKutta(((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))
@@ -170,78 +183,42 @@ def cheapest_steps(n_steps: IntArray) -> tuple[IntArray, RungeKutta]:
 class Steps:
     """Integration steps over the rows of a table, in all its runs together; position k is the k-th row of every run.
 
-    No step is longer than `max_step`, in the unit of time, at fourth order. The method is linearly implicit if `stiff`,
-    else explicit.
+    `rows` are the table's rows at each position of each run, (n_places, n_runs), after its end the run's last; `place`
+    is the position of each row, (n_points,). From a position to the next is a gap, of time `gaps`, (n_places - 1,
+    n_runs), with the same number of steps in all runs, `n_steps`, (n_places - 1,), which the `method` takes.
+    `n_before` are the steps from the first row of a run to its row at each position, (n_places,); `gap` is that in
+    which each step lies, (n_steps,), and `begin` and `length` are the shares of it at which it begins and that it
+    takes, (n_steps * n_runs,), by step, then run.
     """
 
     table: RunTable
-    max_step: float = np.inf
-    stiff: bool = False
-
-    @cached_property
-    def row_by_position_and_run(self) -> IntArray:
-        """Row of the table at each position of each run, (n_places, n_runs); after its end, a run's last row.
-
-        Raises ParameterError if time decreases within a run.
-        """
-        self.table.require_rising_time()
-        by_run = self.table.rows_by_scan()
-        longest = max(map(len, by_run))
-        return np.stack([np.append(rows, np.full(longest - len(rows), rows[-1])) for rows in by_run], axis=1)
-
-    @cached_property
-    def position_by_row(self) -> IntArray:
-        """Position of each row in its run, (n_points,)."""
-        place = np.empty(len(self.table), dtype=np.int64)
-        for rows in self.table.rows_by_scan():
-            place[rows] = np.arange(len(rows))
-        return place
-
-    @property
-    def n_runs(self) -> int:
-        """Number of runs."""
-        return int(self.row_by_position_and_run.shape[1])
-
-    @cached_property
-    def gaps(self) -> FloatArray:
-        """Time from each position to the next, (n_places - 1, n_runs), in the unit of time."""
-        return np.diff(self.table.time_s[self.row_by_position_and_run], axis=0)
-
-    @cached_property
-    def _n_steps_and_method(self) -> tuple[IntArray, RungeKutta | Rosenbrock]:
-        longest = self.gaps.max(axis=1, initial=0.0)
-        n_steps = np.maximum(np.ceil(longest / self.max_step - 1e-9), 1).astype(np.int64)
-        return (n_steps, RODAS) if self.stiff else cheapest_steps(n_steps)
-
-    @property
-    def n_steps(self) -> IntArray:
-        """Number of steps in each gap, from a position to the next, the same in all runs, (n_places - 1,)."""
-        return self._n_steps_and_method[0]
-
-    @property
-    def method(self) -> RungeKutta | Rosenbrock:
-        """The method that takes the steps."""
-        return self._n_steps_and_method[1]
-
-    @cached_property
-    def gap_of_step(self) -> IntArray:
-        """Number of the gap in which each step lies, (n_steps,); gap k is between rows k and k + 1 of every run."""
-        return np.repeat(np.arange(len(self.n_steps)), self.n_steps)
-
-    @cached_property
-    def n_steps_before_position(self) -> IntArray:
-        """Number of steps from the first row of a run to its row at each position, (n_places,)."""
-        return np.concatenate([[0], np.cumsum(self.n_steps)])
-
-    @cached_property
-    def begin_and_length(self) -> tuple[FloatArray, FloatArray]:
-        """Shares of its gap at which each step begins, and that it takes, (n_steps * n_runs,), by step, then run."""
-        gap = self.gap_of_step
-        share = (np.arange(len(gap)) - self.n_steps_before_position[gap]) / self.n_steps[gap]
-        return np.repeat(share, self.n_runs), np.repeat(1.0 / self.n_steps[gap], self.n_runs)
+    rows: IntArray
+    place: IntArray
+    gaps: FloatArray
+    n_steps: IntArray
+    method: RungeKutta | Rosenbrock
+    n_before: IntArray
+    gap: IntArray
+    begin: FloatArray
+    length: FloatArray
 
 
 @lru_cache(maxsize=16)
 def steps_for_table(table: RunTable, max_step: float, *, stiff: bool = False) -> Steps:
-    """Return the `Steps` of an integration over a table."""
-    return Steps(table, max_step, stiff)
+    """Return the steps over a table, none longer than `max_step`, in the unit of time, at fourth order.
+
+    The method is linearly implicit if `stiff`, else explicit. Raises ParameterError if time decreases within a run.
+    """
+    table.require_rising_time()
+    by_run, place = table.rows_by_scan(), np.empty(len(table), dtype=np.int64)
+    longest = max(map(len, by_run))
+    rows = np.stack([np.append(own, np.full(longest - len(own), own[-1])) for own in by_run], axis=1)
+    for own in by_run:
+        place[own] = np.arange(len(own))
+    gaps = np.diff(table.time_s[rows], axis=0)
+    n_steps = np.maximum(np.ceil(gaps.max(axis=1, initial=0.0) / max_step - 1e-9), 1).astype(np.int64)
+    n_steps, method = (n_steps, RODAS) if stiff else cheapest_steps(n_steps)
+    n_before, gap = np.append(0, np.cumsum(n_steps)), np.repeat(np.arange(len(n_steps)), n_steps)
+    share = (np.arange(len(gap)) - n_before[gap]) / n_steps[gap]
+    of_runs = (np.repeat(each, len(by_run)) for each in (share, 1.0 / n_steps[gap]))
+    return Steps(table, rows, place, gaps, n_steps, method, n_before, gap, *of_runs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,11 +20,15 @@ from probewise.priors import Marginal, Product
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
-from probewise.systems.all_steps import Integrations, integrate_from_known_trajectories
 from probewise.systems.calls import Caller, take_samples, user_function_error
-from probewise.systems.integrate import evaluations_per_step, integrate_states
+from probewise.systems.integrate import (
+    Integrations,
+    evaluations_per_step,
+    integrate_from_known_trajectories,
+    integrate_states,
+)
 from probewise.systems.law import LawWithEffects, readings_of_states
-from probewise.systems.simulator import Columns, Simulator, Values
+from probewise.systems.simulator import Columns, Law, Simulator, Values
 from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import RunTable, relative_sds_of_column
 
@@ -77,9 +82,7 @@ class System:
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable, *, stiff: bool = False) -> System:
-        """Build the system for the runs of a table, and determine how the simulator can be called.
-
-        A law is integrated by a linearly implicit method if `stiff`.
+        """Build the system for the runs of a table; find how the simulator can be called, or whether its law works.
 
         Raises
         ------
@@ -95,50 +98,34 @@ class System:
         declared, taken = simulator.noise.sd, (simulator.reading, simulator.time, simulator.run)
         is_sd = not isinstance(declared, str) or declared in table.covariates
         require(is_sd, 'noise["sd"]', declared, f"a number, or a column of numbers: {', '.join(table.covariates)}")
-        settable = ", ".join(name for name in table.columns if name not in taken)
+        settable = ", ".join(name for name in table.columns if name not in taken) or "this table has none"
         for name in simulator.controls:
-            allowed = f"a column that the table has and that can be set: {settable or 'this table has none'}"
+            allowed = f"a column that the table has and that can be set: {settable}"
             require(name in table.columns, "controls", name, allowed)
-        allowed = "a column besides the reading, such as the time or the number of each row"
-        require(columns_without_reading(simulator, table), "columns", list(table.columns), allowed)
+        columns, allowed = columns_without_reading(simulator, table), "a column besides the reading, such as the time"
+        require(columns, "columns", list(table.columns), f"{allowed} or the number of each row")
         bare = cls(simulator, table.scan_names)
-        if simulator.simulate is not None:
-            tried = bare.theta(bare.starts[:_N_TRIED])
-            if simulator.run is None:  # it is called for one recording after the other
-                cells = [np.isfinite(values) for values in table.covariates.values()]
-                table = table.take(max(table.rows_by_scan(), key=lambda rows: sum(int(c[rows].sum()) for c in cells)))
-            columns = columns_without_reading(simulator, table)
-            try:
-                caller = Caller.from_trial_calls(
-                    simulator.simulate,
-                    bare.parameters(tried, table),
-                    columns,
-                    per_run=simulator.per_run,
-                    broadcasts=simulator.vectorized,
-                )
-            except ProbewiseError:
-                raise
-            except Exception as error:
-                raise user_function_error("simulate", error, simulator, columns) from error
-            return replace(bare, caller=caller)
-        assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or table.median_gap, stiff=stiff)
-        system.require_working_law(table)
-        return system
+        if simulator.law is not None:
+            system = replace(bare, max_step=simulator.law.max_step_s or table.median_gap, stiff=stiff)
+            system._require_working_law(simulator.law, table)
+            return system
+        assert simulator.simulate is not None
+        if simulator.run is None:  # it is called for one recording after the other
+            cells = [np.isfinite(values) for values in table.covariates.values()]
+            table = table.take(max(table.rows_by_scan(), key=lambda rows: sum(int(c[rows].sum()) for c in cells)))
+        columns, samples = columns_without_reading(simulator, table), bare.theta(bare.starts[:_N_TRIED])
+        own = (simulator.simulate, bare.parameters(samples, table), columns)
+        try:
+            caller = Caller.from_trial_calls(*own, per_run=simulator.per_run, broadcasts=simulator.vectorized)
+        except ProbewiseError:
+            raise
+        except Exception as error:
+            raise user_function_error("simulate", error, simulator, columns) from error
+        return replace(bare, caller=caller)
 
-    def steps(self, table: RunTable) -> Steps:
-        """Return the steps by which the law is integrated over a table."""
-        return steps_for_table(table, self.max_step, stiff=self.stiff)
-
-    def require_working_law(self, table: RunTable) -> None:
-        """Raise an error unless the law integrates to finite readings at some point of the prior.
-
-        A FileError if it raises an error at all points that are tried, a ParameterError if no reading is finite.
-        """
-        columns, law = columns_without_reading(self.simulator, table), self.simulator.law
-        assert law is not None
-        readings: list[FloatArray] = []
-        wrong: Exception | None = None
+    def _require_working_law(self, law: Law, table: RunTable) -> None:
+        """Raise FileError if a law raises at all points that are tried, ParameterError if no reading is finite."""
+        columns, readings, wrong = columns_without_reading(self.simulator, table), list[FloatArray](), None
         for z in self.starts:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
@@ -153,6 +140,10 @@ class System:
         found = f"not finite at any of the {len(self.starts)} points of the prior that were tried"
         allowed = "finite states and readings: narrower priors or a shorter max_step_s"
         require(np.isfinite(readings).any(), "rates, observe", found, allowed)
+
+    def steps(self, table: RunTable) -> Steps:
+        """Return the steps by which the law is integrated over a table."""
+        return steps_for_table(table, self.max_step, stiff=self.stiff)
 
     @cached_property
     def marginals(self) -> dict[str, Marginal]:
@@ -173,8 +164,7 @@ class System:
 
         The user's own effects (`Simulator.extra`) are absent: at their `null`, (1, 1).
         """
-        own, out = self.simulator, {}
-        at = {name: k for k, name in enumerate(self.marginals)}
+        own, at, out = self.simulator, {name: k for k, name in enumerate(self.marginals)}, {}
         for name in own.parameters:
             if name in own.per_run:
                 of_run = [at[f"{name}[{table.like.get(run, run)}]"] for run in table.scan_names]
@@ -182,10 +172,6 @@ class System:
             else:
                 out[name] = theta[:, at[name] : at[name] + 1]
         return out | {name: np.full((1, 1), extra.null) for name, extra in own.extra.items()}
-
-    def with_added_runs(self, table: RunTable) -> System:
-        """Return the system with the runs of another table added; their parameters per run have the prior."""
-        return replace(self, runs=tuple(dict.fromkeys((*self.runs, *table.scan_names))))
 
     @property
     def n_params(self) -> int:
@@ -205,8 +191,10 @@ class System:
         return np.concatenate([np.zeros((1, self.n_params)), self.scattered_points(_N_STARTS - 1)])
 
     def scattered_points(self, n: int) -> FloatArray:
-        """Return points that cover the prior evenly, as standard-normal coordinates, (n, n_params)."""
-        # Roberts's sequence (additive recurrence by the root of x^(d+1) = x + 1): uniform in any number of dimensions.
+        """Return points that cover the prior evenly, as standard-normal coordinates, (n, n_params).
+
+        Roberts's sequence (additive recurrence by the root of x^(d+1) = x + 1) is uniform in any number of dimensions.
+        """
         root = 2.0
         for _ in range(32):
             root = (1 + root) ** (1 / (self.n_params + 1))
@@ -237,10 +225,6 @@ class System:
         """Map standard-normal coordinates, (n_samples, n_params), to parameters of that shape."""
         return self.prior.from_unit_cube(ndtr(z))
 
-    def coordinates(self, theta: FloatArray) -> FloatArray:
-        """Map parameters to standard-normal coordinates, (n_samples, n_params) both."""
-        return np.asarray(ndtri(self.prior.to_unit_cube(theta)))
-
     def chain(self, plan: Any, effects: Sequence[Effect], *, n_nodes: int = 0) -> SystemChain:
         """Return the chain of the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
@@ -261,9 +245,9 @@ def limited_to_range(predicted: FloatArray, system: System, table: RunTable) -> 
     noise = system.simulator.noise
     if np.isinf(noise.ends).all():
         return predicted
-    low, high = np.array(noise.ends[0]), np.array(noise.ends[1])
-    recorded = table.columns.get(system.simulator.reading)
-    if recorded is not None and recorded.dtype == np.float64:
+    low, high = map(np.array, noise.ends)
+    recorded = table.columns.get(system.simulator.reading, np.array(""))
+    if recorded.dtype == np.float64:
         at_low, at_high = masks_of_readings_at_ends(recorded, *noise.ends, noise.step)
         slack = system.slack * (relative_sds_of_column(table, noise.sd) if isinstance(noise.sd, str) else 1.0)
         predicted = predicted + slack * (1.0 * at_high - 1.0 * at_low)
@@ -292,53 +276,47 @@ class SystemChain:
 
     def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
-        system = self.system
-        given = columns_without_reading(system.simulator, plan)
-        columns = self._apply_stage(Stage.INPUT, given, theta, plan)
+        system, recorded = self.system, columns_without_reading(self.system.simulator, plan)
+        columns = self._apply_stage(Stage.INPUT, recorded, theta, plan)
         parameters = self._apply_stage(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
-        if system.caller is not None:
-            readings = self._call_for_each_recording(system.caller, parameters, columns, plan)
-        else:
-            readings = self._integrated_readings(parameters, columns, given, theta, plan)
+        caller, law = system.caller, system.simulator.law
+        if caller is None:
+            assert law is not None
+            try:
+                states = self._integrated_states(law, parameters, columns, recorded, theta, plan)
+                readings = readings_of_states(law, states, parameters, columns)
+            except ProbewiseError:
+                raise
+            except Exception:  # of the law, at some of the samples
+                if len(theta) > 1:
+                    return np.concatenate([self.simulated_view(one[None, :], plan) for one in theta])
+                system.integrations.n_failed += 1
+                return np.full((1, len(plan)), np.nan)
+        elif system.simulator.run is not None or len(plan.scan_names) == 1:
+            readings = caller(parameters, columns)
+        else:  # one recording after the other: in `simulate`, written for one, a loop over rows would run on
+            readings = np.empty((len(theta), len(plan)))
+            for rows in plan.rows_by_scan():
+                own = (
+                    {name: v[..., rows] if np.shape(v)[-1] == len(plan) else v for name, v in values.items()}
+                    for values in (parameters, columns)
+                )
+                readings[:, rows] = caller(*own)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
-    def _call_for_each_recording(
-        self, caller: Caller, parameters: Values, columns: Columns, plan: RunTable
-    ) -> FloatArray:
-        """Call `simulate` with the whole table, or with one recording after the other if the simulator names no run.
+    def _integrated_states(
+        self, law: Law, parameters: Values, columns: Columns, recorded: Columns, theta: FloatArray, plan: RunTable
+    ) -> dict[str, FloatArray]:
+        """Integrate the law with its effects; return every state at the rows, (n_samples, n_points), by name.
 
-        A user who names no run writes `simulate` for one recording: a loop over its rows would run on into the next.
+        `columns` are those `recorded` with all effects on inputs; rates take them without those that act between rows.
         """
-        if self.system.simulator.run is not None or len(plan.scan_names) == 1:
-            return caller(parameters, columns)
-        runs = plan.rows_by_scan()
-
-        def values_in_rows(values: Columns, rows: IntArray) -> dict[str, NDArray[Any]]:
-            return {name: v[..., rows] if np.shape(v)[-1] == len(plan) else v for name, v in values.items()}
-
-        each = [caller(values_in_rows(parameters, rows), values_in_rows(columns, rows)) for rows in runs]
-        out = np.empty((len(each[0]), len(plan)))
-        for rows, readings in zip(runs, each, strict=True):
-            out[:, rows] = readings
-        return out
-
-    def _integrated_readings(
-        self, parameters: Values, columns: Columns, given: Columns, theta: FloatArray, plan: RunTable
-    ) -> FloatArray:
-        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise.
-
-        `columns` are those `given` with all effects on inputs; the rates take them without those that act between rows.
-        """
-        system, law = self.system, self.system.simulator.law
-        assert law is not None
         between = {effect: getattr(effect.apply, "between_rows", None) for effect in self.effects}
         of_rates = columns
         if any(act is not None and effect.stage is Stage.INPUT for effect, act in between.items()):
-            of_rates = self._apply_stage(Stage.INPUT, given, theta, plan, but=between)
+            of_rates = self._apply_stage(Stage.INPUT, recorded, theta, plan, but=between)
 
-        def law_and_inputs_of_samples(
-            samples: IntArray,
-        ) -> tuple[LawWithEffects, dict[str, FloatArray], dict[str, NDArray[Any]]]:
+        def law_and_inputs(samples: IntArray) -> tuple[LawWithEffects, dict[str, FloatArray], dict[str, NDArray[Any]]]:
             motion = LawWithEffects(law)
             for effect, own in self._effects_with_theta_columns:
                 if (act := between[effect]) is not None:
@@ -346,23 +324,9 @@ class SystemChain:
             motion = self._apply_stage(Stage.RATE, motion, theta[samples], plan)
             return motion, take_samples(parameters, samples), take_samples(of_rates, samples)
 
-        try:
-            states = integrate_from_known_trajectories(
-                law_and_inputs_of_samples,
-                system.steps(plan),
-                system.integrations,
-                effects=(system.runs, self.effects),
-                theta=theta,
-                n_own=system.n_params,
-            )
-            return readings_of_states(law, states, parameters, columns)
-        except ProbewiseError:
-            raise
-        except Exception:
-            if len(theta) == 1:
-                system.integrations.n_failed += 1
-                return np.full((1, len(plan)), np.nan)
-        return np.concatenate([self.simulated_view(theta[k : k + 1], plan) for k in range(len(theta))])
+        steps, memory, n_own = self.system.steps(plan), self.system.integrations, self.system.n_params
+        of = (self.system.runs, self.effects)
+        return integrate_from_known_trajectories(law_and_inputs, steps, memory, effects=of, theta=theta, n_own=n_own)
 
     def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
@@ -405,12 +369,8 @@ def with_converged_step(
     returned as it is. `theta` are parameters of the system and of the `effects` added to its law, (n_samples,
     n_params); samples without finite predictions do not count, unless half the step makes them finite. The `tolerance`
     is in the unit of a reading. With `or_finest`, the finest step within reach is returned, instead of an error, if
-    predictions converge but still change by more.
-
-    Raises
-    ------
-    ParameterError
-        If predictions still change with 4,096 more steps than rows in the longest run.
+    predictions converge but still change by more. Raises ParameterError if they still change with 4,096 more steps than
+    rows in the longest run.
     """
     if system.simulator.law is None:
         return system
@@ -422,28 +382,20 @@ def with_converged_step(
         found, cost = error, math.inf
     stiff = replace(system, max_step=max(system.max_step, table.median_gap), stiff=True)
     if found is not system and not system.stiff and cost > _CHEAPER * _cost_of_integration(stiff, table):
-        try:
+        with contextlib.suppress(ParameterError):  # it is not still either, or not at that cost
             return _halved_until_still(stiff, table, theta, effects, tolerance=tolerance, most=cost / _CHEAPER)
-        except ParameterError:  # it is not still either, or not at that cost
-            pass
     if isinstance(found, ParameterError):
         raise found
     return found
 
 
 def _halved_until_still(
-    system: System,
-    table: RunTable,
-    theta: FloatArray,
-    effects: Sequence[Effect],
-    *,
-    tolerance: float,
-    or_finest: bool = False,
-    most: float = math.inf,
-) -> System:
+    system: System, table: RunTable, theta: FloatArray, effects: Sequence[Effect], *, tolerance: float,
+    or_finest: bool = False, most: float = math.inf,
+) -> System:  # fmt: skip
     """Return a system with the step halved as `with_converged_step` says, by its own method, at a cost of `most`."""
-    now = system
-    coarse, before = now.chain(table, effects).predict(theta, table), np.inf
+    now, before = system, np.inf
+    coarse = now.chain(table, effects).predict(theta, table)
     while True:
         finer = replace(now, max_step=now.max_step / 2)
         fine = finer.chain(table, effects).predict(theta, table)
@@ -453,29 +405,23 @@ def _halved_until_still(
         if there.any() and not ran_away.any():
             with np.errstate(over="ignore"):  # of predictions that are about to run away
                 moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2)))
-        if moved <= tolerance:
+        steps = finer.steps(table)
+        is_affordable = steps.n_steps.sum() <= _MOST_STEPS + len(steps.rows)
+        if moved <= tolerance or (or_finest and moved < before / _CONVERGING and not is_affordable):
             return now
-        if or_finest and moved < before / _CONVERGING and not _has_affordable_steps(finer, table):
-            return now
-        now, coarse, before = finer, fine, moved
-        if not _has_affordable_steps(now, table) or _cost_of_integration(now, table) > most:
+        if not is_affordable or _cost_of_integration(finer, table) > most:
             raise ParameterError(
                 "rates",
                 f"readings still change by {moved:.3g} {system.simulator.unit} (rms) when the step of "
-                f"{2 * now.max_step:.3g} {system.simulator.time_unit} is halved",
+                f"{now.max_step:.3g} {system.simulator.time_unit} is halved",
                 "a law that some thousand steps integrate; set a shorter max_step_s, or write simulate with your own "
                 "integrator",
             )
+        now, coarse, before = finer, fine, moved
 
 
 def _cost_of_integration(system: System, table: RunTable) -> float:
     """Return the number of evaluations of the rates, of all samples and runs together."""
-    law = system.simulator.law
+    law, steps = system.simulator.law, system.steps(table)
     assert law is not None
-    steps = system.steps(table)
     return float(steps.n_steps.sum() * evaluations_per_step(LawWithEffects(law), steps.method))
-
-
-def _has_affordable_steps(system: System, table: RunTable) -> bool:
-    steps = system.steps(table)
-    return bool(steps.n_steps.sum() <= _MOST_STEPS + len(steps.row_by_position_and_run))

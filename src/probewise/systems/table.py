@@ -71,9 +71,8 @@ class RunTable:
     first_line: int = 2
 
     def __post_init__(self) -> None:
-        if not hasattr(self.columns, "items"):
-            allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
-            raise ParameterError("table", self.columns, allowed)
+        allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
+        require(hasattr(self.columns, "items"), "table", self.columns, allowed)
         columns, notes = dict[str, NDArray[Any]](), [*self.notes]
         for name, given in self.columns.items():
             values: Any = given
@@ -83,9 +82,7 @@ class RunTable:
                 notes += [note] if note else []
             columns[name] = _checked_column(name, values, are_names=name == self.run)
             if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
-                notes.append(
-                    f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"
-                )
+                notes += [f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"]
         require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
         for name, values in columns.items():
@@ -144,16 +141,12 @@ class RunTable:
     @cached_property
     def covariates(self) -> dict[str, FloatArray]:
         """Columns of numbers by name, not all missing, without time and run; the reading is one of the columns."""
-        kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run)}
-        numbers = {name: values for name, values in kept.items() if values.dtype == np.float64}
-        return {name: values for name, values in numbers.items() if np.isfinite(values).any()}
+        kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run) and v.dtype == np.float64}
+        return {name: values for name, values in kept.items() if np.isfinite(values).any()}
 
     @cached_property
     def time_begins_anew(self) -> bool:
-        """Whether some run begins before another has ended, as if time were counted from the start of each run.
-
-        The order of the rows does not matter: runs that each start at 0 may be sorted by time.
-        """
+        """Whether some run begins before another has ended, as if time were counted from the start of each run."""
         own = [self.time_s[rows] for rows in self.rows_by_scan()]
         first, last = np.array(sorted((times.min(), times.max()) for times in own)).T
         return bool((first[1:] < np.maximum.accumulate(last)[:-1]).any())
@@ -171,17 +164,15 @@ class RunTable:
 
     def require_rising_time(self) -> None:
         """Raise ParameterError, with the row, if time decreases within a run."""
-        if self.time is None:
-            return
         for name, rows in zip(self.scan_names, self.rows_by_scan(), strict=True):
-            falls = np.flatnonzero(np.diff(self.time_s[rows]) < 0)
+            falls = np.flatnonzero(np.diff(self.time_s[rows]) < 0)  # row numbers, where no time is, rise
             if falls.size:
                 before, at = rows[falls[0]], rows[falls[0] + 1]
                 where = f"column {self.time!r} in row {at + self.first_line}"
-                own = "its run" if self.run is None else f"run {name}"
+                anew = 'its run; where it begins anew name the runs: run = "..."'
+                own = anew if self.run is None else f"run {name}"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
-                cure = "" if self.run is not None else '; where it begins anew name the runs: run = "..."'
-                raise ParameterError(where, float(self.time_s[at]), f"{allowed}{cure}")
+                raise ParameterError(where, float(self.time_s[at]), allowed)
 
     def interpolated_within_runs(self, values: FloatArray) -> FloatArray:
         """Return a column, (n_points,), with its missing values interpolated linearly from row to row of each run.
@@ -225,10 +216,8 @@ class RunRecording(Recording):
     @property
     def relative_sd(self) -> FloatArray:
         """Declared sd of each reading relative to the median, (n_points,); 1 if none is declared."""
-        if not self.sd_column:
-            return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
-        return relative_sds_of_column(table, self.sd_column)
+        return relative_sds_of_column(table, self.sd_column) if self.sd_column else np.ones(len(table))
 
     def to_frame(self) -> Any:
         """Return a pandas DataFrame of the table's columns, a row per reading."""
@@ -273,11 +262,11 @@ def median_sd_of_column(table: RunTable, column: str) -> float | None:
 
 def relative_sds_of_column(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
     """Return a column of sds over the typical one, by default its median, (n_points,); 1 where there is none."""
-    values = table.covariates.get(column, np.full(len(table), np.nan))
-    there = np.isfinite(values) & (values > 0)
     median = median_sd_of_column(table, column)
     if median is None:
         return np.ones(len(table))
+    values = table.covariates[column]
+    there = np.isfinite(values) & (values > 0)
     return np.where(there, values, 1.0) / np.where(there, median if typical is None else typical, 1.0)
 
 
@@ -292,7 +281,6 @@ def column_error(
 
 
 def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
-    """Return a column as read-only floats or texts; names of runs are texts."""
     if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
         values = np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
     array = np.asarray(values)
@@ -316,13 +304,8 @@ def read_run_table(
 
     Loggers and spreadsheets write tables in many ways; `notes` of the result says how one was read that is not plain
     CSV. The names `time`, `run` and `reading` show which row is the header. Names of runs are texts. Dates and clocks
-    in the time column count from the first row, in `time_unit`.
-
-    Raises
-    ------
-    FileError
-        If the file is unusable, lacks the column `time` or `run`, a time is no number, or a cell can be read in several
-        ways; the message says where.
+    in the time column count from the first row, in `time_unit`. Raises FileError, which says where, if the file is
+    unusable, lacks the column `time` or `run`, a time is no number, or a cell can be read in several ways.
     """
     path = checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)")
     own = [name for name in (time, run) if name is not None]
@@ -332,12 +315,11 @@ def read_run_table(
         raise FileError(path, "there is no row below the header", "one row for each reading")
     table.require_columns(*own)
     columns: dict[str, NDArray[Any]] = {name: np.array(cells) for name, cells in table.columns.items()}
-    for name in [name for name in columns if name != run]:
-        if name == time:
-            columns[name] = table.column_of_numbers(name)
-        else:
-            with contextlib.suppress(FileError):
-                columns[name] = table.column_of_numbers(name, missing=True, largest=None)
+    if time is not None and time != run:
+        columns[time] = table.column_of_numbers(time)
+    for name in columns.keys() - {time, run}:
+        with contextlib.suppress(FileError):
+            columns[name] = table.column_of_numbers(name, missing=True, largest=None)
     return RunTable(columns, time, run, time_unit=time_unit, notes=table.notes, first_line=table.rows[0])
 
 
@@ -358,37 +340,35 @@ def concatenate_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tu
     runs, each of several tables is one run.
 
     `tables`, one or more, have the same time and run; `sources` are their names in messages. Returns the table, and
-    notes on missing and omitted columns and on renamed runs.
-
-    Raises
-    ------
-    ParameterError
-        If there is no table, two are the same, or a column of numbers in the first has texts in another.
+    notes on missing and omitted columns and on renamed runs. Raises ParameterError if there is no table, two are the
+    same, or a column of numbers in the first has texts in another.
     """
     require(tables, "tables", (), "one or more")
-    for (one, first), (another, second) in itertools.combinations(zip(sources, tables, strict=True), 2):
-        allowed = "tables that differ; these hold the same rows"
-        require(not _same_tables(first, second), "tables", f"{one} and {another}", allowed)
     if len(tables) == 1:
         return tables[0], ()
+    texts = [{name: [*map(_text, v.tolist())] for name, v in table.columns.items()} for table in tables]
+    for (one, first_rows), (another, rows) in itertools.combinations(zip(sources, texts, strict=True), 2):
+        allowed = "tables that differ; these hold the same rows"
+        require(first_rows != rows, "tables", f"{one} and {another}", allowed)
     first, notes = tables[0], list[str]()
     for source, table in zip(sources[1:], tables[1:], strict=True):
         lacking, beyond = ([n for n in a.columns if n not in b.columns] for a, b in ((first, table), (table, first)))
         notes += [f"{source} has no column {name}: missing there" for name in lacking]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
-    run = first.run or unused_name(_FILE, first.columns)
-    by_table = _distinct_run_names(tables, sources, named=first.run is not None)
-    if first.run is not None:
-        for source, own in zip(sources, by_table, strict=True):
-            if renamed := [f"{name} is {new}" for name, new in own.items() if new != name]:
-                notes.append(f"runs of {source} renamed, as another table has them too: {', '.join(renamed)}")
-    names = np.concatenate([np.array([*own.values()])[t.scan] for t, own in zip(tables, by_table, strict=True)])
-    columns = {
-        name: names  # whether they were numbers or texts
-        if name == run
-        else _concatenated_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
-        for name in dict.fromkeys((*first.columns, run))
-    }
+    run, taken, of_run = first.run or unused_name(_FILE, first.columns), set[str](), list[NDArray[Any]]()
+    for source, table in zip(sources, tables, strict=True):
+        names: tuple[str, ...] = (source,) if first.run is None else table.scan_names
+        new: dict[str, str] = {}
+        for name in names:  # a new name must not be one of this table's own either, which follows unchanged
+            new[name] = unused_name(name, taken | (set(names) - {name}))
+            taken.add(new[name])
+        if first.run is not None and (renamed := [f"{old} is {name}" for old, name in new.items() if old != name]):
+            notes.append(f"runs of {source} renamed, as another table has them too: {', '.join(renamed)}")
+        of_run.append(np.array([*new.values()])[table.scan])
+    columns = {}
+    for name in dict.fromkeys((*first.columns, run)):
+        parts = of_run if name == run else [t.columns.get(name) for t in tables]
+        columns[name] = _concatenated_column(name, parts, [len(t) for t in tables], sources)
     how = tuple(dict.fromkeys(note for table in tables for note in table.notes))
     return replace(first, columns=columns, run=run, notes=how), tuple(notes)
 
@@ -421,26 +401,9 @@ def _text(value: object) -> str:
     return number_text(value) if isinstance(value, float) else str(value)
 
 
-def _distinct_run_names(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> list[dict[str, str]]:
-    """Return for each table the names of its runs, in order: a number is appended to one that an earlier table has."""
-    taken, out = set[str](), list[dict[str, str]]()
-    for table, source in zip(tables, sources, strict=True):
-        names: tuple[str, ...] = table.scan_names if named else (source,)
-        out.append({})
-        for name in names:  # a new name must not be one of this table's own either, which follows unchanged
-            out[-1][name] = unused_name(name, taken | (set(names) - {name}))
-            taken |= {out[-1][name]}
-    return out
-
-
 def unused_name(name: str, taken: Iterable[str]) -> str:
     """Return the name, with a number appended if it is among those taken."""
     known, new, k = set(taken), name, 2
     while new in known:
         new, k = f"{name} ({k})", k + 1
     return new
-
-
-def _same_tables(first: RunTable, second: RunTable) -> bool:
-    one, other = ({name: [*map(_text, v.tolist())] for name, v in t.columns.items()} for t in (first, second))
-    return one == other

@@ -297,9 +297,10 @@ def test_an_overflow_goes_to_waste_or_into_a_state_that_it_drives():
     level = forms["limit:upper"].bank()[3, 0, 0]
     theta = np.array([[level, 0.0], [level, 0.5], [level, 1.0]])
     motions = [wasted.apply(LawWithEffects(law), theta[k : k + 1], TABLE) for k in range(3)]
-    full = {"upper": np.full((1, 1), level), "lower": np.full((1, 1), 0.1)}
+    full = np.array([[[level if state == "upper" else 0.1]] for state in law.states])
     given = {"rate": np.full((1, 1), 2.0)}
-    into_lower = [float(motion.rates(full, given, {}, {})["lower"][0, 0]) for motion in motions]
+    lower = [*law.states].index("lower")
+    into_lower = [float(motion.rates(full, (given, {}))[lower, 0, 0]) for motion in motions]
     over = 2.0 - 0.5 * level
     np.testing.assert_allclose(np.diff(into_lower), 0.5 * over)
     assert "lower takes up 0.50" in taken.sentence(np.array([level, 0.5]), np.array([0.01, 0.01]))

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from probewise.effects import AGAIN, PROPOSAL, name_without_copy_suffix
 from probewise.effects.effect import StepEffect, WaveEffect
-from probewise.errors import ParameterError
+from probewise.errors import require
 from probewise.priors import LogUniform
 from probewise.systems.forms.formulas import formula_forms
-from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
+from probewise.systems.forms.inputs import driving_columns, forms_on_inputs, forms_on_rates
 from probewise.systems.forms.modulations import forms_of_extras, forms_on_parameters
-from probewise.systems.forms.rates import forms_on_rates
 from probewise.systems.forms.readings import forms_on_readings
 from probewise.systems.forms.reference import Form, ReferenceFit, StoredFit
 from probewise.systems.simulator import Simulator
@@ -79,10 +78,9 @@ def bind_forms(about: ReferenceFit) -> dict[str, Form]:
 
 def _second_wave(form: Form) -> Form:
     """Return a second wave; of a column it is the shorter, for two that are near its range are together a curve."""
-    again = replace(form, name=form.name + AGAIN)
-    if not form.name.startswith("periodic_error:"):
+    again, period = replace(form, name=form.name + AGAIN), form.marginals.get("period")
+    if not isinstance(period, LogUniform):
         return again
-    period = cast(LogUniform, form.marginals["period"])
     shorter = replace(period, high=max(0.5 * period.high, 1.1 * period.low))
     entries = form.entries[form.entries[:, 0, 1] < shorter.high]
     return replace(again, parameters={**form.marginals, "period": shorter}, entries=entries)
@@ -117,13 +115,12 @@ def names_in_definitions(about: ReferenceFit, names: Iterable[str]) -> frozenset
 
     A bound is none of them: a position may stop, though its rate is the speed.
     """
-    states = about.states_with_rates_by_definition
-
-    def is_in_definition(name: str) -> bool:
-        kind, *target = name_without_copy_suffix(name).removeprefix("formula:").split(":")
-        return kind in _IN_RATES and target[0] in states
-
-    return frozenset(filter(is_in_definition, names))
+    out = set()
+    for name in names:
+        kind, *target = name_without_copy_suffix(name).removeprefix(PROPOSAL).split(":")
+        if kind in _IN_RATES and target[0] in about.states_with_rates_by_definition:
+            out.add(name)
+    return frozenset(out)
 
 
 def extract_stored_fit(about: ReferenceFit) -> StoredFit:
@@ -145,15 +142,14 @@ def rebind_forms(
     table, more = known.table, list(more_runs)
     if more and table.run is not None:  # the last row again under the name of each
         rows = np.append(np.arange(len(table)), np.full(len(more), len(table) - 1))
-        of_rows = [table.scan_names[k] for k in table.scan.tolist()]
-        longer = table.take(rows)
-        longer = replace(longer, columns={**longer.columns, table.run: np.array([*of_rows, *more])})
+        names_of_runs = np.array([*(table.scan_names[k] for k in table.scan.tolist()), *more])
+        longer = replace(table, columns={n: v[rows] for n, v in table.columns.items()} | {table.run: names_of_runs})
         states = {name: values[rows] for name, values in known.states.items()}
-        beyond = StoredFit(longer, known.predicted[rows], known.sd, states, known.held)
-        found |= _bind_wanted_forms([name for name in wanted if has_value_per_run(name)], simulator, beyond)
-    lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
-    if lost:
-        raise ParameterError("effects", lost[0], "a term that this version knows; diagnose again with it")
+        beyond = replace(known, table=longer, predicted=known.predicted[rows], states=states)
+        found |= _bind_wanted_forms(list(filter(has_value_per_run, wanted)), simulator, beyond)
+    for name in wanted:
+        is_bound = name in found or not name.startswith(PROPOSAL)
+        require(is_bound, "effects", name, "a term that this version knows; diagnose again with it")
     return {name: found[name] for name in wanted if name in found}
 
 
@@ -163,7 +159,6 @@ def counts_from_far_origin(names: Iterable[str], simulator: Simulator, known: St
 
 
 def _bind_wanted_forms(wanted: list[str], simulator: Simulator, known: StoredFit) -> dict[str, Form]:
-    """Bind the forms and proposals of the `wanted` names to a recording; leave out those that this version lacks."""
     if not wanted:
         return {}
     system = System(simulator, known.table.scan_names)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from probewise.effects.effect import (
 )
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
+from probewise.systems.forms.inputs import trial_rate
 from probewise.systems.forms.modulations import (
     frequency_prior,
     origin_in_words,
@@ -35,7 +36,6 @@ from probewise.systems.forms.modulations import (
     text_rounded_to_spread,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.rates import trial_rate
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
 from probewise.systems.forms.reference import AMPLITUDE, ONE_AMPLITUDE, POSITIVE, Form, ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
@@ -53,56 +53,60 @@ _N_DOSES = 9  # doses that are tried as the one at which the reading has changed
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
 
-@dataclass(frozen=True)
-class _ScaledVariable:
-    """A column, a state or the reading `name`, which a term takes as (value - middle) / scale."""
+class _Variable(NamedTuple):
+    """A column, a state or the reading `name`, of which terms take (value - middle) / scale; `text` is value - middle.
+
+    `has_sides` tells whether enough rows are on either side of the middle for a term with a kink there.
+    """
 
     name: str
     middle: float
     scale: float
-    has_sides: bool = True
-    """Whether enough rows are on either side of the middle for a term with a kink there."""
-
-    def scaled(self, values: Any) -> Any:
-        return (values - self.middle) / self.scale
-
-    @property
-    def text(self) -> str:
-        if self.middle == 0.0:
-            return self.name
-        middle = text_rounded_to_spread(abs(self.middle), self.scale)
-        return f"({self.name} {'-' if self.middle > 0 else '+'} {middle})"
-
-
-@dataclass(frozen=True)
-class _Term:
-    """A function of scaled variables, divided by `scale`; `text` is its formula without the amplitude."""
-
     text: str
-    variables: tuple[_ScaledVariable, ...]
-    function: Callable[..., Any]
-    scale: float = 1.0
+    has_sides: bool = True
 
-    def evaluate(self, look_up: Callable[[str], Any]) -> Any:
-        with np.errstate(all="ignore"):  # one that diverges at some row is no number there
-            return self.function(*(variable.scaled(look_up(variable.name)) for variable in self.variables)) / self.scale
+    @classmethod
+    def of(cls, name: str, values: FloatArray, middle: float) -> _Variable:
+        """Build from a column's values, (n_points,), of which the scale is the rms about the middle."""
+        points, scale = switch_points(values), float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0
+        apart = f"{'-' if middle > 0 else '+'} {text_rounded_to_spread(abs(middle), scale)}"
+        has_sides = bool(points.size and points[0] < middle < points[-1])
+        return cls(name, middle, scale, f"({name} {apart})" if middle else name, has_sides)
+
+
+_Term: TypeAlias = tuple[str, tuple[_Variable, ...], Callable[..., Any], float]
+"""A formula without its amplitude, its variables, and its value: a function of these, divided by a scale."""
 
 
 def formula_forms(about: ReferenceFit) -> Iterator[Form]:
     """Yield all proposals: terms of the reading or of a state's rate, thresholds, and shapes in time or of a column."""
-    yield from _reading_formula_forms(about)
-    columns = _complete_columns(about)
+    own, table = about.system.simulator, about.table
+    columns = {name: values for name, values in about.varying_columns.items() if np.isfinite(values).all()}
+    shapes = [term for name in columns for term in _terms_of_column(name)]
+    in_time = {str(table.time): table.time_s} if table.has_varying_time else {}
+
+    def look_up(value: Any, rows: RunTable, name: str) -> Any:
+        return value if name == own.reading else rows.time_s if name == rows.time else rows.covariates[name]
+
+    every = {**columns, **in_time, own.reading: about.predicted}
+    centred = [_Variable.of(name, column, _rounded_mean(column)) for name, column in every.items()]
+    yield from _forms_of_terms(about, [*_terms_of(centred), *shapes], look_up, (about.predicted, table))
     for name in columns:
         yield from _threshold_form(about, name)
     for name, values in columns.items():
         yield from _varying_influence_form(about, name, values)
         yield from _dose_forms(about, name, values)
-    if about.table.has_varying_time:
+    if in_time:
         yield from _square_wave_form(about)
         yield from _swept_wave_form(about)
         yield from _double_settling_form(about)
+    still = [_Variable.of(name, column, 0.0) for name, column in about.states.items() if varies(column)]
+    still += [_Variable.of(n, c, _rounded_mean(c)) for n, c in columns.items() if n not in about.states]
     for state in about.states:
-        yield from _rate_formula_forms(about, state)
+        # Dry friction has a name.
+        terms = [term for term in _terms_of(still) if term[0] != f"sign({state})"]
+        at_rows = about.states, table.covariates
+        yield from _forms_of_terms(about, terms, lambda s, u, n: s[n] if n in s else u[n], at_rows, state)
         yield from _one_sided_rate_forms(about, state)
 
 
@@ -172,60 +176,33 @@ _OF_ANGLE: Mapping[str, Callable[[Any], Any]] = {"tan({0})": np.tan, "1 / cos({0
 _RADIANS = {"deg": np.pi / 180, "rad": 1.0}
 
 
-def _terms_of_variables(variables: list[_ScaledVariable]) -> Iterator[_Term]:
+def _terms_of(variables: list[_Variable]) -> Iterator[_Term]:
     for x in variables:
         for text, (function, degree) in _OF_ONE.items():
             if x.has_sides or not ("|" in text or "sign" in text):
-                yield _Term(text.format(x.text), (x,), function, x.scale**-degree)
+                yield text.format(x.text), (x,), function, x.scale**-degree
         for k in (-1.0, 1.0, 2.0, -2.0):
             rate = f"{k / x.scale:.4g}"
-            yield _Term(f"exp({rate} {x.text})", (x,), lambda v, k=k: np.exp(np.clip(k * v, -50, 50)))
-        yield _Term(f"sin({1 / x.scale:.4g} {x.text})", (x,), np.sin)
+            yield f"exp({rate} {x.text})", (x,), lambda v, k=k: np.exp(np.clip(k * v, -50, 50)), 1.0
+        yield f"sin({1 / x.scale:.4g} {x.text})", (x,), np.sin, 1.0
     for x, z in itertools.combinations(variables, 2):
         for text, (both, first, second) in _OF_TWO.items():
             kinked = x.has_sides if "|{0}" in text else z.has_sides
             if kinked or "|" not in text:
-                yield _Term(text.format(x.text, z.text), (x, z), both, 1 / (x.scale**first * z.scale**second))
+                yield text.format(x.text, z.text), (x, z), both, 1 / (x.scale**first * z.scale**second)
 
 
 def _terms_of_column(name: str) -> Iterator[_Term]:
     """Yield terms of a column itself, not of what it is above its mean; those of an angle by its unit."""
-    as_it_is, (*_, unit) = _ScaledVariable(name, 0.0, 1.0), name.split("_")
     for text, function in _OF_COLUMN.items():
-        yield _Term(text.format(name), (as_it_is,), function)
-    for text, function in _OF_ANGLE.items() if unit in _RADIANS else ():
-        angle = _ScaledVariable(name, 0.0, 1 / _RADIANS[unit])
-        yield _Term(text.format(f"{_RADIANS[unit]:.6g} {name}"), (angle,), function)
-
-
-def _complete_columns(about: ReferenceFit) -> dict[str, FloatArray]:
-    return {name: values for name, values in about.varying_columns.items() if np.isfinite(values).all()}
+        yield text.format(name), (_Variable(name, 0.0, 1.0, name),), function, 1.0
+    unit = _RADIANS.get(name.split("_")[-1], 0.0)
+    for text, function in _OF_ANGLE.items() if unit else ():
+        yield text.format(f"{unit:.6g} {name}"), (_Variable(name, 0.0, 1 / unit, name),), function, 1.0
 
 
 def _rounded_mean(values: FloatArray) -> float:
     return float(text_rounded_to_spread(float(np.mean(values)), float(np.std(values)), 6))
-
-
-def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _ScaledVariable:
-    middle = _rounded_mean(values) if centred else 0.0
-    points = switch_points(values)
-    has_sides = bool(points.size and points[0] < middle < points[-1])
-    return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0, has_sides)
-
-
-def _reading_formula_forms(about: ReferenceFit) -> Iterator[Form]:
-    reading, time, columns = about.system.simulator.reading, about.table.time, _complete_columns(about)
-    shapes = [term for name in columns for term in _terms_of_column(name)]
-    if about.table.has_varying_time and time is not None:
-        columns[time] = about.table.time_s
-    variables = [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
-    level = _scaled_variable(reading, about.predicted, centred=True)
-
-    def look_up(value: Any, rows: RunTable, name: str) -> Any:
-        return value if name == reading else rows.time_s if name == rows.time else rows.covariates[name]
-
-    terms = [*_terms_of_variables([*variables, level]), *shapes]
-    return _forms_of_terms(about, terms, look_up, (about.predicted, about.table))
 
 
 def _threshold_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -251,28 +228,11 @@ def _one_sided_rate_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
     values = about.states[state]
     points = switch_points(values)
     for sign, text in ((1.0, f"max({state} - at, 0)"), (-1.0, f"max(at - {state}, 0)")) if len(points) > 1 else ():
-
-        def change(s: Any, u: Any, a: Any, at: Any, sign: float = sign) -> Any:
-            return a * np.maximum(sign * (s[state] - at), 0.0)
-
+        change = partial(lambda sign, s, u, a, at: a * np.maximum(sign * (s[state] - at), 0.0), sign)
         parameters: Declared = {"a": (AMPLITUDE, ""), "at": (Uniform(points[0], points[-1]), state)}
         bank = single_column_bank(1.0, np.clip(np.quantile(values, _THRESHOLDS), points[0], points[-1]))
         own, guess = (text, parameters, change, (f"state:{state}", "time"), bank), trial_rate(about, state)
         yield from _proposal(about, *own, guess=guess / float(np.ptp(values)), state=state)
-
-
-def _rate_formula_forms(about: ReferenceFit, state: str) -> Iterator[Form]:
-    states = about.states
-    variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if varies(values)]
-    columns = {name: values for name, values in _complete_columns(about).items() if name not in states}
-    variables += [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
-    # Dry friction has a name.
-    terms = [term for term in _terms_of_variables(variables) if term.text != f"sign({state})"]
-
-    def look_up(s: Any, u: Any, name: str) -> Any:
-        return s[name] if name in s else u[name]
-
-    return _forms_of_terms(about, terms, look_up, (states, about.table.covariates), state)
 
 
 def _forms_of_terms(
@@ -286,10 +246,13 @@ def _forms_of_terms(
     states = [name for name in about.states if state or name == reading]
     along = {str(time): "time", reading: "level"} | {name: f"state:{name}" for name in states}
     known: list[FloatArray] = []
-    for term in terms:
+    for text, variables, function, scale in terms:
 
-        def change(one: Any, other: Any, a: Any, term: _Term = term) -> Any:
-            return a * term.evaluate(lambda own: look_up(one, other, own))
+        def change(
+            one: Any, other: Any, a: Any, own: Any = variables, function: Any = function, scale: float = scale
+        ) -> Any:
+            with np.errstate(all="ignore"):  # one that diverges at some row is no number there
+                return a * (function(*((look_up(one, other, v.name) - v.middle) / v.scale for v in own)) / scale)
 
         shape = np.asarray(change(*at_rows, 1.0))
         if not np.isfinite(shape).all():
@@ -300,9 +263,9 @@ def _forms_of_terms(
             continue
         known.append(centred / size)
         guess = trial_rate(about, state) / float(np.sqrt(np.mean(shape**2))) if state else None
-        names = dict.fromkeys(variable.name for variable in term.variables)
+        names = dict.fromkeys(variable.name for variable in variables)
         covariates = tuple(along.get(name) or covariate_of_column(name) for name in names)
-        yield from _proposal(about, term.text, {"a": (AMPLITUDE, "")}, change, covariates, guess=guess, state=state)
+        yield from _proposal(about, text, {"a": (AMPLITUDE, "")}, change, covariates, guess=guess, state=state)
 
 
 def _square_wave_form(about: ReferenceFit) -> Iterator[Form]:
@@ -410,7 +373,13 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
     for what, origin in origins.items():
 
         def dose(rows: RunTable, origin: float = origin) -> FloatArray:
-            return _integral_since_start_of_run(np.abs(rows.covariates[name] - origin), rows, in_time=in_time)
+            from scipy.integrate import cumulative_trapezoid  # here, since it loads SciPy's optimisers
+
+            size, out = np.abs(rows.covariates[name] - origin), np.zeros(len(rows))
+            for own in rows.rows_by_scan():
+                at = rows.time_s[own]
+                out[own] = cumulative_trapezoid(size[own], at, initial=0) if in_time else np.cumsum(size[own])
+            return out
 
         def change(value: Any, rows: RunTable, a: Any, d: Any, dose: Callable[[RunTable], FloatArray] = dose) -> Any:
             return -a * np.expm1(-dose(rows) / d)
@@ -431,15 +400,3 @@ def _dose_forms(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[
             expression=f"a (1 - exp(-D / d)), {grown}",
             needs_rising_time=in_time,
         )
-
-
-def _integral_since_start_of_run(values: FloatArray, rows: RunTable, *, in_time: bool) -> FloatArray:
-    """Return the integral of values over time from the start of each row's run, (n_points,); or their sum over rows."""
-    from scipy.integrate import cumulative_trapezoid  # here, since it loads SciPy's optimisers
-
-    out = np.zeros(len(rows))
-    for own in rows.rows_by_scan():
-        if own.size:
-            at = rows.time_s[own]
-            out[own] = cumulative_trapezoid(values[own], at, initial=0) if in_time else np.cumsum(values[own])
-    return out

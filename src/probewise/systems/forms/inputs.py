@@ -1,23 +1,37 @@
-"""Forms on the inputs: errors of a column, and of the clock."""
+"""Forms on what a simulator takes: errors of a column and of the clock, and terms that the rates of its law lack."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray, distinct_values, rounding_error
-from probewise.effects.effect import PHASE, Act, WaveEffect, acting, in_words, sine_and_cosine_entries
-from probewise.priors import LogUniform
+from probewise._words import value_with_sd
+from probewise.effects.effect import (
+    PHASE,
+    Act,
+    Declared,
+    Fixed,
+    WaveEffect,
+    acting,
+    in_words,
+    sine_and_cosine_entries,
+    single_column_bank,
+)
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
+    declared_wave,
     max_n_trial_frequencies,
     origin_in_words,
     origin_of_column,
     trial_frequencies,
+    trial_frequencies_in_time,
 )
-from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
+from probewise.systems.forms.readings import delayed_values, values_at_earlier_times, within_runs
 from probewise.systems.forms.reference import (
     AMPLITUDE,
     POSITIVE,
@@ -25,10 +39,12 @@ from probewise.systems.forms.reference import (
     Form,
     ReferenceFit,
     clipping_between,
+    period_with_sd,
 )
-from probewise.systems.law import rounding_of_times
-from probewise.systems.table import RunTable, covariate_of_column
+from probewise.systems.law import LawWithEffects, Limit, rounding_of_times
+from probewise.systems.table import covariate_of_column
 
+_NO_SHARE = 1e-9  # of what a bound stops: none
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
 _MOST_FREQUENCIES = 600
 _MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
@@ -42,9 +58,9 @@ def driving_columns(about: ReferenceFit) -> list[str]:
     """Return the names of the columns, except time, that the simulated readings depend on."""
     out = []
     for name, values in about.varying_columns.items():
-        nudges = (_with_offset, _NUDGE * float(np.nanstd(values))), (_with_gain, _NUDGE)
-        acts = ((_column_changer(name, change), np.array([[size]])) for change, size in nudges)
-        if max(float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts) > 0:
+        sizes = (_with_offset, _NUDGE * float(np.nanstd(values))), (_with_gain, _NUDGE)
+        acts = ((_column_changer(name, change), np.array([[size]])) for change, size in sizes)
+        if max([float(about.rms_change_in_sds(Stage.INPUT, *each)[0]) for each in acts]) > 0:
             out.append(name)
     return out
 
@@ -63,7 +79,8 @@ def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
-    values, unit, column = about.table.covariates[name], about.time_unit, covariate_of_column(name)
+    table, unit, column = about.table, about.time_unit, covariate_of_column(name)
+    values = table.covariates[name]
     spread, span = float(np.nanstd(values)), float(np.nanmax(values)) - float(np.nanmin(values))
     true, late = f"the true {name} is the recorded {name}", ("previous", column)
 
@@ -83,19 +100,24 @@ def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
     if ends is not None:
         act = _column_changer(name, ends.act)
         if np.nanmax(about.rms_change_in_sds(Stage.INPUT, act, ends.tried[:, None]), initial=0.0) > 0.05:
-            own = (f"input_saturation:{name}", Stage.INPUT, ends, name, (column,), act, ends.says(name))
-            yield from about.clipped(*own)
+            own = ({"level": (ends.prior, name)}, (column,), act, ends.says(name), single_column_bank(ends.tried))
+            yield from about.form(f"input_saturation:{name}", Stage.INPUT, *own, absent={0: ends.nowhere})
     if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * span:  # if larger, it is an offset
         zone = acting(lambda c, rows, width: np.sign(c) * np.maximum(np.abs(c) - width, 0.0))
         within = f"{name} has no effect within {{0}} of 0"
         yield from size("dead_zone", _column_changer(name, zone), ("width", name), (column,), within)
-    if _moves_both_ways(values, about.table):
+    moves, still = np.concatenate([np.diff(values[rows]) for rows in table.rows_by_scan()]), rounding_error(values)
+    if moves.size and min((moves > still).mean(), (moves < -still).mean()) > _FORTH_AND_BACK:
         play = _column_changer(name, column_with_play)
         yield from size("backlash", play, ("width", name), late, f"{name} has {{0}} of play")
     yield from _periodic_error_form(about, name)
-    if about.table.has_varying_time:
-        delay, says = _column_delayer(about, name), f"{name} acts with a delay of {{0}} {unit}"
-        yield from size("input_delay", delay, ("tau_s", unit), late, says, needs_rising_time=True)
+    if table.has_varying_time:
+        held, is_law = about.is_held_between_rows(name), about.system.simulator.law is not None
+        of_held = delayed_held_column if is_law else mean_of_delayed_held_column
+        delay, says = _column_changer(name, of_held if held else delayed_values), f"{name} acts with a delay of {{0}}"
+        if is_law:
+            delay = ActInTime(delay, lambda motion, theta: motion.plus(dead_times={name: theta[:, :1]}))
+        yield from size("input_delay", delay, ("tau_s", unit), late, f"{says} {unit}", needs_rising_time=True)
 
 
 _with_offset = acting(lambda c, rows, a: c + a)
@@ -105,15 +127,6 @@ _with_gain = acting(lambda c, rows, a: c * (1 + a))
 def _column_changer(name: str, change: Act) -> Act:
     """Return the act on the inputs that applies `change` to the column `name`, (n_points,) or (n_samples, n_points)."""
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
-
-
-def _column_delayer(about: ReferenceFit, name: str) -> Act:
-    """Return the function that delays the column `name`: of a law at the rows as well as between them."""
-    held = about.is_held_between_rows(name)
-    if about.system.simulator.law is None:
-        return _column_changer(name, mean_of_delayed_held_column if held else delayed_values)
-    at_rows = _column_changer(name, delayed_held_column if held else delayed_values)
-    return ActInTime(at_rows, lambda motion, theta: motion.plus(dead_times={name: theta[:, :1]}))
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -128,74 +141,178 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         most = max_n_trial_frequencies(len(about.table))
     frequencies = trial_frequencies(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE, _LEAST_WAVES)
     longest, shortest = (float(1 / frequencies[k]) for k in (0, -1))
-    yield from about.form(
-        f"periodic_error:{name}",
-        Stage.INPUT,
-        {"a": (POSITIVE, name), "period": (LogUniform(shortest * 0.98, longest / 0.9), name), "phase": (PHASE, "rad")},
-        (covariate_of_column(name),),
-        _column_changer(name, wave),
-        in_words(
-            f"{name} has a periodic error with an amplitude of {{0}} and a period of {{1}}, both in units of {name}"
-        ),
-        sine_and_cosine_entries(1.0, 1 / frequencies),
-        guess=1e-4 * float(np.std(values)),
-        kind=WaveEffect,
-        counted_from=origin_in_words(name, origin),
-    )
+    period = LogUniform(shortest * 0.98, longest / 0.9)
+    parameters: Declared = {"a": (POSITIVE, name), "period": (period, name), "phase": (PHASE, "rad")}
+    both = "an amplitude of {0} and a period of {1}, both in units of"
+    says, bank = f"{name} has a periodic error with {both} {name}", sine_and_cosine_entries(1.0, 1 / frequencies)
+    own = (parameters, (covariate_of_column(name),), _column_changer(name, wave), in_words(says), bank)
+    guess, counted_from = 1e-4 * float(np.std(values)), origin_in_words(name, origin)
+    given = (f"periodic_error:{name}", Stage.INPUT, *own)
+    yield from about.form(*given, guess=guess, kind=WaveEffect, counted_from=counted_from)
 
 
-def delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+@within_runs
+def delayed_held_column(values: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return the value that a held column had one dead time before each row, (n_samples, n_points)."""
-    values = np.atleast_2d(c)
-    out = np.empty((max(len(values), len(theta)), values.shape[1]))
-    for rows in table.rows_by_scan():
-        time = table.time_s[rows]
-        earlier = time - theta[:, :1] + rounding_of_times(time)
-        before = np.clip(np.searchsorted(time, earlier, side="right") - 1, 0, None)
-        before = np.where(theta[:, :1] == 0, np.arange(len(rows)), before)  # also of rows with the same time
-        own = np.broadcast_to(values[:, rows], (len(out), len(rows)))
-        out[:, rows] = np.take_along_axis(own, np.broadcast_to(before, own.shape), axis=1)
-    return out
+    earlier = time - theta[:, :1] + rounding_of_times(time)
+    before = np.clip(np.searchsorted(time, earlier, side="right") - 1, 0, None)
+    before = np.where(theta[:, :1] == 0, np.arange(len(time)), before)  # also of rows with the same time
+    every, rows = np.broadcast_arrays(values, before)
+    return np.take_along_axis(every, rows, axis=1)
 
 
-def mean_of_delayed_held_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+@within_runs
+def mean_of_delayed_held_column(values: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return a held column delayed by a dead time, (n_samples, n_points): at each row its mean until the next row."""
-    values = np.atleast_2d(c)
-    out = np.array(np.broadcast_to(values, (max(len(values), len(theta)), values.shape[1])))
-    by = theta[:, 0]
-    for rows in table.rows_by_scan():
-        time, own = table.time_s[rows], values[:, rows]
-        gaps = np.diff(time)
-        there = gaps > rounding_error(table.time_s)
-        total = np.concatenate([np.zeros((len(own), 1)), np.cumsum(own[:, :-1] * gaps, axis=1)], axis=1)
-        since = values_at_earlier_times(time, total, by) + own[:, :1] * np.minimum(time - by[:, None] - time[0], 0.0)
-        out[:, rows[:-1][there]] = np.diff(since, axis=1)[:, there] / gaps[there]
+    by, gaps = theta[:, 0], np.diff(time)
+    there = gaps > rounding_error(time)
+    total = np.concatenate([np.zeros((len(values), 1)), np.cumsum(values[:, :-1] * gaps, axis=1)], axis=1)
+    since = values_at_earlier_times(time, total, by) + values[:, :1] * np.minimum(time - by[:, None] - time[0], 0.0)
+    out = np.array(np.broadcast_to(values, since.shape))
+    out[:, :-1][:, there] = np.diff(since, axis=1)[:, there] / gaps[there]
     return out
 
 
-def column_with_play(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+@within_runs
+def column_with_play(values: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return a column with play (backlash), (n_samples, n_points): it rests until the play is taken up.
 
     A run starts as if it had arrived in the direction of its first motion; without any, in the middle of the play.
     """
-    values = np.atleast_2d(c)
-    half = 0.5 * theta[:, 0]
-    out = np.empty((max(len(values), len(theta)), values.shape[1]))
-    for rows in table.rows_by_scan():
-        own = np.broadcast_to(values[:, rows[0]], half.shape).copy()
-        first = np.flatnonzero(np.abs(np.diff(values[0, rows])) > rounding_error(values[0]))
-        if first.size:  # assume the direction of arrival is that of the first motion
-            own -= half * np.sign(values[0, rows[first[0] + 1]] - values[0, rows[first[0]]])
-        for row in rows:
-            own = np.clip(own, values[:, row] - half, values[:, row] + half)
-            out[:, row] = own
+    half, moves = 0.5 * theta[:, 0], np.diff(values[0])
+    own, out = np.broadcast_to(values[:, 0], half.shape), np.empty((len(half), len(time)))
+    first = np.flatnonzero(np.abs(moves) > rounding_error(values[0]))
+    if first.size:
+        own = own - half * np.sign(moves[first[0]])
+    for k, column in enumerate(values.T):
+        out[:, k] = own = np.clip(own, column - half, column + half)
     return out
 
 
-def _moves_both_ways(values: FloatArray, table: RunTable) -> bool:
-    """Return whether a column both rises and falls, each at more than 2 % of the steps from row to row."""
-    moves = np.concatenate([np.diff(values[rows]) for rows in table.rows_by_scan()])
-    if not moves.size:
-        return False
-    still = rounding_error(values)
-    return bool((moves > still).mean() > _FORTH_AND_BACK and (moves < -still).mean() > _FORTH_AND_BACK)
+def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
+    """Yield a form for each term that may be missing from the rate of a state, for friction and for bounds."""
+    if not about.table.has_varying_time:  # nothing moves
+        return
+    for state in about.states:
+        for kind in ("damping", "drag", "forcing"):
+            yield from _rate_term_form(about, f"{kind}:{state}", state, state)
+        yield from _friction_form(about, state)
+        yield from _periodic_forcing_form(about, state)
+        yield from _limit_form(about, state)
+        for other in about.states:
+            for kind in ("cubic", "quadratic", *(("coupling",) if other != state else ())):
+                yield from _rate_term_form(about, f"{kind}:{state}:{other}", state, other)
+
+
+_TERMS: dict[str, tuple[Callable[[Any], Any], int, str]] = {
+    "damping": (lambda r: -r, 1, "a damping term -a {0}"),
+    "drag": (lambda r: -np.abs(r) * r, 2, "a drag term -a |{0}| {0}"),
+    "forcing": (lambda r: 1.0 + 0.0 * r, 0, "a constant term a"),
+    "cubic": (lambda r: -(r * r * r), 3, "a term -a {0}^3"),  # other powers than the square take twenty times as long
+    "quadratic": (lambda r: -(r**2), 2, "a term -a {0}^2"),
+    "coupling": (lambda r: -r, 1, "a term -a {0}"),
+}
+"""The term of each kind, of unit amplitude, as a function of a state; its degree in the state; and its words."""
+
+
+def _rate_term_form(about: ReferenceFit, name: str, state: str, other: str) -> Iterator[Form]:
+    kind = name.split(":")[0]
+    (term, degree, what), in_time = _TERMS[kind], f"per {about.time_unit}"
+    per = in_time if kind == "damping" else ""  # in a sentence; of another term it says more than it helps
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        said, minus, of = what.format(other).partition(" -a ")
+        if minus and mean[0] < 0:  # a term that adds to the rate, without a double negative
+            return f"the rate of {state} lacks a term +b {of}, b = -a = {value_with_sd(-mean[0], sd[0], per)}"
+        return f"the rate of {state} lacks {said}{minus}{of}, a = {value_with_sd(mean[0], sd[0], per)}"
+
+    act = acting(lambda motion, rows, a: motion.plus(terms=((state, lambda s, p, u: a * term(s[other])),)))
+    size = {"a": (AMPLITUDE, _unit_of_term(state, other, degree, about.time_unit))}
+    largest = float(np.nanmax(np.abs(about.states[other]))) or 1.0
+    own = (name, Stage.RATE, size, (f"state:{other}", "time"), act, says)
+    yield from about.form(*own, guess=trial_rate(about, state) / largest**degree)
+
+
+def _unit_of_term(state: str, other: str, degree: int, time_unit: str) -> str:
+    """Return the unit of a term's size: of a state per time, over the power of the state that it multiplies."""
+    if degree == 0:
+        return f"{state} per {time_unit}"
+    power, above = (degree - 1, "1") if other == state else (degree, state)
+    below = {0: time_unit, 1: f"({other} {time_unit})"}.get(power, f"({other}^{power} {time_unit})")
+    return f"{above}/{below}"
+
+
+def _friction_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+    # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
+    tried = _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31)
+    act = acting(lambda motion, rows, a: motion.plus(friction={state: a}))
+    says = in_words(f"dry friction slows {state} by {{0}} per {about.time_unit}, and holds it at rest")
+    size = ("a", f"{state} per {about.time_unit}")
+    return about.sized(f"friction:{state}", Stage.RATE, size, (f"state:{state}", "level"), act, says, tried)
+
+
+def _periodic_forcing_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+    time, origin, per = str(about.table.time), origin_of_column(about.table.time_s), about.time_unit
+    frequencies = trial_frequencies_in_time(about, max_n_trial_frequencies(len(about.table)))
+
+    @acting
+    def act(motion: LawWithEffects, rows: Any, a: FloatArray, hz: FloatArray, phase: FloatArray) -> LawWithEffects:
+        return motion.plus(terms=((state, lambda s, p, u: a * np.sin(2 * np.pi * hz * (u[time] - origin) + phase)),))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, period = value_with_sd(mean[0], sd[0]), period_with_sd(mean[1], sd[1], per)
+        of = f"an amplitude of {size} per {per} and a period of {period}"
+        return f"the rate of {state} lacks a sinusoidal term with {of}"
+
+    own = declared_wave(about, frequencies, f"{state} per {per}")
+    name = f"periodic_forcing:{state}"
+    yield from about.form(name, Stage.RATE, act=act, says=says, guess=trial_rate(about, state), **own)
+
+
+def _limit_form(about: ReferenceFit, state: str) -> Iterator[Form]:
+    """Yield a bound of a state: the rate beyond it is lost, or a state that it drives takes up a share (overflow)."""
+    ends = clipping_between(about.states[state])
+    if ends is None:
+        return
+    others = [other for other in about.states if other != state]
+    says_where = ends.says(state)
+
+    def act(value: LawWithEffects, theta: FloatArray, table: Any) -> LawWithEffects:
+        level = theta[:, :1]
+        above = level > ends.least_ceiling
+        spilt = {other: theta[:, k : k + 1] for k, other in enumerate(others, 1) if theta[:, k].any()}
+        ceiling = Limit(state, np.where(above, level, np.inf), spilt=spilt)
+        floor = Limit(state, np.where(above, -np.inf, level), upper=False, spilt=spilt)
+        return value.plus(limits=(ceiling, floor))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        shares = {other: value_with_sd(mean[k], sd[k]) for k, other in enumerate(others, 1) if mean[k] > _NO_SHARE}
+        taken = (f"; {other} takes up {share} of the rest" for other, share in shares.items())
+        return says_where(mean, sd) + "".join(taken)
+
+    def variant(taking: str | None) -> Form:
+        shares = {other: Uniform(0.0, 1.0) if other == taking else Fixed(0.0, _NO_SHARE) for other in others}
+        own: Declared = {"level": (ends.prior, state)} | {f"share[{name}]": (p, "1") for name, p in shares.items()}
+        bank = single_column_bank(ends.tried, *(0.5 * (other == taking) for other in others))
+        given = (f"limit:{state}", Stage.RATE, own, (f"state:{state}", "level"), act, says, bank)
+        return next(about.form(*given, absent={0: ends.nowhere}))
+
+    alone = variant(None)
+    if np.nanmax(about.rms_change_in_sds(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
+        # Downstream only: states that drive each other, as an angle and its rate, are no vessels.
+        drives = about.state_drives_rate
+        into = [other for other in others if drives(state, other) and not drives(other, state)]
+        yield replace(alone, alternatives=tuple(variant(other) for other in into))
+
+
+def trial_rate(about: ReferenceFit, state: str) -> float:
+    """Return a rate of a state that is too small to change the course of a law."""
+    return 1e-5 * _rms_rate(about, state)
+
+
+def _rms_rate(about: ReferenceFit, state: str) -> float:
+    """Return the rms rate of a state, by differences from row to row; 1 if that is 0."""
+    by_run = about.table.rows_by_scan()
+    moves, gaps = (np.concatenate([np.diff(v[r]) for r in by_run]) for v in (about.states[state], about.table.time_s))
+    there = gaps > rounding_error(about.table.time_s)
+    return float(np.sqrt(np.mean((moves[there] / gaps[there]) ** 2))) or 1.0

@@ -35,7 +35,7 @@ from probewise.systems.forms.reference import (
     flag,
     period_with_sd,
 )
-from probewise.systems.law import Jump
+from probewise.systems.law import Jump, LawWithEffects
 from probewise.systems.table import RunTable, covariate_of_column
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
@@ -58,7 +58,6 @@ def origin_of_column(values: FloatArray) -> float:
     """Return the origin from which an effect counts a column, (n_points,): 0, or the least value if that is far away.
 
     Far is more than ten times the column's range, as seconds of the epoch are: a drift from 0 would be a constant.
-    Effects keep the origin of the recording to which they were bound, whatever table they predict.
     """
     least = float(np.nanmin(values))
     return least if is_far_from_zero(values, float(np.nanmax(values)) - least) else 0.0
@@ -89,8 +88,7 @@ def trial_frequencies(
     Nothing tells a slower wave from a bend. They go up to one wave in `rows_each` rows of a group or `most_waves` /
     range, in steps of about half the resolution, but there are 8 at least and `most` at most.
     """
-    reach = float(np.ptp(values))
-    highest = _frequency_of_median_gap(values, groups, rows_each)
+    reach, highest = float(np.ptp(values)), _frequency_of_median_gap(values, groups, rows_each)
     highest = min(highest, len(distinct_values(values)) / (rows_each * reach), most_waves / reach)
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
     return np.asarray(np.linspace(least_waves / reach, max(highest, 2 * least_waves / reach), n))
@@ -143,7 +141,6 @@ def residual_peaks(about: ReferenceFit, tried: FloatArray) -> tuple[FloatArray, 
 
 
 def _times_of_readings(about: ReferenceFit) -> tuple[FloatArray, list[Any]]:
-    """Return the times of the rows with a reading, (n_read,), and the numbers of those of each run."""
     read = np.flatnonzero(about.has_reading)
     if np.ptp(about.table.time_s[read]) == 0:
         return about.table.time_s, about.table.rows_by_scan()
@@ -152,7 +149,6 @@ def _times_of_readings(about: ReferenceFit) -> tuple[FloatArray, list[Any]]:
 
 
 def _frequency_of_median_gap(values: FloatArray, groups: list[Any], rows_each: int) -> float:
-    """Return the frequency of one wave in `rows_each` median gaps between rows of a group, or else one in the range."""
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
     gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
@@ -160,7 +156,6 @@ def _frequency_of_median_gap(values: FloatArray, groups: list[Any], rows_each: i
 
 
 def _weighted_residuals(about: ReferenceFit) -> FloatArray:
-    """Return the residuals of the readings in noise variances, (n_read,), outlying ones clipped, about their mean."""
     own, table, read = about.system.simulator, about.table, about.has_reading
     sd = table.covariates[own.noise.sd][read] if isinstance(own.noise.sd, str) else np.full(int(read.sum()), about.sd)
     sd = np.where(np.isfinite(sd) & (sd > 0), sd, about.sd)
@@ -174,87 +169,82 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `declared` returns, from the quantity's name and unit, what `ReferenceFit.form` takes of it: parameters, covariates,
-    words and more; `between_rows` what a parameter of some name does between the rows of a law, where that is not as
-    its `hold` says.
+    `declared` is what `ReferenceFit.form` takes of it: parameters, covariates, words and more; `between_rows` what a
+    parameter does between the rows of a law, where that is not as its `hold` says.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
-    declared: Callable[[str, str], dict[str, Any]]
-    between_rows: Callable[[str], ActBetween] | None = None
+    declared: dict[str, Any]
+    between_rows: ActBetween | None = None
 
 
-def linear_drift_modulation(about: ReferenceFit) -> Modulation:
+def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
     """Return a linear drift a t, with recorded time t from its origin: 0, or the first time if far from 0."""
-    table, time_unit, origin = about.table, about.time_unit, origin_of_column(about.table.time_s)
-    return Modulation(
-        lambda theta, rows: theta[:, :1] * (rows.time_s - origin),
-        lambda what, unit: {
-            "parameters": {"a": (AMPLITUDE, f"{unit or '1'}/{time_unit}")},
-            "covariates": ("time",),
-            "says": lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {time_unit}",
-            "counted_from": origin_in_words(table.time, origin, time_unit),
-        },
-        lambda name: lambda motion, theta: motion.plus(drifts={name: theta[:, :1]}),
-    )
+    table, per, origin = about.table, about.time_unit, origin_of_column(about.table.time_s)
+    declared = {
+        "parameters": {"a": (AMPLITUDE, f"{unit or '1'}/{per}")},
+        "covariates": ("time",),
+        "says": lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {per}",
+        "counted_from": origin_in_words(table.time, origin, per),
+    }
+
+    def between_rows(motion: LawWithEffects, theta: FloatArray) -> LawWithEffects:
+        return motion.plus(drifts={what: theta[:, :1]})
+
+    return Modulation(lambda theta, rows: theta[:, :1] * (rows.time_s - origin), declared, between_rows)
 
 
-def column_proportional_modulation(about: ReferenceFit, name: str) -> Modulation:
+def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, name: str) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     middle, per = float(np.nanmean(about.table.covariates[name])), unit_of_name(name) or "unit"
-    return Modulation(
-        lambda theta, rows: np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle)),
-        lambda what, unit: {
-            "parameters": {"a": (AMPLITUDE, f"{unit or '1'} per {name}")},
-            "covariates": (covariate_of_column(name),),
-            "says": lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
-        },
-    )
+    declared = {
+        "parameters": {"a": (AMPLITUDE, f"{unit or '1'} per {name}")},
+        "covariates": (covariate_of_column(name),),
+        "says": lambda mean, sd: f"{what} changes by {value_with_sd(mean[0], sd[0], unit)} per {per} of {name}",
+    }
+    return Modulation(lambda theta, rows: theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle), declared)
 
 
-def change_point_step_modulation(about: ReferenceFit, *, may_end: bool = False) -> Modulation:
+def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, may_end: bool = False) -> Modulation:
     """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number; it may go back."""
-    table, time_unit, by_row = about.table, about.time_unit, not about.table.has_varying_time
+    table, by_row = about.table, not about.table.has_varying_time
     along = np.arange(float(len(table))) if by_row else table.time_s
     ends = sorted((along[rows].max(), along[rows].min()) for rows in table.rows_by_scan())
     change_points = ChangePoints.of(along, by_row=by_row)
     if len(ends) == 2 and ends[0][0] < ends[1][1] and len(change_points.at) > 5:
         change_points = replace(change_points, border=float(ends[0][0]))
     first, last = change_points.at[0], change_points.at[-1]
-    place, of_place = ("row", "row") if by_row else ("s", time_unit)
-    never, begin = Fixed(first - 2.0, first - 1.0), {f"at_{place}": (Uniform(first, last), of_place)}
+    place, of_place = ("row", "row") if by_row else ("s", about.time_unit)
 
     def at_in_words(mean: float, sd: float) -> str:  # of rows, a point between two, counted from 0
         row = f"row {int(mean) + 3} of the table (the header is row 1)"
-        return row if by_row else value_with_sd(mean, sd, time_unit)
+        return row if by_row else value_with_sd(mean, sd, about.time_unit)
 
-    def declared(what: str, unit: str) -> dict[str, Any]:
-        def says(mean: FloatArray, sd: FloatArray) -> str:
-            goes_back = may_end and mean[1] > mean[2]
-            then = f"goes back at {at_in_words(mean[1], sd[1])}" if goes_back else "stays there"
-            size = value_with_sd(mean[0], sd[0], unit)
-            return f"{what} jumps by {size} at {at_in_words(mean[-1], sd[-1])} and {then}"
-
-        own = {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
-        size, middle = {"a": (AMPLITUDE, unit)}, 0.5 * (first + last)
-        if not may_end:
-            return own | {"parameters": size | begin, "entries": np.array([[[1.0, middle]]]), "kind": StepEffect}
-        entries = np.array([[[1.0, first - 1.5, middle]]])
-        until = {f"until_{place}": (never, of_place)}
-        return own | {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        goes_back = may_end and mean[1] > mean[2]
+        then = f"goes back at {at_in_words(mean[1], sd[1])}" if goes_back else "stays there"
+        size = value_with_sd(mean[0], sd[0], unit)
+        return f"{what} jumps by {size} at {at_in_words(mean[-1], sd[-1])} and {then}"
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
         return np.asarray(theta[:, :1] * ((at > begin) & ((at <= end) | (end <= begin))))
 
-    if by_row:
-        return Modulation(at_rows, declared)
-    return Modulation(
-        at_rows, declared, lambda name: lambda law, theta: law.plus(jumps=(Jump(name, theta[:, :1], theta[:, 1:2]),))
-    )
+    def between_rows(motion: LawWithEffects, theta: FloatArray) -> LawWithEffects:
+        return motion.plus(jumps=(Jump(what, theta[:, :1], theta[:, 1:2]),))
+
+    size, begin = {"a": (AMPLITUDE, unit)}, {f"at_{place}": (Uniform(first, last), of_place)}
+    never, middle = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last)
+    declared = {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
+    if may_end:
+        until, entries = {f"until_{place}": (never, of_place)}, np.array([[[1.0, first - 1.5, middle]]])
+        declared |= {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
+    else:
+        declared |= {"parameters": size | begin, "entries": np.array([[[1.0, middle]]]), "kind": StepEffect}
+    return Modulation(at_rows, declared, None if by_row else between_rows)
 
 
-def value_per_run_modulation(about: ReferenceFit) -> Modulation:
+def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
     """Return a variation by one value per run: a_run; 0 for runs outside the recording that are like none of it."""
     names = about.table.scan_names
     known = {name: k for k, name in enumerate(names)}
@@ -264,23 +254,24 @@ def value_per_run_modulation(about: ReferenceFit) -> Modulation:
         values = np.concatenate([theta, np.zeros((len(theta), 1))], axis=1)
         return np.asarray(values[:, at[rows.scan]])
 
-    def declared(what: str, unit: str) -> dict[str, Any]:
-        def says(mean: FloatArray, sd: FloatArray) -> str:
-            far = int(np.argmax(np.abs(mean)))
-            by = value_with_sd(mean[far], sd[far], unit)
-            return f"{what} differs from run to run, most in run {names[far]}: by {by}"
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        far = int(np.argmax(np.abs(mean)))
+        by = value_with_sd(mean[far], sd[far], unit)
+        return f"{what} differs from run to run, most in run {names[far]}: by {by}"
 
-        parameters = {f"values[{name}]": (AMPLITUDE, unit) for name in names}
-        return dict(parameters=parameters, covariates=("run",), says=says, entries=np.eye(len(names))[None])
-
-    return Modulation(at_rows, declared)
+    parameters = {f"values[{name}]": (AMPLITUDE, unit) for name in names}
+    own = {"parameters": parameters, "covariates": ("run",), "says": says, "entries": np.eye(len(names))[None]}
+    return Modulation(at_rows, own)
 
 
-def modulations_over_rows(about: ReferenceFit) -> dict[str, Modulation]:
-    """Return a drift where time passes, a step, and a value per run where there are several, by what each is called."""
-    drift = {"drift": linear_drift_modulation(about)} if about.table.has_varying_time else {}
-    per_run = {"per_run": value_per_run_modulation(about)} if about.can_fit_value_per_run else {}
-    return {**drift, "step": change_point_step_modulation(about), **per_run}
+def modulations_over_rows(about: ReferenceFit) -> dict[str, Callable[..., Modulation]]:
+    """Return a drift where time passes, a step, and a value per run where there are several, by what each is called.
+
+    Each is a function of the fit, and of a quantity's name and unit.
+    """
+    drift = {"drift": linear_drift_modulation} if about.table.has_varying_time else {}
+    per_run = {"per_run": value_per_run_modulation} if about.can_fit_value_per_run else {}
+    return {**drift, "step": change_point_step_modulation, **per_run}
 
 
 def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highest: float = 0.0) -> dict[str, Any]:
@@ -299,54 +290,38 @@ def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highe
     }
 
 
-def sinusoid_modulation(about: ReferenceFit) -> Modulation:
+def sinusoid_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
     """Return the modulation by a wave whose frequency the residuals of the fit may suggest."""
-    time_unit, origin, frequencies = (
-        about.time_unit,
-        origin_of_column(about.table.time_s),
-        trial_frequencies_in_time(about),
-    )
+    frequencies, origin = trial_frequencies_in_time(about), origin_of_column(about.table.time_s)
     suggested, highest = residual_peaks(about, frequencies)
-    return Modulation(
-        lambda theta, rows: np.asarray(
-            theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3])
-        ),
-        lambda what, unit: {
-            "says": lambda mean, sd: (
-                f"{what} oscillates with an amplitude of {value_with_sd(mean[0], sd[0], unit)} and a period of "
-                f"{period_with_sd(mean[1], sd[1], time_unit)}"
-            ),
-            "suggested": suggested,
-            **declared_wave(about, frequencies, unit, highest),
-        },
-    )
+
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * (rows.time_s - origin) + theta[:, 2:3]))
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        size, period = value_with_sd(mean[0], sd[0], unit), period_with_sd(mean[1], sd[1], about.time_unit)
+        return f"{what} oscillates with an amplitude of {size} and a period of {period}"
+
+    own = {"says": says, "suggested": suggested, **declared_wave(about, frequencies, unit, highest)}
+    return Modulation(at_rows, own)
 
 
 def modulated_form(
-    about: ReferenceFit,
-    name: str,
-    stage: Stage,
-    how: Modulation,
-    act: Act,
-    guess: float,
-    what: str,
-    unit: str,
-    covariates: tuple[str, ...] = (),
+    about: ReferenceFit, name: str, stage: Stage, how: Modulation, act: Act, guess: float, *covariates: str
 ) -> Iterator[Form]:
     """Yield the form by which a quantity varies over the rows as `how`, applied by `act`; none if without effect.
 
     Several values have one scale in common, unless they are so many that a single one could not differ much more than
     the others within the bounds of a coordinate.
     """
-    declared = how.declared(what, unit)
-    declared["covariates"] += covariates
+    declared = how.declared | {"covariates": how.declared["covariates"] + covariates}
     for form in about.form(name, stage, act=act, guess=guess, **declared):
         if not 1 < len(form.amplitudes) <= _MOST_OF_ONE_SCALE:
             yield form
             continue
         # All runs may differ about as much, or one of them alone by far more than the others.
         names = form.prior.names
-        together = SharedScalePrior(names, cast(Any, form.parameters)[names[0]])
+        together = SharedScalePrior(names, cast(Any, form.marginals[names[0]]))
         yield replace(form, parameters=together, alternatives=(form,))
 
 
@@ -358,7 +333,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     """Yield a form for each way in which a parameter may vary: drift, step, one value per run, with a column."""
     simulator, table = about.system.simulator, about.table
     values = about.system.parameters(about.theta, table)
-    over = {_KINDS[kind]: how for kind, how in modulations_over_rows(about).items()}
+    over = {_KINDS[kind]: modulation for kind, modulation in modulations_over_rows(about).items()}
     for name, prior in simulator.parameters.items():
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(prior.from_unit(_QUARTILES))))
 
@@ -366,14 +341,16 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
             def at_rows(value: Any, theta: FloatArray, table: RunTable) -> Any:
                 return {**value, name: value[name] + how.at_rows(theta, table)}
 
-            act = at_rows if how.between_rows is None else ActInTime(at_rows, how.between_rows(name))
-            return modulated_form(about, form, Stage.PARAMETER, how, act, size, name, unit_of_name(name))
+            act = at_rows if how.between_rows is None else ActInTime(at_rows, how.between_rows)
+            return modulated_form(about, form, Stage.PARAMETER, how, act, size)
 
-        for kind, how in over.items():
+        of = name, unit_of_name(name)
+        for kind, modulation in over.items():
             if kind != "differs" or name not in simulator.per_run:
-                yield from varied(f"{kind}:{name}", how, guess / (about.duration if kind == "drifts" else 1.0))
+                size = guess / (about.duration if kind == "drifts" else 1.0)
+                yield from varied(f"{kind}:{name}", modulation(about, *of), size)
         for column in about.varying_columns:
-            how = column_proportional_modulation(about, column)
+            how = column_proportional_modulation(about, *of, column)
             for form in varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column]))):
                 yield _linear_or_by_factor(about, form, name, how) if isinstance(prior, LogUniform) else form
 
@@ -382,8 +359,8 @@ def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modula
     """Return a form of a parameter with two variants: it changes linearly, or by a factor, exponentially.
 
     A parameter with a log prior has no sign, and what changes it, as the temperature changes a rate, often multiplies
-    it. `a` is the slope where the modulation is 0 (a column's mean) in both. The second variant is offered where the
-    misfit may ask for a change that is not small beside the parameter; otherwise they are the same.
+    it. `a` is the slope where the modulation is 0 in both. The second variant is offered where the misfit may ask for a
+    change that is not small beside the parameter; otherwise they are the same.
     """
 
     def act(value: dict[str, FloatArray], theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:

@@ -17,7 +17,6 @@ from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
     Modulation,
-    change_point_step_modulation,
     column_proportional_modulation,
     modulated_form,
     modulations_over_rows,
@@ -48,7 +47,7 @@ _OUTLYING = 5.0  # medians of the residual's size
 def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
     """Return the cubic in the time since the row before of each gap, highest power first, (4, n_samples, n - 1).
 
-    They are splines through values (n_samples, n) at rising times (n,); of rows at the same time the last counts.
+    They are splines through values (n_samples, n); of rows at the same time the last counts.
     """
     from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
 
@@ -60,52 +59,56 @@ def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def late_forms(about: ReferenceFit) -> Iterator[Form]:
-    """Yield the forms of a reading that comes late, `lag` and `delay`, with a smooth variant where rows tell it."""
-    reading, unit = about.system.simulator.reading, about.time_unit
-    for name, act, tried, says in (
-        ("lag", lagged_readings, np.geomspace(0.02, 200.0, 33), f"{reading} lags with a time constant of {{0}}"),
-        ("delay", delayed_readings, np.geomspace(1e-3, 100.0, 41), f"{reading} is delayed by {{0}}"),
-    ):
+def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says: str) -> Iterator[Form]:
+    """Yield the form of a reading that comes late, with a smooth variant where rows tell it."""
 
-        def at_rows(value: FloatArray, theta: FloatArray, table: RunTable, act: Act = act) -> FloatArray:
-            return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
+    def at_rows(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
 
-        prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.table.median_gap * tried)
-        if prior is None:
-            continue
-        variants: list[Form] = []
-        for is_smooth in (False, True):
-            value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
-            own: Declared = {"tau_s": (prior, unit), _SMOOTH: (of_flag, "1")}
-            bank = single_column_bank(prior_sizes(prior), value)
-            given = (name, Stage.LAG, own, ("previous",), act, in_words(says, unit), bank)
-            variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
-        first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
-        apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
-        yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
+    prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.table.median_gap * tried)
+    if prior is None:
+        return
+    variants: list[Form] = []
+    for is_smooth in (False, True):
+        value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
+        own: Declared = {"tau_s": (prior, about.time_unit), _SMOOTH: (of_flag, "1")}
+        words = in_words(f"{about.system.simulator.reading} {says}", about.time_unit)
+        given = (name, Stage.LAG, own, ("previous",), act, words, single_column_bank(prior_sizes(prior), value))
+        variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
+    first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
+    apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
+    yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
 
 
-def lagged_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+def within_runs(change: Act) -> Act:
+    """Return the act that changes values run by run: `change` gets values (1 or n_samples, n), theta and the times."""
+
+    def act(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        values = np.atleast_2d(values)  # a column is (n_points,)
+        out = np.empty((max(len(values), len(theta)), values.shape[1]))
+        for rows in table.rows_by_scan():
+            out[:, rows] = change(values[:, rows], theta, table.time_s[rows])
+        return out
+
+    return act
+
+
+@within_runs
+def lagged_readings(x: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return readings that lag by first order, (n_samples, n_points); each run begins without a lag.
 
     `theta` (n_samples, 2) is the time constant, and above 0.5 for readings that are smooth between the rows.
     """
-    out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
-    tau, smooth = theta[:, :1], theta[:, 1:2] > 0.5
-    for rows in table.rows_by_scan():
-        if len(rows) < 2:
-            continue
-        time, x = table.time_s[rows], out[:, rows]
-        gaps = np.diff(time)
-        with np.errstate(divide="ignore"):
-            carry = np.where(tau > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)), 0.0)
-        gain = (1 - carry) * x[:, 1:]
-        if smooth.any():
-            gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(time, x, tau, carry), gain)
-        added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
-        out[:, rows] = decaying_sum(added, kept, longest=len(rows))
-    return out
+    if len(time) < 2:
+        return x
+    tau, smooth, gaps = theta[:, :1], theta[:, 1:2] > 0.5, np.diff(time)
+    with np.errstate(divide="ignore"):
+        carry = np.where(tau > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)), 0.0)
+    gain = (1 - carry) * x[:, 1:]
+    if smooth.any():
+        gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(time, x, tau, carry), gain)
+    added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
+    return decaying_sum(added, kept, longest=len(time))
 
 
 def _gain_of_smooth_readings(time: FloatArray, x: FloatArray, tau: FloatArray, carry: FloatArray) -> FloatArray:
@@ -125,7 +128,7 @@ def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> F
 
     `theta` (n_samples, 2) is the dead time, and above 0.5 for readings that are smooth between the rows.
     """
-    out = delayed_values(value, theta, table)
+    out: FloatArray = delayed_values(value, theta, table)
     smooth = np.flatnonzero(theta[:, 1] > 0.5)
     if smooth.size:
         by, own = theta[smooth, 0], value[smooth] if len(value) > 1 else value
@@ -134,13 +137,10 @@ def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> F
     return out
 
 
-def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+@within_runs
+def delayed_values(values: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
     """Return readings or a column, (n_points,) or (n_samples, n_points), delayed within runs by theta[:, 0]."""
-    values = np.atleast_2d(values)
-    out = np.empty((max(len(values), len(theta)), values.shape[1]))
-    for rows in table.rows_by_scan():
-        out[:, rows] = values_at_earlier_times(table.time_s[rows], values[:, rows], theta[:, 0])
-    return out
+    return values_at_earlier_times(time, values, theta[:, 0])
 
 
 def values_at_earlier_times(
@@ -171,32 +171,32 @@ def values_at_earlier_times(
 
 def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     """Yield every form of the reading that could be detectable in this table."""
-    table, unit, zero = about.table, about.reading_unit, about.system.simulator.noise.zero
-    reading = about.system.simulator.reading
+    own, zero = about.system.simulator, about.system.simulator.noise.zero
     span = float(np.ptp(about.predicted)) or about.sd
 
     def added(name: str, how: Modulation) -> Iterator[Form]:
-        own = (about.sd, reading, unit)
-        return modulated_form(about, name, Stage.OFFSET, how, lambda y, theta, rows: y + how.at_rows(theta, rows), *own)
+        own = (name, Stage.OFFSET, how, lambda y, theta, rows: y + how.at_rows(theta, rows), about.sd)
+        return modulated_form(about, *own)
 
     def scaled(name: str, how: Modulation) -> Iterator[Form]:
         def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
             return zero + (value - zero) * (1 + how.at_rows(theta, rows))
 
-        gain = f"the gain of {reading}"
-        return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, gain, "1", ("level",))
+        return modulated_form(about, name, Stage.GAIN, how, act, about.sd / span, "level")
 
-    for kind, how in modulations_over_rows(about).items():
-        yield from added(f"offset_{kind}", how)
-        # Rows may be in another unit for a while.
-        of_gain = change_point_step_modulation(about, may_end=True) if kind == "step" else how
-        yield from scaled(f"gain_{kind}", of_gain)
-    if table.has_varying_time:
-        yield from added("interference", sinusoid_modulation(about))
+    reading, of_gain = (own.reading, own.unit), (f"the gain of {own.reading}", "1")
+    for kind, modulation in modulations_over_rows(about).items():
+        yield from added(f"offset_{kind}", modulation(about, *reading))
+        ends = {"may_end": True} if kind == "step" else {}  # rows may be in another unit for a while
+        yield from scaled(f"gain_{kind}", modulation(about, *of_gain, **ends))
+    if about.table.has_varying_time:
+        yield from added("interference", sinusoid_modulation(about, *reading))
         yield from _settling_form(about)
-        yield from late_forms(about)
+        lags, dead = np.geomspace(0.02, 200.0, 33), np.geomspace(1e-3, 100.0, 41)
+        yield from _late_form(about, "lag", lagged_readings, lags, "lags with a time constant of {0}")
+        yield from _late_form(about, "delay", delayed_readings, dead, "is delayed by {0}")
     for name in about.varying_columns:
-        yield from added(f"sensitivity:{name}", column_proportional_modulation(about, name))
+        yield from added(f"sensitivity:{name}", column_proportional_modulation(about, *reading, name))
         yield from _curve_form(about, name)
         if name not in about.states:
             yield from _friction_form(about, name)
@@ -272,32 +272,24 @@ def _friction_form(about: ReferenceFit, name: str) -> Iterator[Form]:
 
 def time_since_start_of_run(table: RunTable) -> FloatArray:
     """Return the time since the first row of each row's run, (n_points,)."""
-    first = np.array([table.time_s[rows].min() if rows.size else 0.0 for rows in table.rows_by_scan()])
+    first = np.array([table.time_s[rows].min() for rows in table.rows_by_scan()])
     return np.asarray(table.time_s - first[table.scan])
 
 
 def settling_time_prior(about: ReferenceFit) -> LogUniform:
-    """Return the log-uniform prior of a settling time constant, from half a gap between rows to twice the longest run.
-
-    It begins at a hundredth of the longest run if that is less.
-    """
+    """Return the prior of a settling time: from half a gap, or a hundredth of the longest run, to twice that run."""
     longest = float(time_since_start_of_run(about.table).max()) or 1.0
     return LogUniform(min(0.5 * about.table.median_gap, 0.01 * longest), 2 * longest)
 
 
 def _settling_form(about: ReferenceFit) -> Iterator[Form]:
     prior, units = settling_time_prior(about), (about.reading_unit, about.time_unit)
+    act = acting(lambda value, rows, a, tau_s: value + a * np.exp(-time_since_start_of_run(rows) / tau_s))
     says = "is off by {0} at the start of each run, and settles with a time constant of {1}"
-    yield from about.form(
-        "settling",
-        Stage.OFFSET,
-        {"a": (AMPLITUDE, units[0]), "tau_s": (prior, units[1])},
-        ("time", "run"),
-        acting(lambda value, rows, a, tau_s: value + a * np.exp(-time_since_start_of_run(rows) / tau_s)),
-        in_words(f"{about.system.simulator.reading} {says}", *units),
-        single_column_bank(1.0, np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES)),
-        guess=1.0,
-    )
+    words, taus = f"{about.system.simulator.reading} {says}", np.geomspace(prior.low * 1.5, 0.5 * prior.high, N_SIZES)
+    parameters: Declared = {"a": (AMPLITUDE, units[0]), "tau_s": (prior, units[1])}
+    own = (parameters, ("time", "run"), act, in_words(words, *units), single_column_bank(1.0, taus))
+    yield from about.form("settling", Stage.OFFSET, *own, guess=1.0)
 
 
 def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
@@ -324,18 +316,18 @@ def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
 def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
-    unit, way = about.reading_unit, "{more/less} while it rises than while it falls"
-    says = in_words(f"{about.system.simulator.reading} reads {{|0|}} {way}", unit, factors=(2,))
+    own, way = about.system.simulator, "{more/less} while it rises than while it falls"
+    says = in_words(f"{own.reading} reads {{|0|}} {way}", own.unit, factors=(2,))
     act = acting(lambda value, rows, a: value + a * sign_of_change(value, rows))
-    size, bank = {"a": (about.amplitude_prior(about.sd), unit)}, single_column_bank(about.sd)
+    size, bank = {"a": (about.amplitude_prior(about.sd), own.unit)}, single_column_bank(about.sd)
     yield from about.form("hysteresis", Stage.HYSTERESIS, size, ("previous",), act, says, bank, amplitudes=(0,))
 
 
 def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, BoolArray]:
     """Return the readings to be expected, (n_points,), and the mask of the readings that are no outliers from these.
 
-    Expected are the predicted readings, bent as the recorded ones are: by a polynomial in the predicted reading, fitted
-    to the residuals. Without it a law that lacks a bend misses the ends of the range by many noise sds.
+    They are the predicted ones, bent by a polynomial in these, fitted to the residuals: without it a law that lacks a
+    bend misses the ends of the range by many noise sds.
     """
     predicted, readings = about.predicted, about.table.columns[about.system.simulator.reading]
     low, high = float(predicted.min()), float(predicted.max())
@@ -390,5 +382,6 @@ def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     if levels.size:
         prior = Uniform(bottom - 0.02 * span, top + 0.02 * span)
         ends = Clipping(prior, middle, levels, float(top + 1e3 * span))
-        says = ends.says(about.system.simulator.reading, about.reading_unit)
-        yield from about.clipped("saturation", Stage.SATURATION, ends, about.reading_unit, ("level",), ends.act, says)
+        unit, says = about.reading_unit, ends.says(about.system.simulator.reading, about.reading_unit)
+        own = ({"level": (prior, unit)}, ("level",), ends.act, says, single_column_bank(levels))
+        yield from about.form("saturation", Stage.SATURATION, *own, absent={0: ends.nowhere})

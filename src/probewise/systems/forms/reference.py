@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, permutations
 from typing import Any, Self, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from probewise._arrays import BoolArray, FloatArray, distinct_values, varies
@@ -23,15 +24,14 @@ from probewise.effects.effect import (
     StepEffect,
     in_words,
     priors_and_units,
-    single_column_bank,
     thinned,
 )
 from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.calls import call_on_read_only, read_only_views
+from probewise.systems.calls import call_on_views
 from probewise.systems.integrate import integrate_states
 from probewise.systems.law import LawWithEffects
-from probewise.systems.simulator import Law, Simulator
+from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
@@ -122,8 +122,8 @@ def chance_of_sorted_readings(simulator: Simulator, table: RunTable) -> float:
 
     It is 1 too where a time was recorded, where equal rows are apart, and where readings rise or fall along all rows.
     """
-    readings = table.columns.get(simulator.reading)
-    if table.has_varying_time or readings is None or readings.dtype != np.float64:
+    readings = table.columns.get(simulator.reading, np.array(""))
+    if table.has_varying_time or readings.dtype != np.float64:
         return 1.0
     codes = [  # a number for each cell, the same for cells that are equal but for rounding
         np.where(np.isfinite(values), np.searchsorted(distinct_values(values), values, side="right"), 0)
@@ -155,11 +155,9 @@ def note_on_row_order(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
     chance = chance_of_sorted_readings(simulator, table)
     if chance > _BY_CHANCE:
         return ()
-    return (
-        f"rows are in no order of recording: wherever the other columns are equal, {simulator.reading} is sorted, by "
-        f"chance once in {1 / max(chance, 1e-300):.0e} tables; nothing is asked that needs "
-        "their order, such as a jump at a row, hysteresis or correlated noise",
-    )
+    sorted_ = f"wherever the other columns are equal, {simulator.reading} is sorted, by chance once in "
+    unasked = "nothing is asked that needs their order, such as a jump at a row, hysteresis or correlated noise"
+    return (f"rows are in no order of recording: {sorted_}{1 / max(chance, 1e-300):.0e} tables; {unasked}",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +217,6 @@ def switch_points(values: FloatArray) -> FloatArray:
     return distinct[at[0] : at[-1] + 2] if at.size else distinct[:0]
 
 
-_ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
 ONE_AMPLITUDE = np.ones((1, 1, 1))  # template bank
 
 
@@ -267,21 +264,29 @@ class ReferenceFit:
     @cached_property
     def predicted(self) -> FloatArray:
         """Readings that the fit predicts, (n_points,), without noise and effects."""
-        if self.known is not None:
-            return self.known.predicted
-        predicted: FloatArray = self.system.chain(self.table, ()).predict(self.theta, self.table)[0]
-        return predicted
+        chain = self.system.chain(self.table, ())
+        return chain.predict(self.theta, self.table)[0] if self.known is None else self.known.predicted
 
     @cached_property
-    def states(self) -> dict[str, FloatArray]:
+    def _parameters_and_columns(self) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
+        columns = columns_without_reading(self.system.simulator, self.table)
+        return self.system.parameters(self.theta, self.table), columns
+
+    @cached_property
+    def states(self) -> Mapping[str, FloatArray]:
         """Each state at the rows, (n_points,), by name; none without a law."""
-        system = self.system
-        if self.known is not None or system.simulator.law is None:
-            return {} if self.known is None else dict(self.known.states)
-        columns = columns_without_reading(system.simulator, self.table)
-        parameters = system.parameters(self.theta, self.table)
-        found = integrate_states(system.simulator.law, system.steps(self.table), parameters, columns)
+        law = self.system.simulator.law
+        if self.known is not None or law is None:
+            return {} if self.known is None else self.known.states
+        found = integrate_states(law, self.system.steps(self.table), *self._parameters_and_columns)
         return {state: values[0] for state, values in found.items()}
+
+    def _rates(self, *given: Mapping[str, Any]) -> Mapping[str, Any]:
+        law = self.system.simulator.law
+        assert law is not None
+        with np.errstate(all="ignore"):
+            rates: Mapping[str, Any] = call_on_views(law.rates, *given)
+        return rates
 
     @cached_property
     def states_with_rates_by_definition(self) -> frozenset[str]:
@@ -289,42 +294,29 @@ class ReferenceFit:
 
         Rates are compared at parameters drawn from their priors, states anywhere within twice the fit's range and rows.
         """
-        law, names = self.system.simulator.law, list(self.states)
-        if law is None or len(names) < 2:
+        if self.system.simulator.law is None or len(self.states) < 2:
             return frozenset()
-        rng = np.random.default_rng(0)
-        rows = rng.integers(len(self.table), size=_N_COMPARED)
-        z = rng.standard_normal((_N_COMPARED, self.theta.shape[1]))
+        n, rng = _N_COMPARED, np.random.default_rng(0)
+        rows, z = rng.integers(len(self.table), size=n), rng.standard_normal((n, self.theta.shape[1]))
         by_row = self.system.parameters(self.system.theta(z), self.table)
-        at = np.arange(_N_COMPARED)
-        p = {name: np.broadcast_to(v, (_N_COMPARED, len(self.table)))[at, rows][:, None] for name, v in by_row.items()}
-        columns = columns_without_reading(self.system.simulator, self.table)
-        u = {name: values[rows][:, None] for name, values in columns.items()}
-        s = {
-            name: (2 * np.abs(values).max() or 1.0) * rng.uniform(-1, 1, (_N_COMPARED, 1))
-            for name, values in self.states.items()
-        }
+        p = {name: np.broadcast_to(v, (n, len(self.table)))[np.arange(n), rows][:, None] for name, v in by_row.items()}
+        u = {name: values[rows][:, None] for name, values in self._parameters_and_columns[1].items()}
+        spans = {name: 2 * np.abs(values).max() or 1.0 for name, values in self.states.items()}
+        s = {name: span * rng.uniform(-1, 1, (n, 1)) for name, span in spans.items()}
         try:
-            rates = _rates_of(law, s, p, u)
+            rates = self._rates(s, p, u)
         except Exception:  # a user's function may refuse states that no reading asks for
             return frozenset()
-        return frozenset(
-            state
-            for state in names
-            for other in names
-            if other != state and np.array_equal(np.broadcast_to(rates[state], s[other].shape), s[other])
-        )
+        pairs = ((state, s[other]) for state, other in permutations(s, 2))
+        return frozenset(name for name, other in pairs if np.array_equal(np.broadcast_to(rates[name], (n, 1)), other))
 
     def state_drives_rate(self, state: str, other: str) -> bool:
         """Return whether the rate of the state `other` depends on `state` at some row of the table."""
-        law = self.system.simulator.law
-        if law is None or self.known is not None:  # it matters to priors only
+        if self.system.simulator.law is None or self.known is not None:  # it matters to priors only
             return False
-        parameters = self.system.parameters(self.theta, self.table)
-        columns = columns_without_reading(self.system.simulator, self.table)
         there = {name: values[None, :] for name, values in self.states.items()}
         nudged = there | {state: there[state] + _NUDGE * np.ptp(there[state])}
-        apart = np.subtract(*(_rates_of(law, s, parameters, columns)[other] for s in (nudged, there)))
+        apart = np.subtract(*(self._rates(s, *self._parameters_and_columns)[other] for s in (nudged, there)))
         return bool(np.any(np.abs(apart) > 0))
 
     @cached_property
@@ -386,7 +378,7 @@ class ReferenceFit:
 
     def change_of_readings(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the readings' change, (n_settings, n_points), by `act` with parameters (n_settings, n_params)."""
-        priors = dict.fromkeys(map(str, range(settings.shape[1])), _ANY)
+        priors = dict.fromkeys(map(str, range(settings.shape[1])), Uniform(0.0, 1.0))  # it is not used
         trial = Form("trial", stage, priors, (), (), act, settings, lambda mean, sd: "", amplitudes=())
         chain = replace(self.system.chain(self.table, ()), effects=(trial,))
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
@@ -457,13 +449,6 @@ class ReferenceFit:
             own = (name, stage, {parameter: (prior, unit)}, covariates, act, says, entries)
             yield from self.form(*own, absent={0: 0.0}, **more)
 
-    def clipped(
-        self, name: str, stage: Stage, ends: Clipping, unit: str, covariates: tuple[str, ...], act: Act, says: Say
-    ) -> Iterator[Form]:
-        """Yield the form of a quantity, of this unit, that ends at a level."""
-        own = ({"level": (ends.prior, unit)}, covariates, act, says, single_column_bank(ends.tried))
-        return self.form(name, stage, *own, absent={0: ends.nowhere})
-
     def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
         """Return the heavy-tailed prior of an amplitude of this typical size; a misfit above 1 widens its tails."""
         plain = HeavyTailedPrior(typical, positive=positive)
@@ -478,13 +463,6 @@ class ReferenceFit:
         first, last = int(there[0]), int(there[-1])
         low, high = float(tried[first]), float(tried[last if last > first else min(last + 1, len(tried) - 1)])
         return LogUniform(low, high) if low < high else None
-
-
-def _rates_of(law: Law, *given: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the rates of a law, of states, parameters and columns."""
-    with np.errstate(all="ignore"):
-        rates: Mapping[str, Any] = call_on_read_only(law.rates, *map(read_only_views, given))
-    return rates
 
 
 def prior_sizes(prior: LogUniform) -> FloatArray:

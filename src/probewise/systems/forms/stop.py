@@ -44,13 +44,10 @@ class MeterStop:
         near = 1e-9 * (1 + abs(self.level))
         way, beyond = ("rises", np.maximum) if self.is_ceiling else ("falls", np.minimum)
         says = f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip()
+        prior = {"level": Uniform(self.level - near, self.level + near)}
+        own = ("saturation", Stage.NOISE, prior, ("reading",), ("level",), lambda noise, theta, plan: noise)
         return NoiseEffect(
-            "saturation",
-            Stage.NOISE,
-            {"level": Uniform(self.level - near, self.level + near)},
-            ("reading",),
-            ("level",),
-            lambda noise, theta, plan: noise,
+            *own,
             np.array([[[self.level]]]),
             lambda mean, sd: f"{says}, where the meter stops",
             amplitudes=(),

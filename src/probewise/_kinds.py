@@ -71,7 +71,7 @@ def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...
     if isinstance(value, Real):
         value = (value,)
     array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
-    if not array_like or not all(_is_finite_real(v) for v in value):  # type: ignore[attr-defined]
+    if not array_like or getattr(value, "ndim", 1) == 0 or not all(_is_finite_real(v) for v in value):  # type: ignore[attr-defined]
         raise ParameterError(name, value, "a number, or several in a list")
     return tuple(v.item() if isinstance(v, np.generic) else v for v in value)  # type: ignore[attr-defined]
 

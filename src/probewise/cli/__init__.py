@@ -23,7 +23,7 @@ from types import ModuleType
 
 from probewise._signals import Stopped, stoppable
 from probewise._writing import NotDrawnError
-from probewise.cli._common import OneLineParser, OutputError, error_in_one_line, print_complaint, print_warning
+from probewise.cli._common import CLOSED, OneLineParser, OutputError, error_in_one_line, print_complaint, print_warning
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
 __all__ = ["VERBS", "main", "parser"]
@@ -123,6 +123,8 @@ def _discard_unwritable_output() -> None:
     """Send output that can no longer be written to the null device, so that the interpreter's flush at exit works."""
     try:
         sys.stdout.flush()
+    except CLOSED:
+        return
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -34,6 +34,7 @@ least, and the memory have no bound."""
 SHIPPED_RECORDINGS = {
     name: Path(__file__).parents[1] / "data" / f"{name}.csv" for name in ("paper", "concealed")
 }  # as `recordings.shipped` has them, which takes NumPy to import
+CLOSED = (ValueError, AttributeError)  # of sys.stdout and sys.stderr that a FILE.py has closed, or set to None
 MOST_BATCH = 100  # readings chosen at a time, each given those before it
 
 
@@ -198,14 +199,14 @@ def print_result(text: str, *, quiet: bool = False) -> None:
         write_to_terminal(sys.stdout, text + "\n")
     except BrokenPipeError:
         raise
-    except OSError as error:
-        line = shown(text.partition("\n")[0])
-        raise OutputError(f"standard output takes no more ({error.strerror}); it was to print {line}") from error
+    except (OSError, *CLOSED) as error:
+        line, why = shown(text.partition("\n")[0]), getattr(error, "strerror", None) or "it is closed"
+        raise OutputError(f"standard output takes no more ({why}); it was to print {line}") from error
 
 
 def print_complaint(text: str) -> None:
     """Write a line to standard error, if that can still be written to."""
-    with contextlib.suppress(OSError):  # the terminal was closed
+    with contextlib.suppress(OSError, *CLOSED):
         write_to_terminal(sys.stderr, text + "\n")
 
 

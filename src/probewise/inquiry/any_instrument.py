@@ -236,7 +236,7 @@ class InstrumentModel:
 def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape: tuple[int, ...]) -> FloatArray:
     """Call a user's function; ShapeError unless its readings broadcast to `shape`, with as many axes."""
     with np.errstate(all="ignore"):
-        out = np.asarray(function(parameters, settings), dtype=np.float64)
+        out = floats(function(parameters, settings), "what the model returns")
     if out.ndim != len(shape) or any(have not in (1, want) for have, want in zip(out.shape, shape, strict=True)):
         raise ShapeError(f"model returns an array of shape {out.shape}; allowed: {shape}, one number for each setting")
     return out if out.shape == shape else np.array(np.broadcast_to(out, shape))

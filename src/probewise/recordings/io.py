@@ -41,6 +41,9 @@ def read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
+_AS_UTF_8 = "UTF-8 text (save the file again with that encoding)"
+
+
 def read_text(path: Path, what: str) -> str:
     """Read a whole file of UTF-8, or of UTF-16 with its byte-order mark, without that mark; `what` as in `read_bytes`.
 
@@ -49,11 +52,15 @@ def read_text(path: Path, what: str) -> str:
     content = read_bytes(path, what)
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        return content.decode("utf-16" if wide else "utf-8-sig")
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+        if (zero := text.find("\0")) < 0:
+            return text
+        found = f"character {zero} is NUL, as in UTF-16 without its mark or in a file that is no text"
+        raise FileError(path, found, _AS_UTF_8)
     except UnicodeDecodeError as error:
         row = content.count(b"\n", 0, error.start) + 1
         found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not {'UTF-16' if wide else 'UTF-8'}"
-        raise FileError(path, found, "UTF-8 text (save the file again with that encoding)", row=row) from error
+        raise FileError(path, found, _AS_UTF_8, row=row) from error
 
 
 _MOST_DIGITS = 400  # more digits than any finite float has before the point

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray, nearly_equal
-from probewise.errors import FileError, ShapeError, message_of, require
+from probewise._arrays import FloatArray, IntArray, floats, nearly_equal
+from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
 from probewise.recordings.io import EndedByFile
@@ -209,7 +209,7 @@ class Caller:
         n_samples = shape[0]
         self._count_call()
         try:
-            readings = np.asarray(self._simulated(parameters, columns), dtype=np.float64)
+            readings = self._simulated(parameters, columns)
         except Exception:
             if strict:
                 raise
@@ -251,7 +251,7 @@ class Caller:
         known = self._known.pop(key := _digest_of_arguments(own, columns), None)
         if known is None:
             self._count_call()
-            known = _readings_broadcast_to_shape(np.array(self._simulated(own, columns), float), (n_points,), self.name)
+            known = _readings_broadcast_to_shape(self._simulated(own, columns), (n_points,), self.name).copy()
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -324,7 +324,7 @@ def _call_each(path: Path, given: Sequence[tuple[Values, Values]]) -> list[Float
     with np.errstate(all="ignore"):
         for each in given:
             try:
-                out.append(np.array(call_on_read_only(_simulate_of_file(path), *map(read_only_views, each)), float))
+                out.append(floats(call_on_read_only(_simulate_of_file(path), *map(read_only_views, each))).copy())
             except Exception:
                 out.append(None)
     return out
@@ -376,8 +376,12 @@ def _values_of_sample(
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
 
 
-def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
-    """Return the readings broadcast to the wanted shape; raise ShapeError if they do not fit it."""
+def _readings_broadcast_to_shape(returned: Any, wanted: tuple[int, ...], name: str) -> FloatArray:
+    """Return readings broadcast to the wanted shape; raise ShapeError if they do not fit it, or are no real numbers."""
+    try:
+        readings = floats(returned)  # what is masked is NaN
+    except ParameterError:
+        raise ShapeError(f"{name} returns {shown(returned)}; allowed: real numbers of shape {wanted}") from None
     if readings.shape == wanted:
         return readings
     if readings.ndim == len(wanted):

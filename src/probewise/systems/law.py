@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, floats
 from probewise.errors import ShapeError
 from probewise.systems.calls import call_on_read_only, read_only_views
 from probewise.systems.simulator import Columns, Law, Values
@@ -128,7 +128,7 @@ def readings_of_states(law: Law, states: Values, parameters: Values, columns: Va
         return first
     with np.errstate(all="ignore"):
         given = map(read_only_views, (states, parameters, columns))
-        out = np.asarray(call_on_read_only(law.observe, *given), dtype=np.float64)
+        out = floats(call_on_read_only(law.observe, *given), "what observe returns")
     try:
         return np.array(np.broadcast_to(out, first.shape))
     except ValueError:

@@ -187,9 +187,12 @@ class Simulator:
         checked_text("reading", self.reading, 'the name of the column that is predicted: reading = "..."')
         require_kind("unit", self.unit, str, 'a text: unit = "..."')
         checked_text("time_unit", self.time_unit, 'a text, such as "min"')
+        known = {self.reading: "the reading"}
         for name, column in (("time", self.time), ("run", self.run)):
             if column is not None:
                 checked_text(name, column, f'the name of a column, {name} = "...", or None')
+                allowed = f"another column than {known.setdefault(column, name)}"
+                require(known[column] == name, name, column, allowed)
         if self.simulate is not None:
             way = "a function simulate(parameters, columns); of a file: read_simulator('FILE.py') of probewise.systems"
             require_callable("simulate", self.simulate, way)

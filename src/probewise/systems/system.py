@@ -25,7 +25,7 @@ from probewise.systems.integrate import evaluations_per_step, integrate_states
 from probewise.systems.law import LawWithEffects, readings_of_states
 from probewise.systems.simulator import Columns, Simulator, Values
 from probewise.systems.step import Steps, steps_for_table
-from probewise.systems.table import RunTable, relative_sds_of_column
+from probewise.systems.table import LARGEST_IN_FIT, RunTable, relative_sds_of_column
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
@@ -102,8 +102,12 @@ class System:
         allowed = "a column besides the reading, such as the time or the number of each row"
         require(columns_without_reading(simulator, table), "columns", list(table.columns), allowed)
         bare = cls(simulator, table.scan_names)
+        starts = bare.theta(bare.starts)
+        for name, values in zip(bare.marginals, starts.T, strict=True):
+            value = float(values[np.argmax(np.abs(values))])  # inf where the prior is wider than floats
+            require(abs(value) <= LARGEST_IN_FIT, name, value, f"a prior with magnitudes up to {LARGEST_IN_FIT:g}")
         if simulator.simulate is not None:
-            tried = bare.theta(bare.starts[:_N_TRIED])
+            tried = starts[:_N_TRIED]
             if simulator.run is None:  # it is called for one recording after the other
                 cells = [np.isfinite(values) for values in table.covariates.values()]
                 table = table.take(max(table.rows_by_scan(), key=lambda rows: sum(int(c[rows].sum()) for c in cells)))

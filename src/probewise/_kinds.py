@@ -159,12 +159,17 @@ def checked_text(name: str, value: object, allowed: str = "a text") -> str:
 
 
 def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
-    """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text."""
-    if isinstance(value, str) or not isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping):
+    """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text.
+
+    Those of a set are sorted: its order differs from one process to the next.
+    """
+    several = isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping) and getattr(value, "ndim", 1) > 0
+    if isinstance(value, str) or not several:
         raise ParameterError(
             name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
         )
-    return tuple(checked_text(name, each, allowed) for each in value)
+    texts = tuple(checked_text(name, each, allowed) for each in value)  # type: ignore[attr-defined]
+    return tuple(sorted(texts)) if isinstance(value, set | frozenset) else texts
 
 
 def require_mapping(name: str, value: object, allowed: str) -> None:

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray, floats, nearly_equal
 from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
-from probewise.recordings.io import EndedByFile
+from probewise.recordings.io import EndedByFile, in_this_directory
 from probewise.systems.simulator import Columns, Simulate, Simulator, Values, read_simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
@@ -272,7 +272,8 @@ class Caller:
                 self._known[key] = readings
 
     def _simulated(self, parameters: Values, columns: Columns) -> Any:
-        return call_on_read_only(self.simulate, read_only_views(parameters), read_only_views(columns))
+        with in_this_directory():
+            return call_on_read_only(self.simulate, read_only_views(parameters), read_only_views(columns))
 
     def _count_call(self) -> None:
         self.n_calls += 1

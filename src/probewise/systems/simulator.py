@@ -8,13 +8,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
-from probewise._kinds import checked_path, checked_text, checked_texts, require_callable, require_kind, require_mapping
+from probewise._kinds import (
+    checked_path,
+    checked_text,
+    checked_texts,
+    require_callable,
+    require_kind,
+    require_mapping,
+    require_one_of,
+)
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
 from probewise.priors import Marginal, parse_prior
@@ -117,8 +125,8 @@ class Law:
         if self.observe is not None:
             require_callable("observe", self.observe, "a function observe(states, parameters, columns), or None")
         require(self.states, "states", dict(self.states), "one state or more, each with where it starts")
-        require(self.hold in ("previous", "linear"), "hold", self.hold, "'previous' or 'linear'")
-        is_step = self.max_step_s is None or 0 < self.max_step_s < np.inf
+        require_one_of("hold", self.hold, get_args(Hold))
+        is_step = self.max_step_s is None or _is_positive_number(self.max_step_s)
         require(is_step, "max_step_s", self.max_step_s, "greater than 0")
 
 

@@ -150,6 +150,13 @@ LAWS = {
         "import math\n" + law_whose_rates('return {"temp_c": -math.sin(s["temp_c"])}'),
         "allowed: np.sin(x) in place of math.sin(x)",
     ),
+    "rates that are no real numbers": (
+        law_whose_rates('return {"temp_c": 1j * s["temp_c"]}'), "rates is 'complex128 of temp_c'; allowed: real",
+    ),
+    "steps without end": (
+        law_whose_rates('return {"temp_c": -s["temp_c"]}').replace("states", "max_step_s = 1e-9\nstates", 1),
+        "max_step_s is 1e-09; allowed: 0.00",
+    ),
     "an if": (
         law_whose_rates('return {"temp_c": -1.0 if s["temp_c"] > 0 else 1.0}'),
         "allowed: np.where(condition, a, b) in place of if",

@@ -29,6 +29,7 @@ from probewise.systems.table import LARGEST_IN_FIT, RunTable, relative_sds_of_co
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
+_MOST_STEPS_GIVEN = 100_000  # over the longest run by a person's max_step_s: the trial integrations alone take a minute
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
 _CHEAPER = 2.0  # evaluations of the explicit method for one of a linearly implicit one, from which that is taken
 _CONVERGING = 4.0  # factor by which halving the step reduces the change at least, if the law is smooth
@@ -126,7 +127,11 @@ class System:
                 raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         assert simulator.law is not None
-        system = replace(bare, max_step=simulator.law.max_step_s or table.median_gap, stiff=stiff)
+        step = simulator.law.max_step_s or table.median_gap
+        longest = max(float(np.ptp(table.time_s[rows])) for rows in table.rows_by_scan())
+        allowed = f"{longest / _MOST_STEPS_GIVEN:.1g} or more: {_MOST_STEPS_GIVEN:,} steps over the longest run"
+        require(longest <= step * _MOST_STEPS_GIVEN, "max_step_s", step, allowed)
+        system = replace(bare, max_step=step, stiff=stiff)
         system.require_working_law(table)
         return system
 
@@ -147,6 +152,8 @@ class System:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
                 states = integrate_states(law, self.steps(table), parameters, columns)
+                for state, values in states.items():
+                    require(values.dtype.kind == "f", "rates", f"{values.dtype} of {state}", "real numbers, in arrays")
                 readings.append(readings_of_states(law, states, parameters, columns))
             except ProbewiseError:
                 raise

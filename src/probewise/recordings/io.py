@@ -132,7 +132,7 @@ def _parse_finite_number(digits: str) -> float:
 
 
 def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
-    """Run a user's file as `import` would, its folder on the search path, and return the names that it defines.
+    """Run a user's file as `import` would, its folder first on the search path, and return the names that it defines.
 
     Raises FileError, with the line, if it cannot be read or run; `what` says what the file should be.
     """

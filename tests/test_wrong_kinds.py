@@ -25,7 +25,7 @@ from probewise.recordings import HalfPlane, Plan, Recording, read_recording, wri
 from probewise.report.plots import spatial_sensitivity
 from probewise.scene import AnyOf, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels
-from probewise.systems import Simulator, predict_system
+from probewise.systems import Law, Simulator, predict_system, table_for
 from probewise.world import Blob, World, gaussian_spot
 
 RNG = np.random.default_rng(0)
@@ -238,7 +238,29 @@ MISTAKES = {
     ),
     # investigations
     "a number for a budget": (lambda: investigated(record, PLAN, budget=300), r"budget is 300; allowed: a Budget\("),
+    # tables
+    "a column without a name": (lambda: table_for(OVEN, {**TABLE, 1: TABLE["t_s"]}), "the name of a column is 1; allo"),
+    "a cell beyond floats": (
+        lambda: table_for(OVEN, {**TABLE, "x": [10**400] * 12}),
+        "column 'x' is .*; allowed: numb",
+    ),
+    "a text for a step": (lambda: Law({"s": 0.0}, len, max_step_s="1"), "max_step_s is '1'; allowed: greater than 0"),
+    # settings of any instrument
+    "settings of which one is masked": (
+        lambda: probewise.Inquiry(min, {"a": (0, 1)}, np.ma.masked_less([1.0, 2.0], 2), 0.1, rng=RNG),
+        "settings is nan; allowed: finite numbers",
+    ),
     # the verbs
+    "an array for a method": (lambda: explore(SENSOR, method=np.ones(3)), "method is array.*; allowed: 'particles'"),
+    "a number for cards": (lambda: explore(SENSOR, cards=[1]), "cards is 1; allowed: Cards, of probewise.scene"),
+    "a function for a utility": (
+        lambda: explore(SENSOR, utility=len),
+        "utility is .*; allowed: one of finishing, info",
+    ),
+    "an array without an axis": (
+        lambda: explore(SENSOR, repeats=np.array(1)),
+        r"repeats is array\(1\); allowed: a num",
+    ),
     "a bar of another kind": (
         lambda: calibrate(RECORDING, progress=lambda done: None),
         r"progress is .*; allowed: True, False, or a function progress\(stage, done, total, note\)",

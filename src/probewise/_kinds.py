@@ -71,7 +71,7 @@ def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...
     if isinstance(value, Real):
         value = (value,)
     array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
-    if not array_like or not all(_is_finite_real(v) for v in value):  # type: ignore[attr-defined]
+    if not array_like or getattr(value, "ndim", 1) == 0 or not all(_is_finite_real(v) for v in value):  # type: ignore[attr-defined]
         raise ParameterError(name, value, "a number, or several in a list")
     return tuple(v.item() if isinstance(v, np.generic) else v for v in value)  # type: ignore[attr-defined]
 
@@ -159,11 +159,17 @@ def checked_text(name: str, value: object, allowed: str = "a text") -> str:
 
 
 def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
-    """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text."""
-    if isinstance(value, str) or not isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping):
-        shown = f": [{value!r}]" if isinstance(value, str) else ""
-        raise ParameterError(name, value, f"{allowed}, in a list{shown}")
-    return tuple(checked_text(name, each, allowed) for each in value)
+    """Return several texts, none empty, as a tuple; raise ParameterError for anything else, also for a single text.
+
+    Those of a set are sorted: its order differs from one process to the next.
+    """
+    several = isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping) and getattr(value, "ndim", 1) > 0
+    if isinstance(value, str) or not several:
+        raise ParameterError(
+            name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
+        )
+    texts = tuple(checked_text(name, each, allowed) for each in value)  # type: ignore[attr-defined]
+    return tuple(sorted(texts)) if isinstance(value, set | frozenset) else texts
 
 
 def require_mapping(name: str, value: object, allowed: str) -> None:

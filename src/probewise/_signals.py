@@ -26,6 +26,7 @@ SAME_S: Final = 1.0
 """Signals within this many seconds count as one request: a closed terminal sends several."""
 
 _asked: list[tuple[int, float]] = []  # number and time of each request to stop the command that runs
+_deferring = False  # whether the main thread is in a block of `defer_signals`
 
 
 class Stopped(KeyboardInterrupt):
@@ -94,6 +95,10 @@ def defer_signals() -> Iterator[None]:
 
     For blocks that must not be interrupted: stopping motors, putting files in place.
     """
+    global _deferring
+    if _deferring or threading.current_thread() is not threading.main_thread():  # an outer block has the first signal
+        yield
+        return
     first: list[tuple[int, float]] = []
 
     def remember_signal(number: int, frame: FrameType | None) -> None:
@@ -105,8 +110,10 @@ def defer_signals() -> Iterator[None]:
 
     try:
         with _signals_handled_by(remember_signal) as restore:
+            _deferring = True
             yield
     finally:
+        _deferring = False
         if first:
             signal.raise_signal(first[0][0])
 

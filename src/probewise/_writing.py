@@ -367,17 +367,21 @@ class Drawings:
     ) -> None:
         """Draw figures, by name, and the page report.html into the directory of results, which are complete there.
 
-        `page` builds the HTML from the figures by name; b"" stands for one that could not be drawn.
+        `page` builds the HTML from the figures by name; b"" stands for one that could not be drawn. NotDrawnError if
+        none can be written.
         """
         kept = f"the results are in {self.out}, without figures and report"
         drawn: dict[str, bytes] = {}
         every = {**drawers, PAGE: lambda: page(drawn).encode("utf-8", "backslashreplace")}
-        with reporting_what_is_kept(lambda: kept, results=True), staged_output(self.out, inputs=inputs) as stage:
-            for name, drawer in every.items():
-                progress("drawing the report", len(drawn), len(every), name)
-                drawn[name] = self.draw(name, drawer)
-                if drawn[name]:
-                    stage.write(name, drawn[name])
+        try:
+            with reporting_what_is_kept(lambda: kept), staged_output(self.out, inputs=inputs) as stage:
+                for name, drawer in every.items():
+                    progress("drawing the report", len(drawn), len(every), name)
+                    drawn[name] = self.draw(name, drawer)
+                    if drawn[name]:
+                        stage.write(name, drawn[name])
+        except FileError as error:  # such as a full disk
+            raise NotDrawnError(f"{error}; {kept}") from error
 
     def write_results(self, made: Output, *, inputs: Sequence[Path] = (), progress: Progress = silent) -> None:
         """Write the files of a run, all or none, then figures and page; remove outdated files of an earlier run."""

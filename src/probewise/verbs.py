@@ -9,7 +9,7 @@ Each function's See Also names the version with every option. Heavy imports happ
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, get_args
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -113,12 +113,12 @@ def calibrate(
     2
     """
     from probewise import calibration
+    from probewise._kinds import require_one_of
     from probewise._progress import progress_or_bar, sampler_progress
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
 
-    if method not in ("quick", "full", "paper"):
-        raise ParameterError("method", method, "'quick', 'full' or 'paper'")
+    require_one_of("method", method, ("quick", "full", "paper"))
     paper = method == "paper"
     if nested_stop is not None and not (paper and nested_stop in NESTED_STOP):
         allowed = " or ".join(map(repr, NESTED_STOP)) if paper else "None"
@@ -286,6 +286,9 @@ def explore(
     _kinds.require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     require_fitted_sensor(sensor, "in the order explore(sensor, ...)")
     _kinds.require_flag("learn_sensor", learn_sensor)
+    for name, value, known in (("method", method, experiment.MethodName), ("model", model, experiment.Model)):
+        _kinds.require_one_of(name, value, get_args(known))
+    _kinds.require_kind("cards", cards, (tuple, list), "cards, of probewise.scene, in a list")
     lies = experiment.as_shape(shape, field)
     streams, hidden = experiment.RandomStreams.spawned_from(rng), None
     naive = method == "paper" and model == "naive"

@@ -104,6 +104,12 @@ def test_one_figure_that_fails_leaves_the_others(tmp_path):
         drawings.raise_if_any_failed()
 
 
+def test_a_page_that_cannot_be_written_is_one_that_is_not_drawn(tmp_path):
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(NotDrawnError, match=r"a directory of that name .*; the results are in .*, without figures"):
+        Drawings(tmp_path).write_report({}, lambda drawn: "page")
+
+
 def test_an_interruption_while_figures_are_drawn_says_where_the_results_are(tmp_path):
     def interrupt():
         raise KeyboardInterrupt

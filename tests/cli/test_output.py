@@ -1,6 +1,7 @@
 """Results are written whole or not at all, and nothing that was read is lost for them."""
 
 import contextlib
+import io
 import itertools
 import os
 import signal
@@ -12,6 +13,7 @@ import pytest
 from probewise._writing import Drawings, Output, staged_output
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
+from probewise.cli._common import OutputError, print_result
 from probewise.cli._inputs import holds_readings
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_recording, write_text_atomically
@@ -235,6 +237,15 @@ def test_a_full_standard_output_is_told_with_what_it_was_to_print(
         said = capsys.readouterr().err
         assert "standard output takes no more (No space left on device); it was to print '" in said
         assert said.endswith(f"what was written is kept: {out}\n")
+
+
+def test_a_standard_output_that_a_file_closed_is_told(monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    for stream in (closed, None):
+        monkeypatch.setattr("sys.stdout", stream)
+        with pytest.raises(OutputError, match=r"takes no more \(it is closed\); it was to print 'kept'"):
+            print_result("kept")
 
 
 def test_a_signal_while_files_are_put_in_place_is_heard_when_all_are(tmp_path, monkeypatch):

@@ -1,5 +1,8 @@
 """Mistakes in a person's file and table: exit status 2, one line that says which, where and what is allowed."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from heater import FILE, runs
@@ -62,6 +65,9 @@ FILES = {
         ("noise =", "class Odd:\n    def __repr__(self): 1 / 0\nparameters['gain'] = Odd()\nnoise ="), "is a Odd",
     ),
     "no simulator": (("def simulate", "def simulat"), "simulate, rates is 'neither'"),
+    "readings that are no real numbers": (("return p", "return 1j + p"), "simulate returns array(["),
+    "a time that is the reading": (('"t_s"', '"temp_c"'), "time is 'temp_c'; allowed: another column than the reading"),
+    "a prior wider than squares of floats": (("(0, 10)", "(-1e200, 1e200)"), "e+199; allowed: a prior with magnitudes"),
     "runs that are not named": (
         ('time, run = "t_s", "run"', 'time = "t_s"'), "per_run is ['start_c']; allowed: nothing, or run =",
     ),
@@ -84,6 +90,20 @@ def test_an_exit_at_some_parameters_makes_them_impossible(tmp_path):
     assert np.isfinite(readings[1]).all()
 
 
+def test_a_file_that_goes_elsewhere_leaves_names_of_folders_and_libraries_what_they_are(tmp_path, monkeypatch):
+    """It changes the working directory when it is run and when it is called; a module lies beside it."""
+    path = tmp_path / "own" / "heater.py"
+    path.parent.mkdir()
+    (path.parent / "beside.py").write_text("")
+    go = "import os; os.chdir(os.path.dirname(__file__))"
+    path.write_text(f"{go}\n{FILE}".replace("return p", f"{go}; import beside\n    return p"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    System.of(read_simulator(path), runs())
+    assert Path.cwd() == tmp_path
+    assert sys.path[-1] == str(path.parent)
+
+
 def cell(row, column, text):
     lines = [line.split(",") for line in run_table_csv(runs()).splitlines()]
     lines[row - 1][lines[0].index(column)] = text
@@ -92,6 +112,12 @@ def cell(row, column, text):
 
 TABLES = {
     "a reading that is text": (cell(5, "temp_c", "warm"), "in row 5 is 'warm'"),
+    "a reading beyond floats": (cell(5, "temp_c", "1e400"), "in row 5 is '1e400'"),
+    "an input too large to be squared": (cell(5, "room_c", "-1e308"), "column 'room_c' in row 5 is -1e+308; allowed:"),
+    "a span too small to be squared": (
+        run_table_csv(runs().with_columns({"room_c": np.arange(36) * 1e-300})),
+        "span of column 'room_c' is 3.5e-299",
+    ),
     "an input that is text": (cell(5, "power_w", "4;5"), "these contain text: power_w ('4;5')"),
     "a time that is missing": (cell(5, "t_s", ""), "row 5, column t_s: the cell is empty"),
     "a time that falls": (
@@ -124,6 +150,13 @@ LAWS = {
     "a sine of one number": (
         "import math\n" + law_whose_rates('return {"temp_c": -math.sin(s["temp_c"])}'),
         "allowed: np.sin(x) in place of math.sin(x)",
+    ),
+    "rates that are no real numbers": (
+        law_whose_rates('return {"temp_c": 1j * s["temp_c"]}'), "rates is 'complex128 of temp_c'; allowed: real",
+    ),
+    "steps without end": (
+        law_whose_rates('return {"temp_c": -s["temp_c"]}').replace("states", "max_step_s = 1e-9\nstates", 1),
+        "max_step_s is 1e-09; allowed: 0.00",
     ),
     "an if": (
         law_whose_rates('return {"temp_c": -1.0 if s["temp_c"] > 0 else 1.0}'),

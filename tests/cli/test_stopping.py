@@ -115,7 +115,7 @@ def test_deferred_lines_are_finished_first_unless_the_signal_is_repeated(repeate
 
     def lines():
         with stoppable():
-            with defer_signals(), contextlib.nullcontext() if repeated else defer_signals():
+            with defer_signals(), defer_signals():
                 signal.raise_signal(signal.SIGTERM)
                 done.append("still here")
                 if repeated:

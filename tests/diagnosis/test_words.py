@@ -15,6 +15,10 @@ from probewise.diagnosis.words import effects_in_words, hypothesis_in_words, joi
             ("lag", "periodic_error:u", "periodic_error:u~again"),
             "a sensor that follows slowly and two periodic errors of u",
         ),
+        (
+            ("depends:tau_s:at 10:30", "sensitivity:a:b"),
+            "tau_s that depends on at 10:30 and readings that depend on a:b",
+        ),
         (("flicker", "lag"), "a flickering lamp and a sensor that follows slowly"),
     ],
 )

@@ -1,5 +1,6 @@
 """An inquiry over any settings: its posterior against a closed form, its choices, its forms, what it refuses."""
 
+import copy
 import math
 import subprocess
 import sys
@@ -118,6 +119,12 @@ def test_a_reading_without_its_setting_is_taken_once_for_each_choice():
         asked.next()
         asked.tell(0.5)
     assert len(asked.readings) == 2
+
+
+def test_what_a_copy_is_told_is_not_told_to_the_inquiry():
+    asked = inquiry()
+    copy.copy(asked).tell(1.0, 0.5)
+    assert asked.readings == ()
 
 
 def test_readings_taken_together_are_spread():

@@ -159,7 +159,9 @@ def test_a_run_interrupted_within_rounds_ends_as_one_never_interrupted(name: str
     for last_call in itertools.count(3, 3):
         problem = Counted(make(), last_call, interrupt)
         try:
-            found = quiet(problem, move=MOVES[move], checkpoint=path, checkpoint_every_s=0, **options)
+            found = quiet(
+                problem, move=MOVES[move], checkpoint=path, checkpoint_every_s=0, return_interrupted=True, **options
+            )
         except KeyboardInterrupt:  # before the first round was done
             continue
         if problem.n_calls < last_call:
@@ -326,10 +328,10 @@ def test_a_disk_that_fills_up_costs_the_checkpoint_only(path: Path, monkeypatch:
 # ------------------------------------------------------------------ Ctrl-C
 
 
-def test_ctrl_c_gives_what_there_is_and_says_so() -> None:
+def test_ctrl_c_gives_what_there_is_if_asked_for_and_says_so() -> None:
     problem = Counted(problems.plateau(), calls_of(problems.plateau, n_live=40) - 2, interrupt)
     with pytest.warns(DoubtfulResultWarning, match=r"interrupted; log Z lacks"):
-        result = run(problem, rng=np.random.default_rng(SEED), n_live=40, max_cost=1.0)
+        result = run(problem, rng=np.random.default_rng(SEED), n_live=40, max_cost=1.0, return_interrupted=True)
     assert result.stop_reason == "interrupted"
     assert "doubtful: interrupted" in result.summary()
     assert result.n_dead >= 60
@@ -337,7 +339,7 @@ def test_ctrl_c_gives_what_there_is_and_says_so() -> None:
     assert np.exp(result.log_weight).sum() == pytest.approx(1.0)
 
 
-def test_ctrl_c_raises_where_it_should_and_the_run_is_saved(path: Path) -> None:
+def test_ctrl_c_raises_by_default_and_the_run_is_saved(path: Path) -> None:
     late = calls_of(problems.plateau, n_live=40) - 2
     with pytest.raises(KeyboardInterrupt):
         quiet(
@@ -345,7 +347,6 @@ def test_ctrl_c_raises_where_it_should_and_the_run_is_saved(path: Path) -> None:
             n_live=40,
             checkpoint=path,
             checkpoint_every_s=NEVER,
-            return_interrupted=False,
         )
     problem = Counted(problems.plateau())
     whole = quiet(problems.plateau(), n_live=40)

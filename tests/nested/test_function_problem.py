@@ -127,6 +127,8 @@ def test_chains_step_over_the_end_of_a_circle_and_stay_even() -> None:
         (one_point, SQUARE, {"names": ["y", "x"]}, "those of the prior"),
         (one_point, {"x": stats.poisson(3)}, {}, r"prior\['x'\] is .*continuous"),
         (one_point, SQUARE, {"periodic": ["z"]}, "periodic is .*names among"),
+        (one_point, SQUARE, {"periodic": 3}, "periodic is 3; allowed: names among"),
+        (one_point, to_square, {"names": 3}, "names is 3; allowed: names of the parameters, in a list"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_words(

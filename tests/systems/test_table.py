@@ -53,6 +53,13 @@ def test_names_of_runs_are_texts(given, names):
     assert table.columns["run"].tolist() == [names[k] for k in table.scan]
 
 
+@pytest.mark.parametrize("given", [[1.1, 1.1, 2.0], np.array([1.1, 1.1, 2.0], dtype=object)])
+def test_names_of_runs_that_were_read_as_numbers_with_a_fraction_are_noted(given):
+    """1.10 was 1.1 before it came here."""
+    assert "of which 1.10 is 1.1" in RunTable({"run": given, "x": np.zeros(3)}, run="run").notes[0]
+    assert not RunTable({"run": [1.0, 2.0, np.nan], "x": np.zeros(3)}, run="run").notes
+
+
 def test_a_simulator_gets_names_of_runs_as_numbers_only_if_they_are_different_numbers():
     for given, expected in ((["1", "02"], [1.0, 2.0]), (["1.1", "1.10"], ["1.1", "1.10"]), (["1", "b"], ["1", "b"])):
         table = RunTable({"run": given, "x": [0.0, 1.0]}, run="run")

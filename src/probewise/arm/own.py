@@ -25,7 +25,7 @@ from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError, message_of, require
 from probewise.recordings.columns import KNOWN, SESSION
-from probewise.recordings.io import run_python_file
+from probewise.recordings.io import in_this_directory, run_python_file
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
@@ -213,7 +213,7 @@ class OwnInstrument:
         """
         aside = contextlib.redirect_stdout(sys.stderr) if self.source else contextlib.nullcontext()
         try:
-            with aside:
+            with aside, in_this_directory():
                 yield
         except BaseException as error:
             if not self.source or isinstance(error, KeyboardInterrupt):

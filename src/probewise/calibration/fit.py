@@ -199,7 +199,7 @@ def calibrate(
 def _checked_orders(orders: object) -> tuple[int, ...]:
     """Return the numbers of Gaussians without duplicates, or raise ParameterError."""
     allowed = "one or more whole numbers from 1, such as (1, 2)"
-    if isinstance(orders, str) or not isinstance(orders, Iterable):
+    if isinstance(orders, str) or not isinstance(orders, Iterable) or getattr(orders, "ndim", 1) == 0:
         raise ParameterError("orders", orders, allowed)
     asked = tuple(orders)
     require(asked and all(isinstance(n, Integral) and int(n) >= 1 for n in asked), "orders", asked, allowed)

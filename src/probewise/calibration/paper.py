@@ -131,7 +131,7 @@ def search_prior_of_order(
     """Search the prior of an order by nested sampling, and refine the evidence if `refined`; return the posterior."""
     problem = problems.problem(n_gaussians)
     report = None if progress is None else partial(progress, n_gaussians)
-    result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
+    result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0)
     if not refined:
         note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
         return OrderPosterior(result, None, (note,))

@@ -160,7 +160,7 @@ def _run_silently(problem: Samplable, n_live: int, rng: np.random.Generator, pro
     report = None if progress is None else partial(progress, len(problem.prior.names) // 6)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # they are in the result
-        return run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
+        return run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0)
 
 
 def fit_orders_quickly(

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 
 from probewise._signals import Stopped, stoppable
 from probewise._writing import NotDrawnError
-from probewise.cli._common import OutputError, error_in_one_line, print_complaint, print_warning
+from probewise.cli._common import CLOSED, OutputError, error_in_one_line, print_complaint, print_warning
 from probewise.cli._options import VERBS, parser
 from probewise.errors import LinkError, NotConvergedError, ProbewiseError
 
@@ -74,6 +74,8 @@ def _discard_unwritable_output() -> None:
     """Send output that can no longer be written to the null device, so that the interpreter's flush at exit works."""
     try:
         sys.stdout.flush()
+    except CLOSED:
+        return
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -18,6 +18,8 @@ from probewise.errors import ProbewiseError, printable, shown
 if TYPE_CHECKING:
     from probewise.progress import Progress
 
+CLOSED = (ValueError, AttributeError)  # of sys.stdout and sys.stderr that a FILE.py has closed, or set to None
+
 
 class CommandError(ProbewiseError, ValueError):
     """A command that cannot be carried out as given: an option is missing or does not apply, or nobody answers."""
@@ -40,9 +42,9 @@ def print_result(text: str) -> None:
         write_to_terminal(sys.stdout, text + "\n")
     except BrokenPipeError:
         raise
-    except OSError as error:
-        line = shown(text.partition("\n")[0])
-        raise OutputError(f"standard output takes no more ({error.strerror}); it was to print {line}") from error
+    except (OSError, *CLOSED) as error:
+        line, why = shown(text.partition("\n")[0]), getattr(error, "strerror", None) or "it is closed"
+        raise OutputError(f"standard output takes no more ({why}); it was to print {line}") from error
 
 
 def say(arguments: argparse.Namespace, *lines: str) -> None:
@@ -69,7 +71,7 @@ def progress_of(arguments: argparse.Namespace, *, beat: bool = True) -> Iterator
 
 def print_complaint(text: str) -> None:
     """Write a line to standard error, if that can still be written to."""
-    with contextlib.suppress(OSError):  # the terminal was closed
+    with contextlib.suppress(OSError, *CLOSED):
         write_to_terminal(sys.stderr, text + "\n")
 
 

@@ -97,6 +97,7 @@ def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunT
             try:
                 as_recording(simulator, table)
                 table.require_rising_time()
+                table.require_moderate_numbers()
             except ParameterError as error:
                 raise FileError(path, f"{error.name} is {error.value}", error.allowed) from error
     return concatenate_tables(tables, [path.name for path in paths])

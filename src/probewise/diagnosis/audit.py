@@ -572,6 +572,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     """
     table = table_for(simulator, table)
     table.require_rising_time()
+    table.require_moderate_numbers()
     inputs = replace(table, columns={name: v for name, v in table.columns.items() if name != simulator.reading})
     own = cast(RunTable, as_recording(simulator, inputs).plan)
     system = System.of(simulator, own)

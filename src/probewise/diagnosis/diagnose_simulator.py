@@ -57,6 +57,7 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     if simulator.reading not in table.columns:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
     table.require_rising_time()
+    table.require_moderate_numbers()
     whole = as_recording(simulator, table)
     usable = np.flatnonzero(whole.usable)
     chosen = usable[positions_in_stretches(table.scan[usable], MOST_READINGS)]

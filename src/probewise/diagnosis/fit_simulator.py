@@ -285,9 +285,7 @@ def _nested_sampling(
     n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * z.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # the doubt is part of the result
-        found = nested.run(
-            target, rng=rng, n_live=n_live, progress=report_round, max_cost=1.0, return_interrupted=False
-        )
+        found = nested.run(target, rng=rng, n_live=n_live, progress=report_round, max_cost=1.0)
     return Evidence(found.log_z, found.log_z_error, method, "; ".join(found.warnings[:1]))
 
 

@@ -88,11 +88,13 @@ def effect_has_words(name: str) -> bool:
 
 def effect_in_words(name: str) -> str:
     """Return an effect's name in words; a user's own effect keeps its name."""
-    kind, *targets = name_without_copy_suffix(name).split(":")
+    kind, _, rest = name_without_copy_suffix(name).partition(":")
     if name.startswith(PROPOSAL):
-        return f"a term {targets[-1]} in {'the rate of ' if targets[0] == 'rate' else ''}{targets[1]}"
-    if targets and kind in FORMS_IN_WORDS:
-        return FORMS_IN_WORDS[kind].format(*targets)
+        side, target, term = rest.split(":", 2)
+        return f"a term {term} in {'the rate of ' if side == 'rate' else ''}{target}"
+    if rest and kind in FORMS_IN_WORDS:
+        words = FORMS_IN_WORDS[kind]
+        return words.format(*rest.split(":", words.count("{") - 1))  # a column's name, the last, may have colons
     return {**FORMS_IN_WORDS, **EFFECTS_IN_WORDS}.get(kind, spoken_name(name))
 
 

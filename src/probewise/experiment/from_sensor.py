@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, cast, get_args
 import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic
+from probewise._kinds import require_kind, require_like, require_one_of
 from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_fitted_sensor
@@ -23,6 +24,7 @@ from probewise.experiment.simulated import Model, scale_of
 from probewise.inference import Naive, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import Finishing, Grid, ReadingEntropy, Utility, utility_named
+from probewise.inquiry.utilities import UTILITY_NAMES
 from probewise.nested import NESTED_STOP, NestedStop
 from probewise.priors import LogNormal, Marginal, Normal, Product
 from probewise.recordings import Recording
@@ -129,6 +131,14 @@ def experiment_for(
         If a name is unknown, or an option does not go with the method, the model or the sensor.
     """
     require_fitted_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
+    require_one_of("method", method, _METHODS)
+    require_one_of("model", model, _MODELS)
+    if nested_stop is not None:
+        require_one_of("nested_stop", nested_stop, tuple(NESTED_STOP))
+    if utility is not None and not isinstance(utility, str):
+        require_like("utility", utility, ("label", "__call__"), f"one of {', '.join(UTILITY_NAMES)}, or a utility")
+    for card in cards:
+        require_kind("cards", card, Card, "Cards, of probewise.scene")
     scale, paper = scale_of(sensor.instrumentation), method == "paper"
     bin_width = scale.step or float(sensor.noise_sd.mean())
     chosen = utility_named(utility, bin_width=bin_width) if isinstance(utility, str) else utility
@@ -136,11 +146,7 @@ def experiment_for(
     from_sheets = "from repeated readings over black and white"
     complete = "1, since the sensor model is taken for complete,"
     paper_utility = chosen is None or isinstance(chosen, ReadingEntropy)
-    methods, models, stops = (" or ".join(map(repr, names)) for names in (_METHODS, _MODELS, NESTED_STOP))
     refused = (
-        ("method", method, method not in _METHODS, methods),
-        ("model", model, model not in _MODELS, models),
-        ("nested_stop", nested_stop, nested_stop not in (None, *NESTED_STOP), stops),
         ("nested_stop", nested_stop, not paper and nested_stop is not None, f"None, but {for_paper}"),
         ("naive", naive, not paper and naive is not None, f"None, but {for_paper}"),
         ("naive", naive, model != "naive" and naive is not None, f"None, but {for_naive}"),

@@ -173,7 +173,6 @@ class NestedSampling:
                 stop=self.stop,
                 move=self.move,
                 max_cost=1.0,  # the robot waits
-                return_interrupted=False,
             )
         except NotConvergedError:  # no hypothesis of this kind could have given the readings
             return had.with_zero_evidence()

@@ -81,6 +81,8 @@ class Settings:
                 sizes = {name: len(column) for name, column in columns.items()}
                 raise ParameterError("settings", sizes, _ALLOWED)
             return cls(columns, "name")
+        if isinstance(given, np.ma.MaskedArray):
+            given = floats(given, "settings")  # what is masked is NaN
         try:
             array = np.asarray(given)
         except ValueError as error:
@@ -135,7 +137,7 @@ class Settings:
 
 def _checked_column(name: str, values: Any) -> Column:
     """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
-    array = np.array(values)
+    array = np.array(floats(values, name) if isinstance(values, np.ma.MaskedArray) else values)
     require(array.ndim == 1 and array.size and array.dtype.kind in "biufU", name, values, _ALLOWED)
     if array.dtype.kind == "U":  # NumPy makes numbers among names texts
         require(all(isinstance(one, str) for one in values), name, values, _ALLOWED)
@@ -236,7 +238,7 @@ class InstrumentModel:
 def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape: tuple[int, ...]) -> FloatArray:
     """Call a user's function; ShapeError unless its readings broadcast to `shape`, with as many axes."""
     with np.errstate(all="ignore"):
-        out = np.asarray(function(parameters, settings), dtype=np.float64)
+        out = floats(function(parameters, settings), "what the model returns")
     if out.ndim != len(shape) or any(have not in (1, want) for have, want in zip(out.shape, shape, strict=True)):
         raise ShapeError(f"model returns an array of shape {out.shape}; allowed: {shape}, one number for each setting")
     return out if out.shape == shape else np.array(np.broadcast_to(out, shape))
@@ -507,7 +509,7 @@ class Inquiry(ShowsItself):
             self._lost_nats = max(by_prior - found.log_z, 0.0)
         self._particles, self._prior_log_likelihood = found, of_prior
         self._readings = readings
-        self._taken.append((at[0], value))
+        self._taken = [*self._taken, (at[0], value)]  # a copy of this inquiry keeps those it has
         self._utility = self._next = None
         self.__dict__.pop("_hypotheses", None)
 

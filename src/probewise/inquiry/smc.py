@@ -347,7 +347,6 @@ def nested_sampling_from_scratch(
         move=KernelMove(moves=moves),
         stop=RemainingEvidence(_DLOGZ),
         max_cost=1.0,  # speed matters, since the robot waits
-        return_interrupted=False,
     )
 
 

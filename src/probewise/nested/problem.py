@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise._kinds import require_callable, require_like
+from probewise._kinds import checked_texts, require_callable, require_like
 from probewise.errors import NotConvergedError, ParameterError, message_of, require
 from probewise.priors import Coordinates, Marginal, Prior, Product, parse_prior, require_prior
 
@@ -302,7 +302,7 @@ class Evaluator:
                     f"{returned} shape {values.shape}; allowed: ({len(theta)},), one number per hypothesis: "
                     f"theta is a batch of shape {theta.shape}, one hypothesis per row"
                 )
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 why = f"{returned} something other than numbers ({error})"
         raise NotConvergedError(f"{why}; {self._first_hypothesis_as_text(theta)}")
 
@@ -404,9 +404,10 @@ def make_problem(
     """
     require_callable("log_likelihood", log_likelihood, "a function of a point, such as lambda x: -0.5 * (x**2).sum()")
     named = _as_named_prior(prior, names, vectorized)
-    if isinstance(periodic, str) or not set(periodic) <= set(named.names):
-        raise ParameterError("periodic", periodic, f"names among {named.names}")
-    return FunctionProblem(log_likelihood, named, vectorized, pass_dict, tuple(periodic))
+    allowed = f"names among {named.names}"
+    wrapped = checked_texts("periodic", periodic, allowed)
+    require(set(wrapped) <= set(named.names), "periodic", periodic, allowed)
+    return FunctionProblem(log_likelihood, named, vectorized, pass_dict, wrapped)
 
 
 def as_problem(
@@ -477,8 +478,7 @@ class _ScipyMarginal:
 
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
     """Convert a prior in any form that `make_problem` takes to one with names; ParameterError for anything else."""
-    require(not isinstance(names, str), "names", names, "a list of names: names=['x', 'y']")
-    given = None if names is None else tuple(str(name) for name in names)
+    given = None if names is None else checked_texts("names", names, "names of the parameters")
     made: Prior
     require(not isinstance(prior, type), "prior", prior, _ALLOWED_PRIOR)
     if isinstance(prior, Mapping):

@@ -156,7 +156,7 @@ def run(
     checkpoint_every_s: float = 10.0,
     executor: Executor | None = None,
     n_workers: int | None = None,
-    return_interrupted: bool = True,
+    return_interrupted: bool = False,
 ) -> NestedResult:
     """Compute the evidence and posterior samples of a problem (paper, section on SSF estimation).
 
@@ -201,7 +201,8 @@ def run(
         is the same to the last bit if a hypothesis' likelihood does not depend on its batch (for matrix products in
         NumPy it may).
     return_interrupted
-        Whether Ctrl-C returns the result so far, with a warning; otherwise it raises `KeyboardInterrupt`.
+        Whether Ctrl-C returns the result so far, with a warning, if there is one. By default it raises
+        `KeyboardInterrupt`, so that no script goes on as if the run were complete.
 
     Raises
     ------
@@ -240,7 +241,7 @@ def run(
                 result,
                 Evaluator(posed, executor=executor, n_parts=n_workers),
                 moving,
-                partial(once, return_interrupted=False),
+                partial(run_once, progress=progress, executor=executor, n_workers=n_workers),
                 max_cost=max_cost,
                 max_calls=max_calls,
                 least_live=least_live(len(result.names)),
@@ -294,7 +295,7 @@ def run_once(
     checkpoint_every_s: float = 10.0,
     executor: Executor | None = None,
     n_workers: int | None = None,
-    return_interrupted: bool = True,
+    return_interrupted: bool = False,
 ) -> NestedResult:
     """Run nested sampling once, without the check of the evidence.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import contextlib
 import functools
 import json
 import math
@@ -10,7 +11,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from types import ModuleType
@@ -41,6 +42,9 @@ def read_bytes(path: Path, what: str) -> bytes:
     return content
 
 
+_AS_UTF_8 = "UTF-8 text (save the file again with that encoding)"
+
+
 def read_text(path: Path, what: str) -> str:
     """Read a whole file of UTF-8, or of UTF-16 with its byte-order mark, without that mark; `what` as in `read_bytes`.
 
@@ -49,11 +53,15 @@ def read_text(path: Path, what: str) -> str:
     content = read_bytes(path, what)
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        return content.decode("utf-16" if wide else "utf-8-sig")
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+        if (zero := text.find("\0")) < 0:
+            return text
+        found = "a character is NUL, as in UTF-16 without its mark or in a file that is no text"
+        raise FileError(path, found, _AS_UTF_8, row=text.count("\n", 0, zero) + 1)
     except UnicodeDecodeError as error:
         row = content.count(b"\n", 0, error.start) + 1
         found = f"byte 0x{content[error.start]:02x} at offset {error.start} is not {'UTF-16' if wide else 'UTF-8'}"
-        raise FileError(path, found, "UTF-8 text (save the file again with that encoding)", row=row) from error
+        raise FileError(path, found, _AS_UTF_8, row=row) from error
 
 
 _MOST_DIGITS = 400  # more digits than any finite float has before the point
@@ -124,7 +132,7 @@ def _parse_finite_number(digits: str) -> float:
 
 
 def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any]:
-    """Run a user's file as `import` would, its folder on the search path, and return the names that it defines.
+    """Run a user's file as `import` would, its folder first on the search path, and return the names that it defines.
 
     Raises FileError, with the line, if it cannot be read or run; `what` says what the file should be.
     """
@@ -145,10 +153,11 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # dataclasses look their module up
     folder = str(path.absolute().parent)
-    if folder not in sys.path:
+    added = folder not in sys.path
+    if added:
         sys.path.insert(0, folder)
     try:
-        with np.errstate(), warnings.catch_warnings():  # what the file sets is its own affair
+        with np.errstate(), warnings.catch_warnings(), in_this_directory():  # what the file sets is its own affair
             exec(code, module.__dict__)
     except KeyboardInterrupt:
         raise
@@ -156,7 +165,28 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         found = f"stops with {message_of(error)}"
         raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
+    finally:
+        if added:  # now last: what lies beside the file is not taken for a library that is imported later
+            sys.path[:] = [*(each for each in sys.path if each != folder), folder]
     return module.__dict__
+
+
+@contextlib.contextmanager
+def in_this_directory() -> Iterator[None]:
+    """Return to the working directory, from which relative names count, if code of a user leaves it in the block."""
+    before = _working_directory()
+    try:
+        yield
+    finally:
+        if before and _working_directory() != before:
+            os.chdir(before)
+
+
+def _working_directory() -> str:
+    try:
+        return os.getcwd()
+    except OSError:  # it was removed
+        return ""
 
 
 class EndedByFile(Exception):

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray, nearly_equal
-from probewise.errors import FileError, ShapeError, message_of, require
+from probewise._arrays import FloatArray, IntArray, floats, nearly_equal
+from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
-from probewise.recordings.io import EndedByFile
+from probewise.recordings.io import EndedByFile, in_this_directory
 from probewise.systems.simulator import Columns, Simulate, Simulator, Values, read_simulator
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
@@ -193,7 +193,7 @@ class Caller:
         n_samples, n_points = shape
         self._count_call()
         try:
-            readings = np.asarray(call_on_views(self.simulate, parameters, columns), dtype=np.float64)
+            readings = self._simulated(parameters, columns)
         except Exception:
             if strict:
                 raise
@@ -232,9 +232,7 @@ class Caller:
         known = self._known.pop(key := _digest_of_arguments(own, columns), None)
         if known is None:
             self._count_call()
-            known = _readings_broadcast_to_shape(
-                np.array(call_on_views(self.simulate, own, columns), float), (n_points,)
-            )
+            known = _readings_broadcast_to_shape(self._simulated(own, columns), (n_points,)).copy()
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -253,6 +251,10 @@ class Caller:
             if readings is not None and readings.shape == (n_points,):
                 self._count_call()
                 self._known[key] = readings
+
+    def _simulated(self, parameters: Values, columns: Columns) -> Any:
+        with in_this_directory():
+            return call_on_views(self.simulate, parameters, columns)
 
     def _count_call(self) -> None:
         self.n_calls += 1
@@ -298,7 +300,7 @@ _simulate_of_file: Callable[[Path], Any] = cache(lambda path: read_simulator(pat
 def _readings_or_none(path: Path, given: tuple[Values, Values]) -> FloatArray | None:
     try:
         with np.errstate(all="ignore"):
-            return np.array(call_on_views(_simulate_of_file(path), *given), float)
+            return floats(call_on_views(_simulate_of_file(path), *given)).copy()
     except Exception:
         return None
 
@@ -345,7 +347,12 @@ def _values_of_sample(
     return own, {name: v[0] if np.ndim(v) == 2 else v for name, v in table.items()}
 
 
-def _readings_broadcast_to_shape(readings: FloatArray, wanted: tuple[int, ...]) -> FloatArray:
+def _readings_broadcast_to_shape(returned: Any, wanted: tuple[int, ...]) -> FloatArray:
+    """Return readings broadcast to the wanted shape; raise ShapeError if they do not fit it, or are no real numbers."""
+    try:
+        readings = floats(returned)  # what is masked is NaN
+    except ParameterError:
+        raise ShapeError(f"simulate returns {shown(returned)}; allowed: real numbers of shape {wanted}") from None
     if readings.shape == wanted:
         return readings
     if readings.ndim == len(wanted):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, floats
 from probewise.errors import ShapeError
 from probewise.systems.calls import call_on_read_only, call_on_views, read_only_views
 from probewise.systems.simulator import Columns, Law, Values
@@ -140,7 +140,7 @@ def readings_of_states(law: Law, states: Values, parameters: Values, columns: Va
     if law.observe is None:
         return first
     with np.errstate(all="ignore"):
-        out = np.asarray(call_on_views(law.observe, states, parameters, columns), dtype=np.float64)
+        out = floats(call_on_views(law.observe, states, parameters, columns), "what observe returns")
     try:
         return np.array(np.broadcast_to(out, first.shape))
     except ValueError:

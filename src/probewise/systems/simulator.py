@@ -8,13 +8,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
-from probewise._kinds import checked_path, checked_text, checked_texts, require_callable, require_kind, require_mapping
+from probewise._kinds import (
+    checked_path,
+    checked_text,
+    checked_texts,
+    require_callable,
+    require_kind,
+    require_mapping,
+    require_one_of,
+)
 from probewise.effects import EFFECTS, RARE_EFFECTS
 from probewise.errors import FileError, ParameterError, message_of, printable, require, shown
 from probewise.priors import Marginal, parse_prior
@@ -119,8 +127,8 @@ class Law:
         if self.observe is not None:
             require_callable("observe", self.observe, "a function observe(states, parameters, columns), or None")
         require(self.states, "states", dict(self.states), "one state or more, each with where it starts")
-        require(self.hold in ("previous", "linear"), "hold", self.hold, "'previous' or 'linear'")
-        is_step = self.max_step_s is None or 0 < self.max_step_s < np.inf
+        require_one_of("hold", self.hold, get_args(Hold))
+        is_step = self.max_step_s is None or (_is_finite_number(self.max_step_s) and self.max_step_s > 0)
         require(is_step, "max_step_s", self.max_step_s, "greater than 0")
 
 
@@ -188,9 +196,12 @@ class Simulator:
         checked_text("reading", self.reading, 'the name of the column that is predicted: reading = "..."')
         require_kind("unit", self.unit, str, 'a text: unit = "..."')
         checked_text("time_unit", self.time_unit, 'a text, such as "min"')
+        known = {self.reading: "the reading"}
         for name, column in (("time", self.time), ("run", self.run)):
             if column is not None:
                 checked_text(name, column, f'the name of a column, {name} = "...", or None')
+                allowed = f"another column than {known.setdefault(column, name)}"
+                require(known[column] == name, name, column, allowed)
         if self.simulate is not None:
             way = "a function simulate(parameters, columns); of a file: read_simulator('FILE.py') of probewise.systems"
             require_callable("simulate", self.simulate, way)

@@ -30,10 +30,11 @@ from probewise.systems.integrate import (
 from probewise.systems.law import LawWithEffects, readings_of_states
 from probewise.systems.simulator import Columns, Law, Simulator, Values
 from probewise.systems.step import Steps, steps_for_table
-from probewise.systems.table import RunTable, relative_sds_of_column
+from probewise.systems.table import LARGEST_IN_FIT, RunTable, relative_sds_of_column
 
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
+_MOST_STEPS_GIVEN = 100_000  # over the longest run by a person's max_step_s: the trial integrations alone take a minute
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
 _CHEAPER = 2.0  # evaluations of the explicit method for one of a linearly implicit one, from which that is taken
 _CONVERGING = 4.0  # factor by which halving the step reduces the change at least, if the law is smooth
@@ -105,15 +106,23 @@ class System:
         columns, allowed = columns_without_reading(simulator, table), "a column besides the reading, such as the time"
         require(columns, "columns", list(table.columns), f"{allowed} or the number of each row")
         bare = cls(simulator, table.scan_names)
+        starts = bare.theta(bare.starts)
+        for name, values in zip(bare.marginals, starts.T, strict=True):
+            value = float(values[np.argmax(np.abs(values))])  # inf where the prior is wider than floats
+            require(abs(value) <= LARGEST_IN_FIT, name, value, f"a prior with magnitudes up to {LARGEST_IN_FIT:g}")
         if simulator.law is not None:
-            system = replace(bare, max_step=simulator.law.max_step_s or table.median_gap, stiff=stiff)
+            step = simulator.law.max_step_s or table.median_gap
+            longest = max(float(np.ptp(table.time_s[rows])) for rows in table.rows_by_scan())
+            allowed = f"{longest / _MOST_STEPS_GIVEN:.1g} or more: {_MOST_STEPS_GIVEN:,} steps over the longest run"
+            require(longest <= step * _MOST_STEPS_GIVEN, "max_step_s", step, allowed)
+            system = replace(bare, max_step=step, stiff=stiff)
             system._require_working_law(simulator.law, table)
             return system
         assert simulator.simulate is not None
         if simulator.run is None:  # it is called for one recording after the other
             cells = [np.isfinite(values) for values in table.covariates.values()]
             table = table.take(max(table.rows_by_scan(), key=lambda rows: sum(int(c[rows].sum()) for c in cells)))
-        columns, samples = columns_without_reading(simulator, table), bare.theta(bare.starts[:_N_TRIED])
+        columns, samples = columns_without_reading(simulator, table), starts[:_N_TRIED]
         own = (simulator.simulate, bare.parameters(samples, table), columns)
         try:
             caller = Caller.from_trial_calls(*own, per_run=simulator.per_run, broadcasts=simulator.vectorized)
@@ -130,6 +139,8 @@ class System:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
                 states = integrate_states(law, self.steps(table), parameters, columns)
+                for state, values in states.items():
+                    require(values.dtype.kind == "f", "rates", f"{values.dtype} of {state}", "real numbers, in arrays")
                 readings.append(readings_of_states(law, states, parameters, columns))
             except ProbewiseError:
                 raise

@@ -16,9 +16,9 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
+from probewise._arrays import BoolArray, FloatArray, IntArray, floats, read_only_floats, rounding_error
 from probewise._display import data_frame
-from probewise._kinds import checked_path
+from probewise._kinds import checked_path, require_kind
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.cells import first_cell_without_number, parsed_numbers
@@ -30,6 +30,8 @@ from probewise.recordings.times import times_to_numbers
 _ONE_RUN = "all"
 _OF_COLUMN = "column:"
 _FILE = "file"
+LARGEST_IN_FIT = 1e75
+"""Largest magnitude in a fit: fourth powers, as squares of terms of second order have them, are floats."""
 # Covariates of a diagnosis that are no columns: of a table, and of a light sensor's recording, which it treats apart.
 _NOT_COLUMNS = frozenset({"time", "row", "run", "level", "previous"})
 _OF_LIGHT_SENSOR = frozenset({"scan", "place", "slope", "direction", "orientation", "edge_distance"})
@@ -76,12 +78,13 @@ class RunTable:
         columns, notes = dict[str, NDArray[Any]](), [*self.notes]
         for name, given in self.columns.items():
             values: Any = given
+            require_kind("the name of a column", name, str, "a text")  # a table without a header has numbers
             require(name not in columns, "columns", f"{name} twice", "each column once")  # as a data frame may have two
             if name == self.time and name != self.run:
                 values, note = times_to_numbers(name, values, self.time_unit)
                 notes += [note] if note else []
             columns[name] = _checked_column(name, values, are_names=name == self.run)
-            if name == self.run and np.asarray(values).dtype.kind == "f" and np.any(np.nan_to_num(values) % 1):
+            if name == self.run and any(isinstance(v, float) and v % 1 > 0 for v in np.asarray(given).tolist()):
                 notes += [f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"]
         require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -173,6 +176,20 @@ class RunTable:
                 own = anew if self.run is None else f"run {name}"
                 allowed = f"{self.time_s[before]:g} or more, since time does not fall within {own}"
                 raise ParameterError(where, float(self.time_s[at]), allowed)
+
+    def require_moderate_numbers(self) -> None:
+        """Raise ParameterError, with the row, for a number, or a column's span, that a fit cannot be computed with."""
+        for name, values in self.columns.items():
+            if values.dtype != np.float64 or not np.isfinite(values).any():
+                continue
+            known = np.where(np.isfinite(values), values, 0.0)
+            k = int(np.argmax(np.abs(known)))
+            allowed = f"magnitudes up to {LARGEST_IN_FIT:g}: empty such cells, or use a larger unit"
+            where = f"column {name!r} in row {k + self.first_line}"
+            require(abs(known[k]) <= LARGEST_IN_FIT, where, float(known[k]), allowed)
+            span = float(np.ptp(values[np.isfinite(values)]))
+            allowed = f"0, or {1 / LARGEST_IN_FIT:g} and more: use a smaller unit"
+            require(span == 0 or span * LARGEST_IN_FIT >= 1, f"span of column {name!r}", span, allowed)
 
     def interpolated_within_runs(self, values: FloatArray) -> FloatArray:
         """Return a column, (n_points,), with its missing values interpolated linearly from row to row of each run.
@@ -274,7 +291,7 @@ def column_error(
     column: str, cells: NDArray[Any], allowed: str, *, missing: bool = True, first: int = 2
 ) -> ParameterError:
     """Return the error of a column of texts that should be numbers: its first wrong cell, with the row in the file."""
-    k = first_cell_without_number(cells.tolist(), missing=missing)
+    k = first_cell_without_number(cells.tolist(), missing=missing, largest=np.finfo(np.float64).max)
     if k is None:
         return ParameterError(column, "texts, all of them numbers", f"numbers: {allowed}")
     return ParameterError(f"{column} in row {k + first}", str(cells[k]), allowed)
@@ -289,7 +306,7 @@ def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     if are_names and array.dtype.kind == "U" and not array.flags.writeable:
         return array
     if array.dtype == object and all(value is None or isinstance(value, Real | Decimal) for value in array.tolist()):
-        array = array if are_names else array.astype(np.float64)  # None is missing, NaN
+        array = array if are_names else floats(array, f"column {name!r}")  # None is missing, NaN
     if array.dtype.kind in "biuf" and not are_names:
         return read_only_floats(array)
     texts = np.array([text_of_name(v) if are_names else str(v) for v in array.tolist()], dtype=np.str_)

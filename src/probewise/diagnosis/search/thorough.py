@@ -179,7 +179,6 @@ def _weigh_by_nested_sampling(
         n_live=n_live,
         progress=lambda _: show(weighing.label),
         max_cost=1.0,  # each run here is checked against the next
-        return_interrupted=False,
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # warnings of the last run are reported

@@ -38,26 +38,17 @@ _IN_BATCHES = ("finishing", "information")
 
 @dataclass(frozen=True)
 class SearchConfiguration:
-    """One configuration of the search.
+    """One configuration of the search."""
 
-    `population`: distribution of the circles, which is also the prior: "anywhere" (radius 20 to 150 mm) or "inside" (50
-    to 150 mm, entirely in the field); `model`: the robot's sensor model, "ssf" or "naive" (a point without SSF), while
-    the true sensor always has the SSF; `utility`: acquisition function by name (`inquiry.utility_named`); `noise_sd`:
-    sd of the simulated noise, which the robot knows, LEGO units; `width`: of the robot's SSF over the true one;
-    `learn_sensor`: whether it learns the sensor along with the shape; `batch`: readings chosen together; `method`: of
-    inference and choice, "particles", or "paper" with the utility "entropy" (`experiment.paper`); `nested_stop`: when
-    its nested sampling stops, "change" or "remaining".
-    """
-
-    population: str = "inside"
-    model: str = "ssf"
-    utility: str = "finishing"
-    noise_sd: float = 1.0
-    width: float = 1.0
-    learn_sensor: bool = False
-    batch: int = 1
-    method: str = "particles"
-    nested_stop: NestedStop = "change"
+    population: str = "inside"  # of the circles, which is also the prior: "anywhere" or "inside"
+    model: str = "ssf"  # the robot's, or "naive", a point without SSF; the true sensor always has the SSF
+    utility: str = "finishing"  # by name, see `inquiry.utility_named`
+    noise_sd: float = 1.0  # simulated and known to the robot, LEGO units
+    width: float = 1.0  # of the robot's SSF over the true one
+    learn_sensor: bool = False  # along with the shape
+    batch: int = 1  # readings chosen together
+    method: str = "particles"  # or "paper" with the utility "entropy" (`experiment.paper`)
+    nested_stop: NestedStop = "change"  # when the paper's nested sampling stops
 
     def __post_init__(self) -> None:
         choices = {"population": POPULATIONS, "model": ("ssf", "naive"), "method": get_args(MethodName)}
@@ -90,7 +81,8 @@ class SearchConfiguration:
         elif self.utility != REFERENCE.utility:
             words.append(self.utility)
         if self.noise_sd != REFERENCE.noise_sd:
-            words.append(f"noise {_exact_number_text(self.noise_sd)}")
+            short = f"{self.noise_sd:g}"
+            words.append(f"noise {short if float(short) == self.noise_sd else repr(float(self.noise_sd))}")
         if self.width != round(self.width, 2):
             words.append(f"believed {float(self.width)!r} times as wide")
         elif self.width != REFERENCE.width:
@@ -100,11 +92,6 @@ class SearchConfiguration:
         if self.batch != REFERENCE.batch:
             words.append(f"{self.batch} at once")
         return ", ".join(words)
-
-
-def _exact_number_text(value: float) -> str:
-    """Return a number as text: six digits if they are exact, otherwise all."""
-    return text if float(text := f"{value:g}") == value else repr(float(value))
 
 
 REFERENCE = SearchConfiguration()

@@ -13,13 +13,7 @@ import numpy as np
 from probewise._words import count_with_noun
 from probewise.experiment import least_readings
 from probewise.proof.campaign import Result
-from probewise.proof.concealed_study import (
-    ConcealedRow,
-    ConcealedTrial,
-    concealed_csv,
-    concealed_forms,
-    concealed_rows,
-)
+from probewise.proof.concealed_study import ConcealedRow, ConcealedTrial, concealed_csv, concealed_rows
 from probewise.proof.configurations import REFERENCE, SearchConfiguration
 from probewise.proof.estimates import LEAST_FOR_MEDIAN, Estimate
 from probewise.proof.plots import (
@@ -45,17 +39,7 @@ from probewise.proof.tables import (
 )
 from probewise.proof.trial import Trial, experiment_of
 from probewise.recordings.table import csv_text_of_rows
-from probewise.report.html import (
-    Draw,
-    Markup,
-    Section,
-    definition_list,
-    figure,
-    fragment,
-    page,
-    paragraph,
-    table,
-)
+from probewise.report.html import Draw, Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots.canvas import png
 from probewise.report.words import number_text, typeset_numbers, value_with_error
 
@@ -226,7 +210,7 @@ def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
 
 def concealed_page(results: Mapping[ConcealedTrial, Result], *, command: str) -> CampaignPage:
     """Return what a study of concealed effects comes to; `command` is the command line that made it."""
-    rows, forms = concealed_rows(results), concealed_forms(results)
+    rows, forms = concealed_rows(results), concealed_rows(results, by_form=True)
 
     def sure_and_wrong(doubts: bool) -> str:
         own = [row for row in rows if (row.trust < 1) == doubts]

@@ -14,7 +14,6 @@ from probewise.diagnosis.words import effect_has_words, effect_in_words
 from probewise.proof.concealed_study import ConcealedRow
 from probewise.proof.estimates import Estimate
 from probewise.proof.study import Summary
-from probewise.proof.tables import Bin
 from probewise.report.plots.canvas import (
     BLACK,
     BLUE,
@@ -57,16 +56,15 @@ def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target
         name: np.array([np.pad(w, (0, longest[name] - len(w)), mode="edge") for w in widths])
         for name, widths in runs.items()
     }
+    number = {name: np.arange(1.0, table.shape[1] + 1) for name, table in tables.items()}
     for ax, (name, table) in zip(axes.flat, tables.items(), strict=False):
         for other, more in tables.items():
             if other != name:
                 label = "median of another panel"
-                ax.plot(_reading_numbers(more), np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
+                ax.plot(number[other], np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
         low, high = np.quantile(table, _BAND, axis=0)
-        ax.fill_between(
-            _reading_numbers(table), low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs"
-        )
-        ax.plot(_reading_numbers(table), np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
+        ax.fill_between(number[name], low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs")
+        ax.plot(number[name], np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
         set_up_width_axes(ax, target_mm)
         ax.set_title(f"{name} ({count_with_noun(len(table), 'run')})", fontsize="medium", loc="left")
         ax.label_outer()
@@ -76,10 +74,6 @@ def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target
         axes.flat[len(runs) - n_columns].set_xlabel("number of readings")
     legend_below(axes)
     return axes
-
-
-def _reading_numbers(table: FloatArray) -> FloatArray:
-    return np.arange(1.0, table.shape[1] + 1)
 
 
 def _value_and_whiskers(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray]:
@@ -117,17 +111,16 @@ def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:
     return axes
 
 
-def reliability_diagram(bins: Sequence[Bin]) -> Axes:
+def reliability_diagram(bins: Sequence[tuple[float, Estimate]]) -> Axes:
     """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases."""
     ax = grid_of_axes(1, 1, size_in=(5.2, 5.0))[0, 0]
     ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
-    value, whiskers = _value_and_whiskers([b.right for b in bins])
-    stated = np.array([b.stated for b in bins])
-    ax.errorbar(stated, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
-    for b in bins:
-        ax.annotate(
-            str(b.right.n), (b.stated, b.right.value), xytext=(6, -3), textcoords="offset points", fontsize=SMALL_PT
-        )
+    value, whiskers = _value_and_whiskers([right for _, right in bins])
+    at = np.array([stated for stated, _ in bins])
+    ax.errorbar(at, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
+    for stated, right in bins:
+        place = {"xytext": (6, -3), "textcoords": "offset points", "fontsize": SMALL_PT}
+        ax.annotate(str(right.n), (stated, right.value), **place)
     ax.set(xlim=(0, 1.04), ylim=(-0.02, 1.04), aspect="equal")
     legend_above(ax)
     return label_axes(ax, x="probability stated", y="share that was right")

@@ -26,31 +26,26 @@ _CHANCE = 0.01
 
 @dataclass(frozen=True)
 class Summary:
-    """One row of the table.
+    """One row of the table, of the runs over one circle each; a run that misses the target counts as the limit.
 
-    Of the runs, one per circle: the share that `reached` the target precision within the limit of readings; `mean` and
-    `median` readings needed, a miss counted as the limit (mean with standard error, median with 95 % interval);
-    readings `to_white`, up to the first one on white (none counted as the limit), and `after_white`; bits per reading,
-    prior minus posterior differential entropy; arm time with standard error; processor time per decision, median over
-    runs of each run's median. Of those that reached the precision: largest error of a length, median (NaN if none);
-    number `wrong` by more than `WRONG_MM`, that which their own posteriors expect, and the 99 % quantile of a Poisson
-    distribution with that mean; share of the 95 % intervals that `held` the truth.
+    Means have standard errors, the median a 95 % interval; what comes from `error_mm` to `held` is of the runs that
+    reached the target precision.
     """
 
     n_runs: int
-    reached: Estimate
-    mean: Estimate
+    reached: Estimate  # share of the runs, within the limit of readings
+    mean: Estimate  # readings needed
     median: Estimate
-    to_white: Estimate
+    to_white: Estimate  # readings up to the first one on white
     after_white: Estimate
-    bits_each: Estimate
-    error_mm: float
-    wrong: int
-    wrong_expected: float
-    wrong_limit: int
-    held: Estimate
+    bits_each: Estimate  # per reading: prior minus posterior differential entropy
+    error_mm: float  # largest error of a length, median; NaN if none reached
+    wrong: int  # runs off by more than `WRONG_MM`
+    wrong_expected: float  # by their own posteriors
+    wrong_limit: int  # the 99 % quantile of a Poisson distribution with that mean
+    held: Estimate  # share of the 95 % intervals that hold the truth
     arm_s: Estimate
-    cpu_s: float
+    cpu_s: float  # per decision, median over runs of each run's median
 
 
 def summarise(trials: Sequence[Result], *, max_readings: int) -> Summary:

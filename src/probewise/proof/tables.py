@@ -122,16 +122,12 @@ def credible_set_size_with_aliases_merged(result: Result) -> float:
 def has_false_extra_effect(result: Result) -> bool:
     """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
     named = _without_noise(leading_hypothesis(result, clean=True)[0])
-    return count_extra_names(named, right_names_of_each_effect(result, merged=True, noise=False)) > 0
-
-
-def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
-    """Count the names left over when as many as possible match a wanted effect, one name per effect."""
-    most = max(
+    wanted = right_names_of_each_effect(result, merged=True, noise=False)
+    matched = (
         sum(name in right for name, right in zip(order, wanted, strict=False))
-        for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
+        for order in itertools.permutations([*named, *[""] * len(wanted)], len(wanted))
     )
-    return len(names) - most
+    return max(matched) < len(named)  # one name per effect, and as many as possible
 
 
 def is_distinguishable_from_ssf(result: Result) -> bool:
@@ -204,22 +200,21 @@ def is_confidently_wrong(result: Result) -> bool:
 _EDGES = np.linspace(0, 1, 11)
 
 
-@dataclass(frozen=True)
-class Bin:
-    """Cases of similar stated probability: its mean, and the share of right answers."""
-
-    stated: float
-    right: Estimate
+def _bin_numbers(probability: FloatArray) -> IntArray:
+    return np.clip(np.searchsorted(_EDGES, probability, side="right") - 1, 0, len(_EDGES) - 2)
 
 
-def reliability_bins(results: Results) -> tuple[Bin, ...]:
-    """Bin cases by the probability of their leading hypothesis into ten equal bins, ascending, without empty bins."""
+def reliability_bins(results: Results) -> list[tuple[float, Estimate]]:
+    """Bin cases by the probability of their leading hypothesis into ten equal bins; return those that are not empty.
+
+    Of each, ascending: the mean probability stated, and the share of right answers.
+    """
     said = [leading_probability_and_correctness(result) for result in results]
     bins = grouped(zip(_bin_numbers(np.array([p for p, _ in said])).tolist(), said, strict=True))
-    return tuple(
-        Bin(float(np.mean([p for p, _ in own])), estimated_share(right for _, right in own))
+    return [
+        (float(np.mean([p for p, _ in own])), estimated_share(right for _, right in own))
         for _, own in sorted(bins.items())
-    )
+    ]
 
 
 def calibration_error(results: Results) -> Estimate:
@@ -234,10 +229,6 @@ def calibration_error(results: Results) -> Estimate:
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
 
 
-def _bin_numbers(probability: FloatArray) -> IntArray:
-    return np.clip(np.searchsorted(_EDGES, probability, side="right") - 1, 0, len(_EDGES) - 2)
-
-
 OUTSIDE, SEVERAL = "outside", "several"
 
 
@@ -246,13 +237,22 @@ def confusion_counts(
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
     """Count answers by truth, over cases of kind "clean", "single" and "outside".
 
-    An answer that is an alias of the truth counts as the truth. `label` maps a name to that of its row and column, e.g.
-    to merge several. Returns the truths and answers that occur, and counts, (n_truths, n_answers).
+    An answer is that of the leading hypothesis: "clean", its one name, or `SEVERAL`; an alias of the truth counts as
+    the truth. If the concealed effects act on the mean, names of noise effects are ignored. `label` maps a name to that
+    of its row and column, e.g. to merge several. Returns the truths and answers that occur, and counts, (n_truths,
+    n_answers).
     """
     counts: Counter[tuple[str, str]] = Counter()
     for result in _of(results, "clean", "single", "outside"):
         truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
-        counts[label(truth), label(_stated_name(result, truth))] += 1
+        names, on_mean = leading_hypothesis(result, clean=True)[0], acts_on_mean(result)
+        names = _without_noise(names) if on_mean else names
+        answer = SEVERAL if len(names) > 1 else "".join(names) or "clean"
+        if truth not in ("clean", OUTSIDE) and names_match(
+            names, right_names_of_each_effect(result, merged=True, noise=not on_mean)
+        ):
+            answer = truth
+        counts[label(truth), label(answer)] += 1
 
     def in_order(found: set[str], order: Sequence[str]) -> tuple[str, ...]:
         return (*(name for name in order if name in found), *sorted(found - set(order)))
@@ -260,20 +260,6 @@ def confusion_counts(
     columns = in_order({s for _, s in counts}, ["clean", *SINGLES, "unknown", SEVERAL])
     truths = in_order({t for t, _ in counts}, ["clean", *SINGLES, OUTSIDE])
     return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
-
-
-def _stated_name(result: Result, truth: str) -> str:
-    """Return the name for which a leading hypothesis counts: `truth` if right, "clean", its one name, or `SEVERAL`.
-
-    If the concealed effects act on the mean, names of noise effects are ignored.
-    """
-    names, on_mean = leading_hypothesis(result, clean=True)[0], acts_on_mean(result)
-    if on_mean:
-        names = _without_noise(names)
-    wanted = right_names_of_each_effect(result, merged=True, noise=not on_mean)
-    if truth not in ("clean", OUTSIDE) and names_match(names, wanted):
-        return truth
-    return SEVERAL if len(names) > 1 else "".join(names) or "clean"
 
 
 _DRAWS = 400
@@ -351,11 +337,7 @@ _BOOTSTRAPS = 2000
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """One row of the table.
-
-    `found`: estimate with its 95 % interval; `least`, `most`: bounds of the target, infinite by default; if both are,
-    there is no target.
-    """
+    """One row of the table: an estimate with its 95 % interval, and the bounds of its target, infinite without one."""
 
     name: str
     found: Estimate
@@ -370,6 +352,10 @@ class ScoreRow:
         if self.found.low >= self.least and self.found.high <= self.most:
             return "met"
         return "missed" if self.found.low > self.most or self.found.high < self.least else "open"
+
+
+Part: TypeAlias = Callable[[list[Result]], Iterator[ScoreRow]]
+"""Rows of a table, of the cases that did not fail."""
 
 
 def _share(name: str, hits: Iterable[bool], least: float = -math.inf, most: float = math.inf) -> ScoreRow:
@@ -410,23 +396,24 @@ def _unknown(results: Iterable[Result]) -> list[bool]:
     return [r["verdict"] == "unknown" for r in results]
 
 
-def _rows(results: Results, *parts: Callable[[list[Result]], Iterator[ScoreRow]]) -> tuple[ScoreRow, ...]:
+def _scored(results: Results, *parts: Part) -> tuple[ScoreRow, ...]:
     """Return the rows of these parts of a table, and that of the cases that failed."""
     done = [r for r in results if "failed" not in r]
-    failed = _share("cases that failed", ["failed" in r for r in results])
-    return (*(row for part in parts for row in part(done)), failed)
+    return (
+        *(row for part in parts for row in part(done)),
+        _share("cases that failed", ["failed" in r for r in results]),
+    )
 
 
-def score(results: Results) -> tuple[ScoreRow, ...]:
-    """Return the rows of a challenge of the light sensor, from results of `run_case`."""
-    parts = _alarms_and_detection, _names, _probabilities, _places_and_intervals, _held_out_scans
-    return _rows(results, *parts, _pairs_aliases_and_unlisted, _seconds_by_plan)
+def _seconds(part: str, *kinds: tuple[object, str, float]) -> Part:
+    """Return the rows of processor times of the cases whose `part` has each value, with its words and most seconds."""
 
+    def rows(done: list[Result]) -> Iterator[ScoreRow]:
+        for value, words, most in kinds:
+            seconds = [r["cpu_s"] for r in done if r[part] == value]
+            yield _mean(f"processor time of a diagnosis, {words} (s)", seconds, most=most)
 
-def _seconds_by_plan(done: list[Result]) -> Iterator[ScoreRow]:
-    for plan, most in (("paper", 5.0), ("two_way", math.inf)):
-        seconds = [r["cpu_s"] for r in done if r["plan"] == plan]
-        yield _mean(f"processor time of a diagnosis, {plan} plan (s)", seconds, most=most)
+    return rows
 
 
 def detected_and_named_by_effect(results: Results, size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
@@ -562,18 +549,17 @@ def _pairs_aliases_and_unlisted(done: list[Result]) -> Iterator[ScoreRow]:
     yield _mean("  readings advised, of those that repeating the plan needs", needed, most=0.25)
 
 
-def score_rounds(results: Results) -> tuple[ScoreRow, ...]:
-    """Return the rows of a challenge in rounds: each target after the last round and the first, then costs."""
-    return _rows(results, _rounds)
-
-
 def _rounds(last: list[Result]) -> Iterator[ScoreRow]:
     first = [r | r["rounds"][0] for r in last]
     for after_last, after_first in zip(_of_round(last), _of_round(first), strict=True):
         yield after_last
         yield ScoreRow(f"  after one round: {after_first.name}", after_first.found)
     further = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in last], dtype=np.float64)
-    extra = _bootstrapped_median(further[further > 0])
+    further, extra = further[further > 0], estimated_mean([])
+    if further.size:  # a bootstrap's percentiles
+        drawn = np.random.default_rng(0).choice(further, (_BOOTSTRAPS, further.size))
+        low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+        extra = Estimate(float(np.median(further)), float(low), float(high), int(further.size))
     yield ScoreRow("extra readings, median of those not settled at once", extra, most=80.0)
     yield _share("settled at last", [r["rounds"][-1]["settled"] for r in last])
     yield _mean("processor time of an investigation (s)", [r["cpu_s"] for r in last])
@@ -591,26 +577,6 @@ def _of_round(results: list[Result]) -> Iterator[ScoreRow]:
     yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.96)
     yield _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03)
     yield _share("physics named, clean", map(names_effect_on_mean, _of(results, "clean")), most=0.005)
-
-
-def _bootstrapped_median(values: FloatArray) -> Estimate:
-    if not values.size:
-        return estimated_mean([])
-    drawn = np.random.default_rng(0).choice(values, (_BOOTSTRAPS, values.size))
-    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
-    return Estimate(float(np.median(values)), float(low), float(high), int(values.size))
-
-
-def score_systems(results: Results) -> tuple[ScoreRow, ...]:
-    """Return the rows of a challenge of systems, from results of `run_system_case`."""
-    parts = _alarms_and_names_of_systems, _probabilities_and_intervals_of_systems, _held_out_runs
-    return _rows(results, *parts, _unlisted_laws, _seconds_by_law)
-
-
-def _seconds_by_law(done: list[Result]) -> Iterator[ScoreRow]:
-    for kind, law, most in (("closed form", False, 5.0), ("differential equations", True, 20.0)):
-        seconds = [r["cpu_s"] for r in done if r["law"] is law]
-        yield _mean(f"processor time of a diagnosis, {kind} (s)", seconds, most=most)
 
 
 def name_without_target(name: str) -> str:
@@ -701,3 +667,22 @@ def _gains_as_much_as_true_law(result: Result) -> bool:
         return True
     gains = gains_on_held_out_runs(result, "right")
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
+
+
+def score(results: Results) -> tuple[ScoreRow, ...]:
+    """Return the rows of a challenge of the light sensor, from results of `run_case`."""
+    parts = _alarms_and_detection, _names, _probabilities, _places_and_intervals, _held_out_scans
+    times = _seconds("plan", ("paper", "paper plan", 5.0), ("two_way", "two_way plan", math.inf))
+    return _scored(results, *parts, _pairs_aliases_and_unlisted, times)
+
+
+def score_rounds(results: Results) -> tuple[ScoreRow, ...]:
+    """Return the rows of a challenge in rounds: each target after the last round and the first, then costs."""
+    return _scored(results, _rounds)
+
+
+def score_systems(results: Results) -> tuple[ScoreRow, ...]:
+    """Return the rows of a challenge of systems, from results of `run_system_case`."""
+    parts = _alarms_and_names_of_systems, _probabilities_and_intervals_of_systems, _held_out_runs
+    times = _seconds("law", (False, "closed form", 5.0), (True, "differential equations", 20.0))
+    return _scored(results, *parts, _unlisted_laws, times)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -136,15 +135,12 @@ def timed_steps(
     arm: SimulatedArm, experiment: Experiment, *, circle: int, max_readings: int, seed: int = SEED
 ) -> Iterator[tuple[Step, float]]:
     """Yield each step of a run with its processor time in s; randomness depends on seed and circle only."""
-    rng = np.random.default_rng([seed, circle])
     with arm:
-        steps = explore(arm, experiment, rng=rng, max_readings=max_readings)
-        while True:
-            before = time.process_time()
-            step = next(steps, None)
-            if step is None:
-                return
+        steps = explore(arm, experiment, rng=np.random.default_rng([seed, circle]), max_readings=max_readings)
+        before = time.process_time()
+        for step in steps:
             yield step, time.process_time() - before
+            before = time.process_time()
 
 
 def has_reached_target(last: Step, experiment: Experiment) -> bool:
@@ -181,12 +177,12 @@ def arm_that_reads(light_reading: Callable[[Pose, float, float], float], *, spee
 def arm_of(trial: Trial) -> SimulatedArm:
     """Return a simulated arm over the circle, with noise that depends on the circle and is the same in all rows."""
     world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
-    disc, number = disc_of(trial.truth), itertools.count()
-    noise = np.random.default_rng([trial.circle, 99]).standard_normal(trial.max_readings)
+    noise = iter(np.random.default_rng([trial.circle, 99]).standard_normal(trial.max_readings))
+    disc = disc_of(trial.truth)
 
     def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
         clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)
-        return clean + trial.row.noise_sd * float(noise[next(number)])
+        return clean + trial.row.noise_sd * float(next(noise))
 
     return arm_that_reads(light_reading)
 

@@ -89,18 +89,14 @@ def stratum_in_wheel(
 
 @dataclass(frozen=True)
 class HiddenEffect:
-    """One concealed effect, with its parameters.
-
-    `size_lambda`: norm of its change after a refit of the null model, in noise sds; `covariates`: those along which its
-    residual is visible; `region`: where it acts; None: not a local effect.
-    """
+    """One concealed effect, with its parameters."""
 
     name: str
     effect: Concealed
-    size_lambda: float
+    size_lambda: float  # norm of its change after a refit of the null model, in noise sds
     in_vocabulary: bool
-    covariates: tuple[str, ...]
-    region: CovariateRegion | None
+    covariates: tuple[str, ...]  # along which its residual is visible
+    region: CovariateRegion | None  # where it acts; None: not a local effect
 
 
 ALIASES: tuple[tuple[str, str], ...] = (
@@ -119,26 +115,20 @@ _ATTEMPTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One case of a challenge: a recording to diagnose, and the simulated sensor with its concealed effects.
-
-    `test_plans`: plans of the held-out readings by name (`held_out_plans`), `test_seed`: of their noise; `ssf`,
-    `noise_level`, `noise_model`, `plan`: names in SSFS, NOISE_LEVELS, OTHER_NOISE or "white", and PLANS; `hidden`:
-    concealed effects, in the order of the vocabulary; `alias`: in the stratum of aliases, the name of an effect that is
-    aliased with the concealed one; `cosine` of the two, or of a pair, after the refit; None: neither.
-    """
+    """One case of a challenge: a recording to diagnose, and the simulated sensor with its concealed effects."""
 
     recording: Recording
     world: World
-    test_plans: Mapping[str, Plan]
-    test_seed: np.random.SeedSequence
+    test_plans: Mapping[str, Plan]  # of the held-out readings by name (`held_out_plans`)
+    test_seed: np.random.SeedSequence  # of their noise
     stratum: Stratum
-    ssf: str
+    ssf: str  # names in SSFS, NOISE_LEVELS, OTHER_NOISE or "white", and PLANS
     noise_level: str
     noise_model: str
     plan: str
-    hidden: tuple[HiddenEffect, ...]
-    cosine: float | None
-    alias: str | None
+    hidden: tuple[HiddenEffect, ...]  # in the order of the vocabulary
+    cosine: float | None  # of a pair, or of an alias and the concealed effect, after the refit
+    alias: str | None  # an effect that is aliased with the concealed one, in the stratum of aliases
 
     @property
     def combination(self) -> tuple[str, ...]:
@@ -185,20 +175,10 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     plan = replace(plan, instrumentation=told)
     concealing = replace(sensor, concealed=tuple(each.effect for each in hidden))
     world = with_noise_model(concealing, model, duration_s=setup.duration_s)
-    return Case(
-        world.simulate(plan, rng=np.random.default_rng(noise)),
-        world,
-        held_out_plans(plan, rng=np.random.default_rng(test)),
-        test_noise,
-        stratum,
-        ssf,
-        level,
-        model,
-        plan_name,
-        hidden,
-        cosine,
-        alias,
-    )
+    recording = world.simulate(plan, rng=np.random.default_rng(noise))
+    test_plans = held_out_plans(plan, rng=np.random.default_rng(test))
+    named = ssf, level, model, plan_name
+    return Case(recording, world, test_plans, test_noise, stratum, *named, hidden, cosine, alias)
 
 
 def held_out_recordings(case: Case) -> dict[str, Recording]:
@@ -224,10 +204,6 @@ def _draw_effects(
     match stratum.kind:
         case "clean":
             return (), None, None
-        case "single":
-            return (draw_effect(SINGLES[n_earlier % len(SINGLES)]),), None, None
-        case "outside":
-            return (draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),), None, None
         case "pair":
             first, second = (draw_effect(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
             cosine = setup.cosine(first.effect, second.effect)
@@ -240,18 +216,15 @@ def _draw_effects(
             if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
             return (hidden,), cosine, other.name
-        case _:
-            return (draw_effect(stratum.kind),), None, None
+    names = {"single": SINGLES, "outside": tuple(OUTSIDE)}.get(stratum.kind, (stratum.kind,))
+    return (draw_effect(names[n_earlier % len(names)]),), None, None
 
 
 def draw_effect_of_size(name: str, wanted: float, setup: CleanSetup, rng: np.random.Generator) -> HiddenEffect:
     """Return the effect `name`, other parameters drawn, with lambda about `wanted`, or at its fixed amplitude."""
     sampler = SAMPLERS[name]
-    of_amplitude = sampler.draw(setup, rng)
-    amplitude, limit = sampler.first, sampler.limit
-    if sampler.scalable:
+    of_amplitude, amplitude, limit = sampler.draw(setup, rng), sampler.first, sampler.limit
+    if limit > amplitude:  # else it is fixed
         amplitude = amplitude_of_size(lambda a: setup.size(of_amplitude(a)), wanted, first=amplitude, limit=limit)
     effect = of_amplitude(amplitude)
-    return HiddenEffect(
-        name, effect, setup.size(effect), name in INSIDE, sampler.covariates, region=setup.region(effect)
-    )
+    return HiddenEffect(name, effect, setup.size(effect), name in INSIDE, sampler.covariates, setup.region(effect))

@@ -135,10 +135,8 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     angle = math.radians(rng.choice([0, 90, 180, 270]) + rng.uniform(25, 65))
     beside = [0.0, float(rng.uniform(4, 9))]
     if any(isinstance(pattern, Disc) for pattern in plan.patterns.values()):
-        corners = tuple(
-            (28 * math.cos(turn), 28 * math.sin(turn)) for turn in rng.uniform(0, 2) + np.arange(3) * 2 * math.pi / 3
-        )
-        pattern: Pattern = Polygon(corners)
+        turns = rng.uniform(0, 2) + np.arange(3) * 2 * math.pi / 3
+        pattern: Pattern = Polygon(tuple((28 * math.cos(turn), 28 * math.sin(turn)) for turn in turns))
     else:
         pattern = _randomly_displaced_pattern(Disc((0.0, 0.0), 30.0), rng)
     slant = math.radians(rng.uniform(30, 60))
@@ -148,18 +146,30 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
         "pattern": (pattern, line + beside, 0.0),
         "direction": (boundary, line[::-1], 0.0) if one_way else oblique,
     }
-    start_s, plans = float(plan.time_s[-1]), {}
+    # Each covariate continues the line in time fitted to that of the plan: the battery drains at the same rate.
+    drains = {name: np.polyfit(plan.time_s, values, 1) for name, values in plan.covariates.items()}
+    start_s, plans, none = float(plan.time_s[-1]), {}, np.zeros(len(line), dtype=np.int64)
     for name, (surface, places_mm, turn) in scans.items():
-        plans[name] = _single_scan_plan(plan, name, surface, places_mm, turn, start_s + _BREAK_S)
+        time_s = start_s + _BREAK_S + _READING_S * np.arange(len(line))
+        plans[name] = Plan(
+            x_mm=places_mm[:, 0],
+            y_mm=places_mm[:, 1],
+            orientation_rad=np.full(len(line), turn),
+            time_s=np.round(time_s, 3),
+            scan=none,
+            scan_names=(f"test_{name}",),
+            pattern=none,
+            pattern_names=(name,),
+            patterns={name: surface},
+            covariates={key: np.asarray(np.round(np.polyval(fall, time_s))) for key, fall in drains.items()},
+            instrumentation=plan.instrumentation,
+        )
         start_s = float(plans[name].time_s[-1])
     return plans
 
 
 def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> Pattern:
-    """Return a boundary (also turned by up to 2 degrees), quadrant or disc (also resized) moved by up to 0.5 mm.
-
-    Other patterns are returned unchanged.
-    """
+    """Return a boundary (also turned by up to 2 degrees), quadrant or disc (also resized) moved by up to 0.5 mm."""
     dx, dy, turn = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), math.radians(rng.uniform(-2, 2))
     match pattern:
         case HalfPlane():
@@ -169,31 +179,4 @@ def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> P
         case Disc():
             center = (pattern.center_mm[0] + dx, pattern.center_mm[1] + dy)
             return replace(pattern, center_mm=center, radius_mm=pattern.radius_mm + dx)
-        case _:
-            return pattern
-
-
-def _single_scan_plan(
-    plan: Plan, name: str, pattern: Pattern, places_mm: FloatArray, orientation_rad: float, start_s: float
-) -> Plan:
-    """Return a plan of one scan from `start_s`; each covariate continues the line in time fitted to that of `plan`."""
-    n_points = len(places_mm)
-    time_s = start_s + _READING_S * np.arange(n_points)
-    # The battery keeps draining at the same rate.
-    covariates = {
-        name: np.asarray(np.round(np.polyval(np.polyfit(plan.time_s, values, 1), time_s)), dtype=np.float64)
-        for name, values in plan.covariates.items()
-    }
-    return Plan(
-        x_mm=places_mm[:, 0],
-        y_mm=places_mm[:, 1],
-        orientation_rad=np.full(n_points, orientation_rad),
-        time_s=np.round(time_s, 3),
-        scan=np.zeros(n_points, dtype=np.int64),
-        scan_names=(f"test_{name}",),
-        pattern=np.zeros(n_points, dtype=np.int64),
-        pattern_names=(name,),
-        patterns={name: pattern},
-        covariates=covariates,
-        instrumentation=plan.instrumentation,
-    )
+    return pattern

@@ -71,14 +71,12 @@ class _Budget:
 
 @dataclass(frozen=True, eq=False)
 class _SecondEstimate:
-    """A `run` by the method `name`, whose posterior says how much each missed peak holds.
-
-    `parts`: `n_met` clusters of the first run's samples and then the missed peaks, in the coordinates into which
-    `enter` maps parameters; None if no peak was missed.
-    """
+    """A `run` by the method `name`, whose posterior says how much each missed peak holds."""
 
     name: str
     run: NestedResult
+    # `n_met` clusters of the first run's samples and then the missed peaks, in the coordinates into which `enter` maps
+    # parameters; None if no peak was missed.
     parts: Clusters | None
     n_met: int
     enter: Callable[[FloatArray], FloatArray]
@@ -227,8 +225,5 @@ def _with_longer_chains(move: Move) -> SliceMove:
     """Double the chains' length, to twice the default at least; any other move is replaced by slice sampling."""
     least = SliceMove()
     chain = move if isinstance(move, SliceMove) else least
-    return replace(
-        chain,
-        steps_per_param=2.0 * max(chain.steps_per_param, least.steps_per_param),
-        fewest_steps=2 * max(chain.fewest_steps, least.fewest_steps),
-    )
+    steps, fewest = max(chain.steps_per_param, least.steps_per_param), max(chain.fewest_steps, least.fewest_steps)
+    return replace(chain, steps_per_param=2.0 * steps, fewest_steps=2 * fewest)

@@ -70,12 +70,12 @@ class Weighted(Samples):
 
 def _warnings_of_weights(k: float, n_eff: float, missed: float = 0.0) -> tuple[str, ...]:
     """Return warnings of a heavy tail, of few effective samples, and of a share `missed` of the posterior."""
-    reasons = (
-        (not k < MOST_K, f"Pareto k of the weights is {k:.2f}, not below {MOST_K}"),
-        (not n_eff >= _FEW_EFFECTIVE, f"only {n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
-        (not missed < MOST_LOST, f"the draws miss {100 * missed:.0f} % of the posterior"),
-    )
-    return tuple(words for so, words in reasons if so)
+    reasons = {
+        f"Pareto k of the weights is {k:.2f}, not below {MOST_K}": k < MOST_K,
+        f"only {n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}": n_eff >= _FEW_EFFECTIVE,
+        f"the draws miss {100 * missed:.0f} % of the posterior": missed < MOST_LOST,
+    }
+    return tuple(words for words, fine in reasons.items() if not fine)
 
 
 def evenly_weighted(
@@ -89,11 +89,8 @@ def evenly_weighted(
     run: NestedResult | None = None,
 ) -> Weighted:
     """Return equally weighted samples, theta (n, n_params) and log_likelihood (n,), and an evidence, by default one."""
-    n = len(theta)
-    even = np.full(n, -math.log(n))
-    return Weighted(
-        names, theta, log_likelihood, even, log_z, log_z_error, float(n), n_calls, pareto_k=-math.inf, run=run
-    )
+    even, n = np.full(len(theta), -math.log(len(theta))), float(len(theta))
+    return Weighted(names, theta, log_likelihood, even, log_z, log_z_error, n, n_calls, pareto_k=-math.inf, run=run)
 
 
 def weighted_draws(
@@ -113,16 +110,12 @@ def weighted_draws(
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A mixture of Student-t kernels, of one shape within each cluster.
-
-    `centres` in each cluster's whitened frame, one array (n_kernels, n_params) per cluster; `width` of the kernels in
-    that frame; `share` of the draws for each cluster, (n_clusters,).
-    """
+    """A mixture of Student-t kernels, of one shape within each cluster."""
 
     clusters: Clusters
-    centres: tuple[FloatArray, ...]
-    width: tuple[float, ...]
-    share: FloatArray
+    centres: tuple[FloatArray, ...]  # in each cluster's whitened frame, (n_kernels, n_params) each
+    width: tuple[float, ...]  # of the kernels in that frame
+    share: FloatArray  # of the draws for each cluster, (n_clusters,)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw points, (n, n_params)."""
@@ -230,11 +223,10 @@ def draw_and_weigh(
     theta, log_density = theta[possible], log_density[possible]
     log_likelihood = evaluate.log_likelihood(theta) if possible.size else np.empty(0)
     log_ratio = log_density + log_likelihood - proposal.log_density(x[possible])
-    alive = np.isfinite(log_ratio)
+    alive, n_calls = np.isfinite(log_ratio), evaluate.n_calls
     if not alive.any():
-        nothing = np.empty(0)
-        n_calls = evaluate.n_calls
-        none, told = (-math.inf, math.inf, 0.0, n_calls, math.inf), _warnings_of_weights(math.inf, 0.0)
+        nothing, none = np.empty(0), (-math.inf, math.inf, 0.0, n_calls, math.inf)
+        told = _warnings_of_weights(math.inf, 0.0)
         return Weighted(evaluate.names, theta[:0], nothing, nothing, *none, warnings=told)
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
     k = pareto_k(log_ratio)
@@ -244,7 +236,7 @@ def draw_and_weigh(
     log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, n_held)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
-    n_eff, n_calls = n_effective(log_weight), evaluate.n_calls
+    n_eff = n_effective(log_weight)
     told = _warnings_of_weights(k, n_eff, missed)
     return Weighted(evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, n_calls, k, warnings=told)
 

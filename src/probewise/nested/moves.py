@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.nested.clusters import Clusters
 from probewise.nested.problem import Bound, Evaluator, Points
 from probewise.nested.slice import AXIS, DIFFERENCE, FRAME, HOP, SliceChains
@@ -24,16 +24,12 @@ _MOST_KERNELS = 100
 
 @dataclass(frozen=True)
 class Tally:
-    """Statistics of a move.
+    """Statistics of a move, by which it tunes itself."""
 
-    `n_evaluated`: likelihood evaluations. `n_tried`, `n_accepted`: candidates and acceptances by which
-    the move tunes itself. `n_stuck`: chains that never left their start.
-    """
-
-    n_evaluated: int
+    n_evaluated: int  # likelihood evaluations
     n_accepted: int
-    n_stuck: int = 0
-    n_tried: int = 0
+    n_stuck: int = 0  # chains that never left their start
+    n_tried: int = 0  # candidates
 
 
 class Move(Protocol):
@@ -89,46 +85,30 @@ class SliceMove:
     A step draws a line through the chain's point, a bracket of fixed width placed at random about the point, and
     candidates within the bracket; a rejected candidate becomes the bracket's new end. There is no stepping out: with a
     width that does not depend on the point the step is reversible without (Neal's limit m = 1), which saves
-    evaluations. Each chain goes on to its next step once a candidate is accepted, so the batches stay full.
+    evaluations. Where the prior is not uniform in the sampling space, a step first draws a level below the prior
+    density at the point, which the density at candidates must exceed too (Neal's auxiliary height).
 
-    Where the prior is not uniform in the sampling space, a step first draws a level below the prior density at the
-    point; the density at candidates must exceed that level too (Neal's auxiliary height). A rejection for that reason
-    costs no likelihood.
-
-    Four kinds of steps, each reversible by itself:
-
-    - along the axes of the space, each on a scale drawn between the conditional and the marginal
-      sd of the live points: a parameter uncorrelated with the others moves far in one step;
-    - along random orthonormal directions in the metric of the live points, so that n_params
-      successive steps cover every direction. Where the live points form clusters, each has its own metric and such a
-      step stays within its cluster's part of space;
-    - along the difference of two live points, within and between clusters;
-    - a hop, where there are clusters: the affine map between two clusters takes the point to its
-      counterpart in the other, accepted with the ratio of their volumes. Hops keep the share of live points in each
-      mode from drifting.
-
-    A chain has `steps_per_param` steps per parameter, at least `fewest_steps`, and `hops` hops more where there are
-    clusters. Of the steps a share `axes` is along axes and a share `differences` along differences of live points; the
-    rest are along random directions. `width` is the bracket's, in units of the live points' sd along the line; it is
-    tuned so that a step takes `target` candidates on average.
+    Four kinds of steps, each reversible by itself: along the axes of the space, on a scale drawn between the
+    conditional and the marginal sd of the live points; along random orthonormal directions in the metric of the live
+    points, of their cluster where they form several; along the difference of two live points, within and between
+    clusters; a hop, where there are clusters: the affine map between two of them takes the point to its counterpart,
+    accepted with the ratio of their volumes, which keeps the share of live points in each mode from drifting.
     """
 
     steps_per_param: float = 1.0
-    width: float = 5.0
-    axes: float = 0.7
-    differences: float = 0.1
-    hops: int = _HOPS
-    target: float = 2.5
+    width: float = 5.0  # of the bracket, in units of the live points' sd along the line
+    axes: float = 0.7  # share of steps along axes
+    differences: float = 0.1  # and along differences; the rest are along random directions
+    hops: int = _HOPS  # more, where there are clusters
+    target: float = 2.5  # candidates of a step on average, to which the width is tuned
     fewest_steps: int = _FEWEST_STEPS
 
     def __post_init__(self) -> None:
         require(self.steps_per_param > 0, "steps_per_param", self.steps_per_param, "greater than 0")
-        if not (self.axes >= 0 and self.differences >= 0 and self.axes + self.differences <= 1):
-            raise ParameterError("(axes, differences)", (self.axes, self.differences), "0 or more, together at most 1")
-        if self.hops < 0:
-            raise ParameterError("hops", self.hops, "0 or more")
-        if self.fewest_steps < 1:
-            raise ParameterError("fewest_steps", self.fewest_steps, "1 or more")
+        shares = self.axes, self.differences
+        require(min(shares) >= 0 and sum(shares) <= 1, "(axes, differences)", shares, "0 or more, together at most 1")
+        require(self.hops >= 0, "hops", self.hops, "0 or more")
+        require(self.fewest_steps >= 1, "fewest_steps", self.fewest_steps, "1 or more")
 
     def n_steps(self, n_params: int) -> int:
         """Return the number of steps of a chain, without hops."""
@@ -251,18 +231,14 @@ class KernelMove:
     """A move that draws above a bound by independent proposals from kernels about the live points.
 
     Every chain starts at a live point and accepts or rejects its proposals in turn (independence Metropolis-Hastings;
-    Hastings 1970; Tierney 1994), so the prior above the bound is left invariant; with `moves` accepted on average it
-    forgets its start. Proposals that do not depend on a chain's position are evaluated in one batch: for a robot that
-    infers after every reading, the overhead per call exceeds the cost of the likelihood. Suited to few parameters,
-    where many proposals lie above the bound. Where fewer than one in `patience` is accepted, the chains of `otherwise`
-    go on from the ends.
-
-    `moves` is the target number of accepted proposals per chain, on average; a chain with none stays at its start,
-    which is valid, and about exp(-moves) of the chains do. `n_proposals`, of a chain, is tuned to that target.
+    Hastings 1970; Tierney 1994), so the prior above the bound is left invariant. Proposals that do not depend on a
+    chain's position are evaluated in one batch: for a robot that infers after every reading, the overhead per call
+    exceeds the cost of the likelihood. Suited to few parameters, where many proposals lie above the bound. Where fewer
+    than one in `patience` is accepted, the chains of `otherwise` go on from the ends.
     """
 
-    moves: float = 10.0
-    n_proposals: int = 16
+    moves: float = 10.0  # accepted per chain on average; about exp(-moves) of the chains stay at their start
+    n_proposals: int = 16  # of a chain, tuned to that
     patience: float = 60.0
     otherwise: SliceMove = field(default_factory=SliceMove)
 
@@ -313,9 +289,9 @@ def _accept_in_turn(
     """Let every chain accept or reject its proposals in turn (Metropolis-Hastings with independent proposals).
 
     `possible`, whether each proposal lies above the bound, and `log_target`, the log of target over proposal density,
-    are (n_steps * n_chains,), steps first; `log_now` is that log at the starts, (n_chains,). `log_odds`: logs of
-    uniform numbers, (n_steps, n_chains). Return the index of the proposal that each chain accepted last, -1 for none,
-    (n_chains,), and the number of acceptances.
+    are (n_steps * n_chains,), steps first; `log_now` is that log at the starts, `log_odds` logs of uniform numbers,
+    (n_steps, n_chains). Return the number of the proposal that each chain accepted last, -1 for none, and how many it
+    was in all.
     """
     n_steps, n_chains = log_odds.shape
     log_target = np.where(possible, log_target, -np.inf).reshape(n_steps, n_chains)

@@ -256,8 +256,7 @@ class Evaluator:
             raise NotConvergedError(self._failure_message(error, parts[len(answers)])) from error
         # Concatenation copies: a likelihood may return the same array every time.
         values = np.concatenate([self._checked_answer(a, part) for a, part in zip(answers, parts, strict=True)])
-        fine = values < np.inf
-        if not fine.all():
+        if not (fine := values < np.inf).all():
             at = int(np.argmin(fine))
             raise NotConvergedError(
                 f"the log likelihood is {values[at]} at {self._parameters_as_text(theta[at])}; "
@@ -275,8 +274,7 @@ class Evaluator:
         # Not `map`: dask builds a task graph for it, which takes longer than submitting the parts.
         sent = [self.executor.submit(self.problem.log_likelihood, part.copy()) for part in parts]
         try:
-            for future in sent:
-                yield future.result()
+            yield from (future.result() for future in sent)
         finally:
             for future in sent:
                 future.cancel()
@@ -314,25 +312,26 @@ class Evaluator:
                 f"the problem cannot be sent to the executor's workers ({why}); allowed: one that pickles, so made of "
                 "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
             )
+
+        def fails(some: FloatArray) -> bool:
+            try:
+                if self.executor is None:
+                    self.problem.log_likelihood(some.copy())
+                else:
+                    self.executor.submit(self.problem.log_likelihood, some.copy()).result()
+            except Exception:
+                return True
+            return False
+
         if not isinstance(error, BrokenExecutor):  # a hypothesis that killed its worker could kill this process too
             culprit = theta
             while len(culprit) > 1:
                 half = culprit[: len(culprit) // 2]
-                culprit = half if self._fails(half) else culprit[len(culprit) // 2 :]
-            if self._fails(culprit):
+                culprit = half if fails(half) else culprit[len(culprit) // 2 :]
+            if fails(culprit):
                 return f"the likelihood raised {why}; at {self._parameters_as_text(culprit[0])}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
         return f"the likelihood raised {why}; {batch}; {self._first_hypothesis_as_text(theta)}"
-
-    def _fails(self, theta: FloatArray) -> bool:
-        try:
-            if self.executor is None:
-                self.problem.log_likelihood(theta.copy())
-            else:
-                self.executor.submit(self.problem.log_likelihood, theta.copy()).result()
-        except Exception:
-            return True
-        return False
 
     def _first_hypothesis_as_text(self, theta: FloatArray) -> str:
         return f"first of the {len(theta)} hypotheses asked for: {self._parameters_as_text(theta[0])}"
@@ -359,17 +358,17 @@ class FunctionProblem:
         if self.vectorized:
             given = dict(zip(self.prior.names, theta.T, strict=True)) if self.pass_dict else theta
             return self.function(given)  # type: ignore[no-any-return]
-        return np.array([self._log_likelihood_of_one(row) for row in theta])
-
-    def _log_likelihood_of_one(self, row: FloatArray) -> Any:
-        given = dict(zip(self.prior.names, row.tolist(), strict=True)) if self.pass_dict else row
-        answer = self.function(given)
-        if np.size(answer) != 1:
-            raise ValueError(
-                f"the likelihood of one point has shape {np.shape(answer)}; allowed: one number; a function of many "
-                "points at once needs vectorized=True"
-            )
-        return np.asarray(answer).reshape(())[()] if not np.ma.isMaskedArray(answer) else np.nan
+        names = self.prior.names
+        rows = (dict(zip(names, row.tolist(), strict=True)) for row in theta) if self.pass_dict else theta
+        answers = []
+        for answer in map(self.function, rows):
+            if np.size(answer) != 1:
+                raise ValueError(
+                    f"the likelihood of one point has shape {np.shape(answer)}; allowed: one number; a function of "
+                    "many points at once needs vectorized=True"
+                )
+            answers.append(np.nan if np.ma.isMaskedArray(answer) else np.asarray(answer).reshape(())[()])
+        return np.array(answers)
 
 
 def make_problem(

@@ -17,7 +17,6 @@ from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import find_disconnected_clusters
 from probewise.nested.importance import (
     MOST_LOST,
-    HeldOut,
     Weighted,
     draw_and_weigh,
     fit_wide_and_narrow_proposals,
@@ -77,8 +76,13 @@ def refine(
     evaluate, space = _evaluator_and_space(problem, result, "result")
     require(result.names, "result", "a run without parameters", "one with some; the evidence is exact without")
     n_lineages = effective_lineages(result)
-    fitted, held = _split_off_held_out(result, n_lineages, space, rng)
-    known = [fitted]
+    # Two to one at random: samples for fitting a density, by weight, and held-out ones.
+    lot = rng.random(len(result.theta)) < _HELD_OUT
+    chosen = np.flatnonzero(lot & (result.log_weight > -math.inf))
+    rows = chosen[resampled_rows(np.exp(result.log_weight[chosen]), min(_MOST_HELD, chosen.size), rng)]
+    x = space.enter(result.theta[rows])
+    held = x, space.leave(x)[1] + result.log_likelihood[rows], _HELD_OUT * n_lineages
+    known = [_resampled_for_fit(result.theta[~lot], result.log_weight[~lot], space, rng)]
     for _ in range(_N_PILOTS):
         proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
         pilots = [draw_and_weigh(p, None, space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals]
@@ -189,19 +193,6 @@ def effective_lineages(found: Posterior) -> float:
     if isinstance(found, Weighted):
         return found.n_eff if found.run is None else effective_lineages(found.run)
     return found.n_live / max(found.information * found.memory, 1.0)
-
-
-def _split_off_held_out(
-    found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
-) -> tuple[FloatArray, HeldOut]:
-    """Split samples at random, two to one, into those for fitting a density, by weight, and held-out ones."""
-    lot = rng.random(len(found.theta)) < _HELD_OUT
-    chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
-    weight = np.exp(found.log_weight[chosen])
-    rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
-    x = space.enter(found.theta[rows])
-    held = x, space.leave(x)[1] + found.log_likelihood[rows], _HELD_OUT * n_lineages
-    return _resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 
 def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:

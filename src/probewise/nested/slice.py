@@ -20,22 +20,17 @@ _NOTHING = 1e-13  # length of a bracket that has shrunk to a point
 
 @dataclass(eq=False)
 class _Candidates:
-    """Candidates of one round, `n_ahead` for each of the chains `rows`, chain by chain: n in all.
-
-    Of each, (n,): its `chain`, its place `u` (n, n_params), the log prior density that it must exceed, the cluster in
-    which it lies, and whether it may be accepted. Of each chain, (n_rows,): whether its step is a hop, and whether its
-    bracket has `shrunk` to nothing.
-    """
+    """Candidates of one round, `n_ahead` for each of the chains `rows`, chain by chain: n in all."""
 
     rows: IntArray
-    chain: IntArray
+    chain: IntArray  # of each candidate, (n,), as what follows
     n_ahead: int
-    u: FloatArray
-    level: FloatArray
-    cluster: IntArray
-    possible: BoolArray
-    hop: BoolArray
-    shrunk: BoolArray
+    u: FloatArray  # its place, (n, n_params)
+    level: FloatArray  # the log prior density that it must exceed
+    cluster: IntArray  # in which it lies
+    possible: BoolArray  # whether it may be accepted
+    hop: BoolArray  # of each chain, (n_rows,): whether its step is a hop
+    shrunk: BoolArray  # and whether its bracket has shrunk to nothing
 
 
 class SliceChains:

@@ -32,19 +32,13 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Campaign(Generic[K]):
-    """Tasks whose results a file keeps.
+    """Tasks whose results a file keeps."""
 
-    `work`: function from a task to its result, a dict for JSON, defined at module level if workers are processes;
-    `tasks`: by key, each with its own seed, so that order and worker do not matter; `settings`: everything that
-    determines the results, a dict for JSON; `misfit`: function of a result in the file: what of it cannot be, and what
-    is allowed, or None; `noun`: of several tasks.
-    """
-
-    work: Callable[[K], Result]
-    tasks: Mapping[str, K]
-    settings: Mapping[str, Any]
-    misfit: Misfit = lambda result: None
-    noun: str = "runs"
+    work: Callable[[K], Result]  # a dict for JSON from a task; defined at module level if workers are processes
+    tasks: Mapping[str, K]  # by key, each with its own seed, so that order and worker do not matter
+    settings: Mapping[str, Any]  # everything that determines the results, a dict for JSON
+    misfit: Misfit = lambda result: None  # what of a result in the file cannot be, and what is allowed, or None
+    noun: str = "runs"  # of several tasks
 
     def run(
         self, *, path: str | os.PathLike[str], executor: Executor | None = None, progress: Progress = silent

@@ -84,9 +84,8 @@ def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage
     curves = {row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in own[row]] for row in usual}
 
     def html(draw: Draw) -> str:
-        by_name = {row.name: summary for row, summary in found.items()}
         needed = figure(
-            draw("readings needed", lambda: png(readings_needed(by_name))),
+            draw("readings needed", lambda: png(readings_needed({row.name: own for row, own in found.items()}))),
             f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that "
             "many.",
         )
@@ -102,8 +101,7 @@ def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage
                 "width.",
             )
             sections.insert(0, Section("How fast", (drawn,)))
-        least = lower_bound_table(found)
-        if least is not None:
+        if (least := lower_bound_table(found)) is not None:
             sections.append(Section("Lower bound for any strategy", (least, paragraph(_BOUNDS))))
         sections.append(_how_it_was_made(command))
         return page("How many measurements?", answer=sentence, key_figure=needed, sections=sections)
@@ -183,23 +181,22 @@ def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | 
         if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
             least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
             search = over(least.search_bits, least.search_capacity_bits), _with_error(own.to_white)
-            lines.append(
-                (row.name, *search, over(least.refinement_bits, least.capacity_bits), _with_error(own.after_white))
-            )
+            after = over(least.refinement_bits, least.capacity_bits), _with_error(own.after_white)
+            lines.append((row.name, *search, *after))
     places = "up to white, at least (bits over bits per reading)", "from there, at least"
     return table(("row", places[0], "measured", places[1], "measured"), lines) if lines else None
 
 
 def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
     """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
-    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
+    ends, others = ("value", "low", "high"), ("error_mm", "wrong", "wrong_expected", "wrong_limit")
     rows = []
     for row, found in table.items():
-        estimates = [getattr(found, name) for name in _COLUMNS]
-        values = [value for e in estimates for value in (e.value, e.low, e.high)]
-        values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
+        values = [getattr(getattr(found, name), end) for name in _COLUMNS for end in ends]
+        values += [getattr(found, name) for name in others]
         rows.append([row.name, found.n_runs, *map(_csv_cell, values)])
-    return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
+    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
+    return csv_text_of_rows(["row", "runs", *bounds, *others], rows)
 
 
 def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
@@ -275,9 +272,6 @@ _CONCEALED_LEGEND = (
 )
 
 
-_DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
-
-
 def challenge_page(
     results: Results, score: Callable[[Results], Sequence[ScoreRow]], *, command: str, systems: bool
 ) -> CampaignPage:
@@ -298,8 +292,10 @@ def challenge_page(
                 "truth." + (" Targets are left out." if systems else ""),
             )
             sections.append(Section("Confusion matrix", (drawn,)))
-            each = ("Case by case", _case_table(results)) if systems else (_AT_LAMBDA_8, _effect_table(done))
-            sections.append(Section(each[0], each[1:]))
+            if systems:
+                sections.append(Section("Case by case", (_case_table(results),)))
+            else:
+                sections.append(Section("Each effect at lambda 8", (_effect_table(done),)))
         failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
         if failures:
             sections.append(Section("Cases that failed", (definition_list(failures),)))
@@ -314,7 +310,6 @@ def challenge_page(
     return CampaignPage(challenge_csv(rows), html, sentence)
 
 
-_AT_LAMBDA_8 = "Each effect at lambda 8"
 _CHALLENGE_LEGEND = (
     "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is undecided. "
     "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
@@ -333,29 +328,23 @@ def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
 
 
 _TARGETS: Columns[ScoreRow] = {
-    "what": lambda row: _indented_row_name(row.name),
+    # Indented by an em space, since HTML drops plain spaces.
+    "what": lambda row: "\u2003" * row.name.startswith(" ") + row.name.lstrip().replace("_", " "),
     "found": lambda row: _value_text(row.found) if row.found.n else "–",
     "95 % interval": lambda row: typeset_numbers(_interval_text(row.found)),
     "of": lambda row: str(row.found.n),
     "target": lambda row: _target_text(row),
-    "decision": lambda row: "undecided" if row.decision == "open" else _DECISIONS[row.decision],
+    "decision": lambda row: {"open": "undecided", None: ""}.get(row.decision, str(row.decision)),
 }
-
-
-def _indented_row_name(name: str) -> str:
-    """Write a row's name with spaces for underscores, indented by an em space, since HTML drops plain spaces."""
-    own = name.lstrip()
-    return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
 def challenge_csv(rows: Sequence[ScoreRow]) -> str:
     """Return a challenge's table as CSV text: quantity, value, interval, cases, target's bounds, decision."""
     cells = []
     for row in rows:
-        numbers, bounds = (row.found.value, row.found.low, row.found.high), (row.least, row.most)
-        cells.append(
-            [row.name.strip(), *map(_csv_cell, numbers), row.found.n, *map(_csv_cell, bounds), _DECISIONS[row.decision]]
-        )
+        numbers = map(_csv_cell, (row.found.value, row.found.low, row.found.high))
+        decision = {"open": "cannot decide", None: ""}.get(row.decision, row.decision)
+        cells.append([row.name.strip(), *numbers, row.found.n, *map(_csv_cell, (row.least, row.most)), decision])
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 

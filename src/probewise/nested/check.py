@@ -82,11 +82,9 @@ class _SecondEstimate:
     enter: Callable[[FloatArray], FloatArray]
 
     def distance(self, run: NestedResult) -> float:
-        """Return a run's log Z minus this estimate's, in combined standard errors."""
         return (run.log_z - self.run.log_z) / max(math.hypot(_error_to_trust(run), self.run.log_z_error), 1e-12)
 
     def doubts(self, run: NestedResult) -> list[str]:
-        """Return doubts about a run in words: missed peaks, and evidences that disagree or do not tell."""
         return [*self.missing_part_in_words(run), *self.disagreement_in_words(run)]
 
     def missing_part_in_words(self, run: NestedResult) -> list[str]:
@@ -222,7 +220,6 @@ def _second_estimate(
 
 
 def _with_longer_chains(move: Move) -> SliceMove:
-    """Double the chains' length, to twice the default at least; any other move is replaced by slice sampling."""
     least = SliceMove()
     chain = move if isinstance(move, SliceMove) else least
     steps, fewest = max(chain.steps_per_param, least.steps_per_param), max(chain.fewest_steps, least.fewest_steps)

@@ -141,7 +141,6 @@ def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]
 
 
 def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object]:
-    """Return the seed states of all runs; raise ParameterError if the runs cannot be merged."""
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
     names, seeds = parts[0].names, list[object]()

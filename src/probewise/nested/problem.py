@@ -90,8 +90,6 @@ class Space:
 
 @dataclass(frozen=True)
 class _NormalScores:
-    """Coordinates with a standard normal prior, by way of the unit cube."""
-
     prior: Prior
 
     def enter(self, theta: FloatArray) -> FloatArray:
@@ -266,7 +264,6 @@ class Evaluator:
         return values
 
     def _likelihoods_of_parts(self, parts: list[FloatArray]) -> Iterator[object]:
-        """Yield the likelihoods of the parts in order; several parts run in parallel."""
         # Copies: a likelihood that writes into its argument must not change the samples.
         if self.executor is None or len(parts) == 1:
             yield from (self.problem.log_likelihood(part.copy()) for part in parts)
@@ -459,8 +456,6 @@ class _TransformPrior:
 
 @dataclass(frozen=True)
 class _ScipyMarginal:
-    """A frozen continuous distribution of scipy.stats as a marginal."""
-
     distribution: Any
 
     def from_unit(self, u: FloatArray) -> FloatArray:
@@ -475,7 +470,6 @@ class _ScipyMarginal:
 
 
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
-    """Convert a prior in any form that `make_problem` takes to one with names; ParameterError for anything else."""
     require(not isinstance(names, str), "names", names, "a list of names: names=['x', 'y']")
     given = None if names is None else tuple(str(name) for name in names)
     made: Prior
@@ -505,7 +499,6 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
 
 
 def _as_marginal(name: str, one: Any) -> Marginal:
-    """Convert a distribution in any of its forms to a marginal; `name` is its name in error messages."""
     if isinstance(one, tuple | list | Marginal):
         return parse_prior(name, one)
     has_quantile = hasattr(one, "ppf") or hasattr(one, "icdf")

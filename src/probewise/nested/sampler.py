@@ -483,7 +483,6 @@ def _final_result(
     rng: np.random.Generator,
     notes: Sequence[str] = (),
 ) -> NestedResult:
-    """Let the remaining live points die and compute the result."""
     n_dead = sum(map(len, now.dead))
     last = now.live.take_rows(now.live.rows_by_rising_likelihood())
     points = LivePoints.join(*now.dead, last)

@@ -86,7 +86,6 @@ class SliceChains:
         return replace(self._now, u=self._wrapped(self._now.u, 0.0))
 
     def _wrapped(self, u: FloatArray, begin: FloatArray | float) -> FloatArray:
-        """Wrap periodic coordinates into the period that begins there."""
         if self._columns:
             u = u.copy()
             u[:, self._columns] = begin + (u[:, self._columns] - begin) % 1.0
@@ -119,7 +118,6 @@ class SliceChains:
                 self._begin_step(more, rng)
 
     def _begin_step(self, rows: IntArray, rng: np.random.Generator) -> None:
-        """Set up the line, the bracket and the level of the next step of the chains `rows`."""
         at = self._step[rows]
         kinds, measure = self._kinds[rows, at], self._metric_rows(rows, self._home[rows])
         toward = np.zeros((rows.size, self._line.shape[1]))

@@ -405,7 +405,6 @@ def predict_runs(
 
 
 def _log_mean_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
-    """Return the log of the mean density over samples, (n_points,), of readings predicted with `sd` (n_samples,)."""
     each = log_gaussian_density(readings, predicted, sd[:, None])
     return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 

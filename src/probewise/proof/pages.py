@@ -200,7 +200,6 @@ def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
 
 
 def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
-    """Write an estimate, times a scale, with its error; without, if that is 0 or unknown."""
     value, half = scale * estimate.value, scale * estimate.half_width
     return value_with_error(value, half) if half > 0 else number_text(value, 1)
 
@@ -403,5 +402,4 @@ def _target_text(row: ScoreRow) -> str:
 
 
 def _csv_cell(value: float) -> str:
-    """Write a number as a cell of a CSV file; one that is not finite is empty."""
     return f"{value:.6g}" if math.isfinite(value) else ""

@@ -85,7 +85,6 @@ def _objective(found: Fit) -> float:
 
 
 def _fits_with_one_more_gaussian(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
-    """Yield fits with one more Gaussian than `found`, one from each way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
     for z in starts_with_more_gaussians(found.model.sensor, found.z, wanted):
         yield _white_noise_fit(Model(wanted, (), recording.plan), recording, z)
@@ -122,7 +121,6 @@ class _Rivalry:
         return templates, order, float(np.sqrt(min(explained[order[0]] / whole, 1.0)))
 
     def refits(self, effect: Effect, templates: EffectTemplates, entries: Iterable[int]) -> Iterator[Fit]:
-        """Yield the fit of the model with an effect from each of these entries of its template bank."""
         found, n = self.found, len(self._usable)
         for at in entries:
             columns = templates.columns[at]
@@ -255,7 +253,6 @@ def run_table(rows: SystemTable, kind: SystemKind, readings: FloatArray) -> RunT
 
 
 def _best_fit(found: Fit, readings: Recording, forms: Sequence[Effect]) -> Fit:
-    """Add forms to a fit, one after the other, from their best starts; return the best fit of all."""
     if not forms:
         return found
     rivalry = _Rivalry(found, readings)

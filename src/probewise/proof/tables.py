@@ -104,30 +104,19 @@ def names_in_label(label: str) -> Names:
     return () if label == "clean" else tuple(label.split("+"))
 
 
-def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
-    """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
-    labels = [names_in_label(label) for label in result["credible_set"]]
-    if merged:
-        return any(are_names_right(result, names) for names in labels)
-    wanted = right_names_of_each_effect(result, merged=False)
-    return any(names_match(names, wanted) for names in labels)
+def leading_hypothesis(result: Result, *, clean: bool = True) -> tuple[Names, float]:
+    """Return (names, probability) of the most probable hypothesis; the clean one, (), counts only if `clean`."""
+    options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
+    return max(options, key=lambda option: option[1], default=((), 0.0))
 
 
-def credible_set_size_with_aliases_merged(result: Result) -> float:
-    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
-    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
-    return float(len(result["credible_set"]) - max(right - 1, 0))
+def _without_noise(names: Iterable[str]) -> Names:
+    return tuple(name for name in names if name not in NOISE)
 
 
-def has_false_extra_effect(result: Result) -> bool:
-    """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
-    named = _without_noise(leading_hypothesis(result, clean=True)[0])
-    wanted = right_names_of_each_effect(result, merged=True, noise=False)
-    matched = (
-        sum(name in right for name, right in zip(order, wanted, strict=False))
-        for order in itertools.permutations([*named, *[""] * len(wanted)], len(wanted))
-    )
-    return max(matched) < len(named)  # one name per effect, and as many as possible
+def acts_on_mean(result: Result) -> bool:
+    """Return whether no concealed effect acts on the noise only; True if nothing is concealed."""
+    return not any(h["on_noise"] for h in result["hidden"])
 
 
 def is_distinguishable_from_ssf(result: Result) -> bool:
@@ -147,19 +136,9 @@ def is_recognised_as_out_of_vocabulary(result: Result) -> bool:
     return result["verdict"] == "unknown" or named
 
 
-def acts_on_mean(result: Result) -> bool:
-    """Return whether no concealed effect acts on the noise only; True if nothing is concealed."""
-    return not any(h["on_noise"] for h in result["hidden"])
-
-
-def leading_hypothesis(result: Result, *, clean: bool) -> tuple[Names, float]:
-    """Return (names, probability) of the most probable hypothesis; the clean one, (), counts only if `clean`."""
-    options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
-    return max(options, key=lambda option: option[1], default=((), 0.0))
-
-
-def _without_noise(names: Iterable[str]) -> Names:
-    return tuple(name for name in names if name not in NOISE)
+def names_effect_on_mean(result: Result) -> bool:
+    """Return whether the diagnosis names an effect on the mean ("unknown" is none)."""
+    return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
 def is_leading_name_right(result: Result) -> bool:
@@ -173,28 +152,45 @@ def is_leading_name_right(result: Result) -> bool:
     due = is_distinguishable_from_ssf(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
-        key = _without_noise(names)
-        if key or not due:
+        if (key := _without_noise(names)) or not due:
             joined[key] = joined.get(key, 0.0) + p
-    first = max(joined, key=lambda key: joined[key], default=())
-    return are_names_right(result, first, noise=False)
+    return are_names_right(result, max(joined, key=lambda key: joined[key], default=()), noise=False)
+
+
+def has_false_extra_effect(result: Result) -> bool:
+    """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
+    named = _without_noise(leading_hypothesis(result)[0])
+    return count_extra_names(named, right_names_of_each_effect(result, merged=True, noise=False)) > 0
+
+
+def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
+    """Count the names left over when as many as possible match a wanted effect, one name per effect."""
+    orders = itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
+    return len(names) - max(sum(n in right for n, right in zip(order, wanted, strict=False)) for order in orders)
 
 
 def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:
     """Return the leading hypothesis's probability and whether it is right; an alias is, outside the vocabulary only."""
-    names, probability = leading_hypothesis(result, clean=True)
+    names, probability = leading_hypothesis(result)
     return probability, names_match(names, right_names_of_each_effect(result, merged=False))
-
-
-def names_effect_on_mean(result: Result) -> bool:
-    """Return whether the diagnosis names an effect on the mean ("unknown" is none)."""
-    return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
 def is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect, or an alias, has a probability above 0.9; "clean" and "unknown" do not count."""
     probability, right = leading_probability_and_correctness(result)
-    return probability > 0.9 and not right and leading_hypothesis(result, clean=True)[0] not in ((), ("unknown",))
+    return probability > 0.9 and not right and leading_hypothesis(result)[0] not in ((), ("unknown",))
+
+
+def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
+    """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
+    sets, wanted = map(names_in_label, result["credible_set"]), right_names_of_each_effect(result, merged=False)
+    return any(are_names_right(result, names) if merged else names_match(names, wanted) for names in sets)
+
+
+def credible_set_size_with_aliases_merged(result: Result) -> float:
+    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
+    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
+    return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
 _EDGES = np.linspace(0, 1, 11)
@@ -245,7 +241,7 @@ def confusion_counts(
     counts: Counter[tuple[str, str]] = Counter()
     for result in _of(results, "clean", "single", "outside"):
         truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
-        names, on_mean = leading_hypothesis(result, clean=True)[0], acts_on_mean(result)
+        names, on_mean = leading_hypothesis(result)[0], acts_on_mean(result)
         names = _without_noise(names) if on_mean else names
         answer = SEVERAL if len(names) > 1 else "".join(names) or "clean"
         if truth not in ("clean", OUTSIDE) and names_match(
@@ -302,8 +298,7 @@ def oracle_credible_set_size(hidden: Hidden) -> float:
 
 def readings_to_separate_alias(result: Result) -> float:
     """Return how many readings of the same plan would separate a case's aliased pair by 3 nats (inf if identical)."""
-    size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
-    apart = size**2 * (1 - rho**2) / 2
+    apart = float(result["hidden"][0]["size_lambda"]) ** 2 * (1 - float(result["cosine"]) ** 2) / 2
     return float(result["readings"]) * HONEST_NATS / apart if apart > 0 else np.inf
 
 
@@ -313,11 +308,8 @@ def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
 
 
 def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
-    """Return the distance of each rival in noise sds, by name; {} for a noise effect.
-
-    It is lambda sqrt(1 - rho^2), or sqrt(2 nats) where the case holds the rival's loss of log likelihood (systems).
-    """
-    if "rival_nats" in hidden:
+    """Return the distance of each rival in noise sds, by name; {} for a noise effect."""
+    if "rival_nats" in hidden:  # of a system, the rival's loss of log likelihood
         return {name: float(np.sqrt(2 * nats)) for name, nats in hidden["rival_nats"].items()}
     size, rivals = float(hidden["size_lambda"]), {n: r for n, r in hidden["cosines"].items() if n != hidden["name"]}
     return {name: size * float(np.sqrt(max(1 - rho**2, 0.0))) for name, rho in rivals.items()}
@@ -367,7 +359,6 @@ def _mean(name: str, values: Iterable[float], least: float = -math.inf, most: fl
 
 
 def _of(results: Iterable[Result], *kinds: str, **wanted: object) -> list[Result]:
-    """Return the results of these kinds of cases, with the wanted values of their parts."""
     return [r for r in results if r["kind"] in kinds and all(r[name] == value for name, value in wanted.items())]
 
 
@@ -397,7 +388,6 @@ def _unknown(results: Iterable[Result]) -> list[bool]:
 
 
 def _scored(results: Results, *parts: Part) -> tuple[ScoreRow, ...]:
-    """Return the rows of these parts of a table, and that of the cases that failed."""
     done = [r for r in results if "failed" not in r]
     return (
         *(row for part in parts for row in part(done)),
@@ -591,7 +581,7 @@ def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
     yield from _alarms_by_noise(other)
     yield _share("physics named, no effect, white noise", map(names_effect_on_mean, white), most=0.005)
     yield _share("physics named, no effect, other noise", map(names_effect_on_mean, other), most=0.005)
-    noise_is_right = [leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]
+    noise_is_right = [leading_hypothesis(r)[0] == tuple(r["truth"]) for r in other]
     yield _share("noise named right, no effect, other noise", noise_is_right)
     for size, least in ((6.0, -math.inf), (8.0, 0.9), (12.0, 0.95), (20.0, 0.98)):
         singles = _of(done, "single", size=size)
@@ -604,7 +594,6 @@ def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
 
 
 def _effects_with_rivals(singles: Results) -> list[Result]:
-    """List the concealed effects of cases with one effect whose rivals are on file."""
     return [r["hidden"][0] for r in singles if "rival_nats" in r["hidden"][0]]
 
 
@@ -617,7 +606,7 @@ def _probabilities_and_intervals_of_systems(done: list[Result]) -> Iterator[Scor
     yield _mean("size of the credible set, the truth and its aliases as one, lambda 12", sizes, most=1.4)
     if oracle := [oracle_credible_set_size(hidden) for hidden in _effects_with_rivals(singles)]:
         yield _mean("  oracle, so counted, lambda 12", oracle)
-    wrong = [is_confidently_wrong(r) and not are_names_right(r, leading_hypothesis(r, clean=True)[0]) for r in done]
+    wrong = [is_confidently_wrong(r) and not are_names_right(r, leading_hypothesis(r)[0]) for r in done]
     yield _share("wrong name stated above .9", wrong, most=0.01)
     yield ScoreRow("expected calibration error", calibration_error(done))
     stated = [item for r in done for effect in r["parameters"].values() for item in effect.items()]
@@ -662,7 +651,7 @@ def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:
 
 def _gains_as_much_as_true_law(result: Result) -> bool:
     """Return whether the right name or an alias leads, or the repaired model gains 80 % of the right model's nats."""
-    names = leading_hypothesis(result, clean=True)[0]
+    names = leading_hypothesis(result)[0]
     if names_match(names, right_names_of_each_effect(result, merged=True)) and result["verdict"] != "unknown":
         return True
     gains = gains_on_held_out_runs(result, "right")

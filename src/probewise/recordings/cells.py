@@ -42,10 +42,6 @@ def parsed_numbers(cells: Sequence[str]) -> FloatArray | None:
         return None
 
 
-def _is_number(cell: str) -> bool:
-    return _NUMBER.fullmatch(cell) is not None
-
-
 def first_cell_without_number(
     cells: Sequence[object], *, missing: bool = True, largest: float = math.inf
 ) -> int | None:
@@ -56,11 +52,11 @@ def first_cell_without_number(
     first: int | None = None
     for k, cell in enumerate(cells):
         text = str(cell).strip()
-        is_number = _is_number(text) and abs(float(text)) <= largest
-        if not is_number and not (missing and text in MISSING):
-            if not looks_like_number(text):
-                return k
-            first = k if first is None else first
+        if (missing and text in MISSING) or (_NUMBER.fullmatch(text) and abs(float(text)) <= largest):
+            continue
+        if not looks_like_number(text):
+            return k
+        first = k if first is None else first
     return first
 
 
@@ -68,7 +64,7 @@ def count_numbers(cells: Sequence[str]) -> int:
     """Count the cells that hold a plain decimal number (float() would accept 'infinity' and '1_000' too)."""
     if parsed_numbers(cells) is not None:
         return len(cells)
-    return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
+    return sum(n for cell, n in Counter(cells).items() if _NUMBER.fullmatch(cell))
 
 
 class UnclearCellError(ValueError):
@@ -161,23 +157,18 @@ class _Quantities:
         return cls(numbers, next(iter(units)), words, missing) if len(units) == 1 else None
 
     def decimal_marks(self) -> set[str]:
-        """Return the decimal marks with which all numbers can be read."""
-        texts = self.numbers.values()
-        return {mark for mark in _GROUPS if any(all(map(f.fullmatch, texts)) for f in _formats(mark))}
+        """Return the decimal marks with which all numbers can be read, in one of the ways to set thousands apart."""
+        marks, exponent = set[str](), r"(?:[eE][+-]?\d+)?"
+        for mark, groups in _GROUPS.items():
+            point = re.escape(mark)
+            for group in map(re.escape, groups):
+                whole = rf"(?:\d+|[1-9]\d{{0,2}}(?:{group}\d{{3}})+)(?:{point}\d*)?"
+                form = re.compile(rf"[+-]?(?:{whole}{exponent}|{point}\d+{exponent})")
+                if all(map(form.fullmatch, self.numbers.values())):
+                    marks.add(mark)
+        return marks
 
     def plain(self, mark: str) -> dict[str, str]:
-        """Return each distinct cell as a plain number, or an empty text."""
         dropped = str.maketrans("", "", "".join(_GROUPS[mark]))
         out = {cell: number.translate(dropped).replace(mark, ".") for cell, number in self.numbers.items()}
         return out | dict.fromkeys(self.words, "") | {cell: cell for cell in self.missing}
-
-
-def _formats(mark: str) -> list[re.Pattern[str]]:
-    """Return the patterns of numbers with a decimal mark: one for each way to set thousands apart."""
-    fraction = rf"(?:{re.escape(mark)}\d*)?(?:[eE][+-]?\d+)?"
-    return [
-        re.compile(
-            rf"[+-]?(?:(?:\d+|[1-9]\d{{0,2}}(?:{group}\d{{3}})+){fraction}|{re.escape(mark)}\d+(?:[eE][+-]?\d+)?)"
-        )
-        for group in map(re.escape, _GROUPS[mark])
-    ]

@@ -40,12 +40,10 @@ class _Object:
         self.path, self.where, self.content = path, where, content
 
     def error(self, name: str, allowed: str) -> FileError:
-        """Return the error that the value of a name is missing or not allowed."""
         found = f"is {_shortened_json(self.content[name])}" if name in self.content else "is missing"
         return FileError(self.path, f"{self.where}.{name} {found}".lstrip("."), allowed)
 
     def value(self, name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
-        """Return the value of a name; FileError if it is missing or does not fit."""
         if name not in self.content or not fits(self.content[name]):
             raise self.error(name, allowed)
         return self.content[name]

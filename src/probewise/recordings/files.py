@@ -129,7 +129,6 @@ def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> li
 
 
 def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
-    """Write the images, the description, then the table, each atomically."""
     require(path.suffix.lower() != ".json", "path", str(path), "the name of the CSV; the JSON goes beside it")
     if unknown := sorted({name for name, _ in plan.rows_by_pattern()} - set(plan.patterns)):
         raise ParameterError("pattern", unknown[0], "a pattern that plan.patterns describes")

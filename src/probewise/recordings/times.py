@@ -137,7 +137,11 @@ def _seconds_of_dates(parts: Sequence[dict[str, Any]]) -> tuple[FloatArray, str]
         raise UnclearCellError(short[0], "a year of four digits: of two, day, month and year cannot be told apart")
     if len({p["zone"] is None for p in parts if p["hour"]}) > 1:
         raise UnclearCellError(0, "dates that all have a time zone, or none of them")
-    clocks = np.array([_seconds_of_clock(k, p) - _seconds_of_zone(p["zone"]) for k, p in enumerate(parts)])
+    clocks = np.array([_seconds_of_clock(k, p) for k, p in enumerate(parts)])
+    for k, zone in enumerate(p["zone"] for p in parts):
+        if zone is not None and zone[0] in "+-":
+            digits = zone[1:].replace(":", "").ljust(4, "0")
+            clocks[k] -= float(f"{zone[0]}1") * (3600.0 * int(digits[:2]) + 60.0 * int(digits[2:]))
     if "a" not in parts[0]:
         days = _days(((p["y"], p["m"], p["d"]) for p in parts), strict=True)
         return _DAY * (days - days[0]) + clocks, ""
@@ -168,10 +172,3 @@ def _days(dates: Iterable[tuple[Any, Any, Any]], *, strict: bool = False) -> Flo
                 raise UnclearCellError(k, "a date that exists, such as 2026-11-28") from error
             return np.empty(0)
     return np.array(out, dtype=np.float64)
-
-
-def _seconds_of_zone(zone: str | None) -> float:
-    if zone is None or zone[0] not in "+-":
-        return 0.0
-    digits = zone[1:].replace(":", "").ljust(4, "0")
-    return (-1.0 if zone[0] == "-" else 1.0) * (3600.0 * int(digits[:2]) + 60.0 * int(digits[2:]))

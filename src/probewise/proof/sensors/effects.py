@@ -173,7 +173,6 @@ def _log_uniform(low: float, high: float | Callable[[CleanSetup], float]) -> Dra
 
 
 def _moment(low: float, high: float) -> Draw:
-    """Draw a time between these shares of the recording, s."""
     return lambda setup, rng: float(setup.plan.time_s[0]) + rng.uniform(low, high) * setup.duration_s
 
 
@@ -187,7 +186,6 @@ def _edge_scan(setup: CleanSetup, rng: np.random.Generator) -> str:
 
 
 def _edge_scans(setup: CleanSetup, rng: np.random.Generator) -> tuple[str, ...]:
-    """Draw a scan, or all scans that start at its orientation."""
     scan, plan = _edge_scan(setup, rng), setup.plan
     if rng.random() >= 0.5:
         return (scan,)
@@ -209,7 +207,6 @@ _SPOT = (_uniform(-40, 40), _uniform(-4, 4), _log_uniform(3.0, 10.0))  # x, y an
 
 
 def _signed(kind: Callable[..., Concealed]) -> Callable[..., Concealed]:
-    """Return the maker of an effect whose amplitude has a random sign."""
     return lambda a, sign, *more: kind(sign * a, *more)
 
 
@@ -219,7 +216,6 @@ def _directed(kind: Callable[[float, float], Concealed]) -> Callable[..., Concea
 
 
 def _saturation(a: float, levels: tuple[float, float], softness: float) -> Concealed:
-    """Saturate at a share `a` of the span below white, sharply or rounded over one reading unit."""
     black, white = levels
     return known.saturation(white - a * (white - black), softness)
 

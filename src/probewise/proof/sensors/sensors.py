@@ -39,7 +39,6 @@ NOISE_NAMES: Mapping[str, str] = {model: name for model, (name, _) in _NOISE.ite
 
 
 def _about(rng: np.random.Generator, value: float) -> float:
-    """Draw a length within 15 % of a LEGO light sensor's."""
     return value * float(rng.uniform(0.85, 1.15))
 
 

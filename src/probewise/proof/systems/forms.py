@@ -184,7 +184,6 @@ def _modulations(true: SimulatedSystem) -> dict[str, Form]:
 
 
 def _proportional_to_column(true: SimulatedSystem, column: str) -> Form:
-    """Return the modulation a (column - its mean over the recording)."""
     middle, sd = true.deviation(column)
     return _modulation(lambda now, v: v["a"] * (now.u[column] - middle), column, reach=sd, uses=(column,))
 
@@ -228,25 +227,21 @@ def forms_of(true: SimulatedSystem) -> list[Form]:
 
 
 def _is(number: str) -> dict[str, Any]:
-    """Return the fields of a form of one parameter, the `number`, which is the amplitude."""
     return {"of_amplitude": lambda a, drawn: {number: a}, "signed": False}
 
 
 def _bounded_by(end: float, inwards: float) -> dict[str, Any]:
-    """Return the fields of a form with a "level", which the amplitude moves inwards from an end of the range."""
     return {"of_amplitude": lambda a, drawn: {"level": end + inwards * a}, "signed": False}
 
 
 def _added_form(
     true: SimulatedSystem, name: str, addition: Callable[..., Any], *covariates: str, order: int = OFFSET, **more: Any
 ) -> Form:
-    """Return the form that adds `a` times `addition` (readings, rows, parameters) to the reading."""
     sd, act = true.kind.sd, lambda y, rows, v: np.asarray(y + v["a"] * addition(y, rows, v))
     return Form(name, "reading", act, sd, _MANY * sd, covariates, order=order, **more)
 
 
 def _forms_of_readings(true: SimulatedSystem, modulations: Mapping[str, Form]) -> Iterator[Form]:
-    """Yield what is added to the reading, or multiplies it, over rows, runs and columns."""
     sd, typical = true.kind.sd, float(np.sqrt(np.mean(true.readings**2)))
 
     def added(name: str, how: Form) -> Form:
@@ -329,7 +324,6 @@ def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
 
 
 def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
-    """Yield what depends on the reading itself: hysteresis, a bend, a ceiling and a floor, a lag and a delay."""
     low, high, sd = float(true.readings.min()), float(true.readings.max()), true.kind.sd
     span, level = high - low, ("level",)
 
@@ -356,13 +350,11 @@ def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
 def _input_form(
     name: str, column: str, change: Callable[..., Any], first: float, limit: float, *covariates: str, **more: Any
 ) -> Form:
-    """Return the form that replaces a column of the law or formula by `change(column, rows, parameters)`."""
     act = lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}  # noqa: E731
     return Form(name, "input", act, first, limit, covariates, **more)
 
 
 def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
-    """Yield the forms on a column that the law or formula uses."""
     values, (_, spread) = true.table.columns[column], true.deviation(column)
     low, high = float(values.min()), float(values.max())
     span, n_values = high - low, len(np.unique(values))
@@ -411,7 +403,6 @@ def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray
 
 
 def _forms_of_parameters(true: SimulatedSystem, modulations: Mapping[str, Form]) -> Iterator[Form]:
-    """Yield the forms by which each parameter may vary: in a step, a drift, from run to run, with a column."""
     for name, values in true.parameters.items():
         of_run = name in true.kind.per_run
         if of_run and true.kind.law is not None:
@@ -439,7 +430,6 @@ def _forms_of_rate(true: SimulatedSystem, state: str, wave: Form) -> Iterator[Fo
     own = f"state:{state}", "time"
 
     def term(name: str, of: str, change: Callable[[Any], Any], size: float, *seen: str, **more: Any) -> Form:
-        """Return a term that is a function `change` of the state `of`."""
         return _rate_form(true, f"{name}:{state}", state, lambda s, now, v: change(s[of]), size, *seen, **more)
 
     yield term("damping", state, lambda r: -r, size, *own, signed=False)

@@ -49,7 +49,6 @@ def noise_of_size(
     n = len(rows)
 
     def of(in_sds: Callable[..., FloatArray], size_lambda: float = 0.0, **parameters: Any) -> SystemNoise:
-        """Return noise that is added; `in_sds`: function of readings, table and generator."""
         return SystemNoise(name, lambda y, rows, rng: y + sd * in_sds(y, rows, rng), parameters, size_lambda)
 
     def white(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:

@@ -77,7 +77,6 @@ class _Integration:
         self.hard = [(e.form, float(e.values["a" if e.form.sticks else "level"])) for e in hard]
 
     def solve(self) -> dict[str, FloatArray]:
-        """Return every state by name at every row, (n_points,)."""
         first = self.rows[0]
         starts = (self.parameters[each] if isinstance(each, str) else each for each in self.law.start.values())
         s = np.array([np.broadcast_to(np.asarray(v)[first] if np.ndim(v) else v, len(first)) for v in starts])
@@ -135,7 +134,6 @@ class _Integration:
         return at
 
     def _rates(self, s: FloatArray, p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
-        """Return the rate of each state by name, with the effects on rates except dry friction and bounds."""
         by_name = dict(zip(self.names, s, strict=True))
         out = self.law.rates(by_name, p, now.u)
         for e in self.effects:
@@ -155,7 +153,6 @@ class _Integration:
         return ((a, b) for a, b in pairwise([0.0, *inside.tolist(), 1.0]) if b - a > _CLOSE)
 
     def _solved(self, slope: Callable[..., Any], begin: float, end: float, s: FloatArray, events: Any = None) -> Any:
-        """Return SciPy's solution of the slope of the states between two shares of a gap."""
         n_calls = 0
 
         def counted(share: float, y: FloatArray) -> Any:
@@ -172,7 +169,6 @@ class _Integration:
         return solved
 
     def _through_gap(self, s: FloatArray, k: int) -> FloatArray:
-        """Integrate states, (n_states, n_runs), from position k of all runs to the next position."""
         gap, at = self.time[self.rows[k + 1]] - self.time[self.rows[k]], self._inputs_in_gap(k)
         intervals = list(self._intervals(k))
 
@@ -202,7 +198,6 @@ class _Integration:
             return {name: float(np.ravel(v)[0]) for name, v in self._rates(y, *at(share)).items()}
 
         def end_of_mode(form: Form, size: float, mode: int, i: int) -> Any:
-            """Return SciPy's event: coming to rest, breaking loose, reaching or leaving a bound."""
 
             def rate(x: float, y: FloatArray) -> float:
                 return free_rates(x, y)[form.target]

@@ -9,7 +9,20 @@ import pytest
 from scipy.stats import kstest
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.cases import WHEEL, Stratum, draw_case, held_out_recordings, stratum_of
+from probewise.proof.sensors.cases import (
+    NOISE_LEVELS,
+    NOISE_NAMES,
+    PLANS,
+    SSFS,
+    WHEEL,
+    Stratum,
+    draw_case,
+    draw_plan_with_displaced_patterns,
+    draw_sensor,
+    held_out_plans,
+    held_out_recordings,
+    stratum_of,
+)
 from probewise.proof.sensors.effects import (
     INSIDE,
     NEEDS_SENSOR,
@@ -18,15 +31,6 @@ from probewise.proof.sensors.effects import (
     SINGLES,
     CleanSetup,
     CovariateRegion,
-)
-from probewise.proof.sensors.sensors import (
-    NOISE_LEVELS,
-    NOISE_NAMES,
-    PLANS,
-    SSFS,
-    draw_plan_with_displaced_patterns,
-    draw_sensor,
-    held_out_plans,
 )
 from probewise.recordings import fingerprint, read_recording, write_recording
 

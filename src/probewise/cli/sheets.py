@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
-    from probewise.recordings.description import read_description
+    from probewise.recordings.files import read_description
     from probewise.report.sheets import arm_home_jig_sheets, field_sheet, marks_sheet, pattern_sheets, target_sheet
 
     what = arguments.what

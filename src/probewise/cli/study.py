@@ -14,7 +14,7 @@ from probewise.cli._executor import add_executor, run_and_report
 from probewise.errors import ParameterError, require
 
 if TYPE_CHECKING:
-    from probewise.proof.configurations import SearchConfiguration
+    from probewise.proof.study import SearchConfiguration
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 MOST_CIRCLES = 10_000  # as of `probewise.proof.study`, which takes a second to import
@@ -102,7 +102,7 @@ def _require_none(arguments: argparse.Namespace, names: Iterable[str], beside: s
 
 
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:
-    from probewise.proof.configurations import SearchConfiguration, paper_comparison_rows, standard_rows
+    from probewise.proof.study import SearchConfiguration, paper_comparison_rows, standard_rows
 
     given = _given(arguments, _FACTORS)
     if arguments.beside_paper:

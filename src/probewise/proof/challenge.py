@@ -26,7 +26,7 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, ProbewiseError
 from probewise.investigation import investigate
-from probewise.proof.campaign import Campaign, Result
+from probewise.proof.campaign import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, Campaign, Result, misfit_of_case
 from probewise.proof.refits import (
     NullRefit,
     SystemRefit,
@@ -36,7 +36,6 @@ from probewise.proof.refits import (
     rivals_with_nats,
     run_table,
 )
-from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup, CovariateRegion
 from probewise.proof.systems.cases import SystemCase, draw_system_case, system_stratum_of, write_system_case

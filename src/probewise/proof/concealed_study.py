@@ -22,14 +22,16 @@ from probewise._version import __version__
 from probewise.arm import Pose, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
 from probewise.inference import Rounded
-from probewise.proof.campaign import Campaign, Result
-from probewise.proof.configurations import FIELD, MOST_CIRCLES, REFERENCE, SEED, true_circle
+from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Result, misfit
 from probewise.proof.estimates import Estimate, estimated_share, grouped
-from probewise.proof.results import CONCEALED_TRIAL, misfit
-from probewise.proof.trial import (
+from probewise.proof.study import (
     BLOB,
     BRIGHT,
     DARK,
+    FIELD,
+    MOST_CIRCLES,
+    REFERENCE,
+    SEED,
     WRONG_MM,
     accuracy_measures,
     arm_that_reads,
@@ -39,6 +41,7 @@ from probewise.proof.trial import (
     has_reached_target,
     mixture_of,
     timed_steps,
+    true_circle,
 )
 from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain

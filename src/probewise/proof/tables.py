@@ -18,8 +18,8 @@ from probewise.diagnosis.prior_odds import Names
 from probewise.effects import VOCABULARY
 from probewise.proof.campaign import Result
 from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic, grouped
+from probewise.proof.sensors.cases import NOISE_NAMES
 from probewise.proof.sensors.effects import NO_PHYSICS, SINGLES
-from probewise.proof.sensors.sensors import NOISE_NAMES
 
 Results: TypeAlias = Sequence[Result]
 

@@ -24,6 +24,7 @@ from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError, require
+from probewise.recordings.cells import times_to_numbers
 from probewise.recordings.columns import (
     A_PATTERN,
     SESSION,
@@ -41,7 +42,6 @@ from probewise.recordings.columns import (
     texts_to_numbers,
 )
 from probewise.recordings.patterns import Pattern
-from probewise.recordings.times import times_to_numbers
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,14 @@ from probewise.recordings.cells import (
     first_cell_without_number,
     is_missing,
     looks_like_number,
+    looks_like_time,
     parsed_numbers,
     plain_cells,
+    require_unit_of_time,
+    texts_to_times,
     unit_of_cells,
 )
 from probewise.recordings.io import read_text
-from probewise.recordings.times import looks_like_time, require_unit_of_time, texts_to_times
 
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""

@@ -7,8 +7,7 @@ from probewise.arm import Pose
 from probewise.experiment import CLEAN
 from probewise.experiment.rivals import rivals_of
 from probewise.proof.concealed_study import CONCEALED, ConcealedTrial, _arm_in_concealed_world, concealed_forms
-from probewise.proof.configurations import FIELD, REFERENCE
-from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
+from probewise.proof.study import BRIGHT, DARK, FIELD, REFERENCE, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
 from probewise.world import World
 

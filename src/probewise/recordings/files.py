@@ -1,4 +1,4 @@
-"""Files of recordings and plans: NAME.csv with the rows, NAME.json with instrument, patterns and controls."""
+"""Files of recordings, plans and predictions: NAME.csv with the rows, NAME.json with instrument and patterns."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, read_only_floats, require_finite
+from probewise._display import ShowsItself
 from probewise._kinds import checked_path
 from probewise._writing import is_device_or_pipe, write_bytes_atomically, write_text_atomically
-from probewise.errors import FileError, ParameterError, require, shortened, shown
+from probewise.errors import FileError, ParameterError, ShapeError, require, shortened, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.cells import MISSING, count_numbers
 from probewise.recordings.columns import (
@@ -31,8 +32,7 @@ from probewise.recordings.columns import (
     scan_codes_and_names,
     sessions_of_scans,
 )
-from probewise.recordings.images import image_bytes, is_file_name_without_path, read_image
-from probewise.recordings.io import parse_json_file_text, read_text
+from probewise.recordings.io import image_bytes, is_file_name_without_path, parse_json_file_text, read_image, read_text
 from probewise.recordings.patterns import PATTERNS, Image, Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording, range_in_words, require_plan, require_recording
 from probewise.recordings.table import LARGEST, CSVTable, cell_in_words, csv_text, number_text, read_table
@@ -106,12 +106,12 @@ def _name_in_file(field: str) -> str:
 
 def _parse_pattern(found: _Object, kind: type[Pattern]) -> Pattern:
     values: dict[str, Any] = {}
-    for field in fields(kind):
-        name = _name_in_file(field.name)
-        if field.type not in _FIELDS or (name not in found.content and field.default is not dataclasses.MISSING):
+    for one in fields(kind):
+        name = _name_in_file(one.name)
+        if one.type not in _FIELDS or (name not in found.content and one.default is not dataclasses.MISSING):
             continue  # an image's pixels, which are in their own file; what has a default
-        value = found.value(name, *_FIELDS[field.type])
-        values[field.name] = math.radians(value) if name != field.name else value
+        value = found.value(name, *_FIELDS[one.type])
+        values[one.name] = math.radians(value) if name != one.name else value
     if kind is Image:
         picture = found.path.parent / values["file"]
         if not picture.is_file():  # the error names the JSON that refers to the picture
@@ -200,14 +200,14 @@ def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pa
 def _pattern_fields(pattern: Pattern) -> dict[str, object]:
     require(type(pattern) in _KIND_OF, "pattern", type(pattern).__name__, f"one of {', '.join(_KINDS)}")
     out: dict[str, object] = {"kind": _KIND_OF[type(pattern)]}
-    for field in fields(pattern):
-        value = getattr(pattern, field.name)
+    for one in fields(pattern):
+        value = getattr(pattern, one.name)
         if isinstance(value, np.ndarray):
             continue  # an image's pixels are in their own file
-        if field.name.endswith("_rad"):
-            out[_name_in_file(field.name)] = shortest_degrees(value)
-        elif field.name not in ("inside", "outside") or value != field.default:
-            out[field.name] = value
+        if one.name.endswith("_rad"):
+            out[_name_in_file(one.name)] = shortest_degrees(value)
+        elif one.name not in ("inside", "outside") or value != one.default:
+            out[one.name] = value
     return out
 
 
@@ -455,3 +455,78 @@ def fingerprint(recording: Recording) -> str:
         if isinstance(pattern, Image):
             digest.update(f"{pattern.albedo.shape}".encode() + pattern.albedo.astype("<f8").tobytes())
     return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction(ShowsItself):
+    """Predictive mean and sd of each row's reading; all arrays have shape (n_points,).
+
+    `sd` includes noise and parameter uncertainty. `log_density` is the natural log of the marginal predictive density
+    of that row's reading, per unit of the reading; NaN where it is missing or out of range, and everywhere for a plan.
+    `readings` are the scored readings, NaN where there is none.
+    """
+
+    plan: Plan
+    mean: FloatArray
+    sd: FloatArray
+    log_density: FloatArray
+    readings: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if not np.size(self.readings):
+            object.__setattr__(self, "readings", np.full(len(self.plan), np.nan))
+        for name in ("readings", "mean", "sd", "log_density"):
+            values = read_only_floats(getattr(self, name))
+            if values.shape != (len(self.plan),):
+                raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(self.plan)},), one per row")
+            object.__setattr__(self, name, values)
+        require_finite("mean", self.mean)
+        require_finite("sd", self.sd)
+        if np.isinf(self.log_density).any():
+            raise ParameterError("log_density", math.inf, "finite numbers, or NaN without a reading")
+        if np.any(self.sd <= 0):
+            raise ParameterError("sd", float(self.sd.min()), "greater than 0")
+
+    def __len__(self) -> int:
+        return len(self.plan)
+
+    def summary(self) -> str:
+        """Summarise: number of predictions; for recorded readings, chi-square and log density per reading."""
+        return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
+
+
+def prediction_summary(readings: FloatArray, mean: FloatArray, sd: FloatArray, log_density: FloatArray) -> str:
+    """Summarise predictions in a line or two, as `Prediction.summary` does; all arguments have shape (n_points,)."""
+    lines = [f"{len(mean)} readings predicted"]
+    scored = np.isfinite(log_density) & np.isfinite(readings)
+    if scored.any():
+        n_left = int(len(mean) - scored.sum())
+        left_out = f" ({n_left} missing or out of range, left out)" if n_left else ""
+        z = (readings[scored] - mean[scored]) / sd[scored]
+        lines.append(
+            f"of {int(scored.sum())} recorded{left_out}: chi-square per reading {float(np.mean(z**2)):.3f}, "
+            f"log density per reading {float(log_density[scored].mean()):.3f}"
+        )
+    return "\n".join(lines)
+
+
+def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> None:
+    """Write a CSV file of the plan's rows in order, with `mean`, `sd` and `log_density`, in full precision."""
+    columns = plan_columns(prediction.plan)
+    for name in ("mean", "sd", "log_density"):
+        columns[name] = [number_text(value) for value in getattr(prediction, name)]
+    write_text_atomically(path, csv_text(columns))
+
+
+def read_prediction_columns(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return `mean`, `sd` and `log_density` from a file of predictions, (n_points,) each; an empty density becomes NaN.
+
+    Raises FileError if the file is missing, a cell is not a valid number, or an sd is not above 0.
+    """
+    table = read_table(checked_path("path", path), wanted=("mean", "sd", "log_density"))
+    table.require_columns("mean", "sd", "log_density")
+    mean, sd = table.column_of_numbers("mean"), table.column_of_numbers("sd")
+    if np.any(sd <= 0):
+        k = int(np.argmax(sd <= 0))
+        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.rows[k], column="sd")
+    return mean, sd, table.column_of_numbers("log_density", missing=True)

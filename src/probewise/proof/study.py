@@ -377,24 +377,16 @@ def trials_by_row(results: Mapping[Trial, Result]) -> dict[SearchConfiguration, 
     return grouped((trial.row, result) for trial, result in results.items())
 
 
-def study(
-    rows: Mapping[SearchConfiguration, int] | Sequence[SearchConfiguration],
-    n_circles: int | None = None,
-    *,
-    max_readings: int = 100,
-) -> Campaign[Trial]:
-    """Return the campaign of every row over the first circles of its population.
+def study(rows: Mapping[SearchConfiguration, int], *, max_readings: int = 100) -> Campaign[Trial]:
+    """Return the campaign of every row over so many of the first circles of its population.
 
-    `rows`: the rows; a mapping gives each its own number of circles, else it is `n_circles`; rows and circles may be
-    added later to a file. `max_readings`: a run that has not reached the target precision after so many is a miss.
-    Raises ParameterError if there is no row, or a row has no circle.
+    Rows and circles may be added later to a file. `max_readings`: a run that has not reached the target precision after
+    so many is a miss. Raises ParameterError if there is no row, or a row has no circle.
     """
-    wanted = dict(rows) if isinstance(rows, Mapping) else dict.fromkeys(rows, n_circles or 0)
-    if not wanted:
-        raise ParameterError("rows", rows, "one row or more, such as those of standard_rows()")
-    for row, n in wanted.items():
+    require(rows, "rows", rows, "one row or more, such as those of standard_rows(), each with its number of circles")
+    for row, n in rows.items():
         checked_whole(f"circles of the row {row.name!r}", n, most=MOST_CIRCLES)
     # Circle by circle, so that an interrupted study has equally many runs in each row.
-    trials = [Trial(row, k, max_readings) for k in range(max(wanted.values())) for row, n in wanted.items() if k < n]
+    trials = [Trial(row, k, max_readings) for k in range(max(rows.values())) for row, n in rows.items() if k < n]
     settings = {"study": __version__, "max_readings": max_readings}
     return Campaign(run_trial, {trial.key: trial for trial in trials}, settings, partial(misfit, schema=TRIAL))

@@ -15,8 +15,8 @@ from probewise.proof.study import (
 )
 from probewise.proof.study import study as campaign_of
 
-ROWS = [REFERENCE, SearchConfiguration(model="naive")]
-BRIEF = {"n_circles": 2, "max_readings": 3}
+ROWS = {REFERENCE: 2, SearchConfiguration(model="naive"): 2}
+BRIEF = {"max_readings": 3}
 
 
 @pytest.fixture(scope="module")

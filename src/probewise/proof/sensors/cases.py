@@ -60,11 +60,6 @@ def _center(rng: np.random.Generator) -> tuple[float, float]:
     return float(rng.uniform(-0.8, 0.8)), float(rng.uniform(0.8, 2.2))
 
 
-def _draw_gaussian_spot(rng: np.random.Generator) -> Spot:
-    center, sd = _center(rng), (_about(rng, 4.0), _about(rng, 2.5))
-    return gaussian_spot([Blob(1.0, center, sd, float(rng.uniform(-0.4, 0.4)))], pixel_mm=_PIXEL_MM)
-
-
 def _draw_two_lobed_spot(rng: np.random.Generator) -> Spot:
     (u, v), apart = _center(rng), _about(rng, 3.5)
     left = Blob(float(rng.uniform(0.5, 0.7)), (u - apart, v), (_about(rng, 2.2), _about(rng, 2.5)), 0.2)
@@ -72,8 +67,13 @@ def _draw_two_lobed_spot(rng: np.random.Generator) -> Spot:
     return gaussian_spot([left, right], pixel_mm=_PIXEL_MM)
 
 
-def _draw_ridge_spot(rng: np.random.Generator) -> Spot:
-    return ridge_spot(
+SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
+    "gaussian": lambda rng: gaussian_spot(
+        [Blob(1.0, _center(rng), (_about(rng, 4.0), _about(rng, 2.5)), float(rng.uniform(-0.4, 0.4)))],
+        pixel_mm=_PIXEL_MM,
+    ),
+    "two_lobes": _draw_two_lobed_spot,
+    "ridge": lambda rng: ridge_spot(
         _about(rng, 9.0),
         center_mm=_center(rng),
         lobes=float(rng.uniform(0.15, 0.35)),
@@ -81,25 +81,20 @@ def _draw_ridge_spot(rng: np.random.Generator) -> Spot:
         ridge_width_mm=1.5,
         shadow=float(rng.uniform(0.25, 0.4)),
         pixel_mm=_PIXEL_MM,
-    )
-
-
-def _draw_ring_spot(rng: np.random.Generator) -> Spot:
-    off_axis, radius, width = float(rng.uniform(0.2, 0.6)), _about(rng, 3.3), _about(rng, 2.0)
-    return ring_spot(radius, width, center_mm=_center(rng), off_axis=off_axis, pixel_mm=_PIXEL_MM)
-
-
-def _draw_skewed_spot(rng: np.random.Generator) -> Spot:
-    core, center = (_about(rng, 1.6), _about(rng, 1.1)), _center(rng)
-    return tailed_spot(core, center_mm=center, skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
-
-
-SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
-    "gaussian": _draw_gaussian_spot,
-    "two_lobes": _draw_two_lobed_spot,
-    "ridge": _draw_ridge_spot,
-    "ring": _draw_ring_spot,
-    "skewed": _draw_skewed_spot,
+    ),
+    "ring": lambda rng: ring_spot(
+        off_axis=float(rng.uniform(0.2, 0.6)),
+        radius_mm=_about(rng, 3.3),
+        width_mm=_about(rng, 2.0),
+        center_mm=_center(rng),
+        pixel_mm=_PIXEL_MM,
+    ),
+    "skewed": lambda rng: tailed_spot(
+        (_about(rng, 1.6), _about(rng, 1.1)),
+        center_mm=_center(rng),
+        skew=float(rng.uniform(0.3, 0.5)),
+        pixel_mm=_PIXEL_MM,
+    ),
 }
 """The last three are not mixtures of Gaussians; the best mixture of four leaves a residual of lambda about 1 at the
 middle noise level: a good but inexact model."""

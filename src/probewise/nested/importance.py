@@ -328,23 +328,19 @@ def refine(
 
     Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot round a few
     draws of each are weighted; the form with the larger effective sample size gets the larger share of the mixture, and
-    its weighted draws are added to the samples for the next fit. Finally `n_draws` points are drawn. Only these count,
-    so they are independent.
+    its weighted draws are added to the samples for the next fit. Finally `n_draws` points are drawn, 100 or more; only
+    these count, so they are independent. Each of two pilot rounds takes a quarter of that, at least 100, in addition.
 
-    The error includes three corrections. The held-out third of the samples is combined with the draws by bridge
-    sampling (Meng & Wong 1996), which estimates the share of the posterior that the proposal misses. A heavy tail of
-    the weights, which slows the convergence of their mean, increases the error. And the run may have lost a mode: with
-    n_live points and information H (nats) it knows the shares of modes as precisely as n_live / H independent samples.
-    So a mode of share s is lost with probability exp(-s n_live / H); the sum of s times that over the modes found is
-    added.
+    The held-out third of the samples is combined with the draws by bridge sampling (Meng & Wong 1996), which estimates
+    the share of the posterior that the proposal misses. The error includes that; what a heavy tail of the weights adds,
+    which slows the convergence of their mean; and that the run may have lost a mode: with n_live points and information
+    H (nats) it knows the shares of modes as n_live / H independent samples do, so that a mode of share s is lost with
+    probability exp(-s n_live / H). The sum of s times that over the modes found is added.
 
-    `result` is a run of the same problem, or an earlier refinement. `n_draws`: number of final draws, 100 or more; each
-    of two pilot rounds takes a quarter of that, at least 100, in addition. `look`: whether to check the run, if it has
-    no check (it was made with `max_cost=1`), for at most as many evaluations again; parts of the posterior that it has
-    missed are among the warnings.
-
-    Raises ParameterError if an option is out of range, the run has other parameters, or the prior has neither
-    `to_unit_cube` nor coordinates; NotConvergedError if the likelihood fails.
+    `result` is a run of the same problem, or an earlier refinement. `look`: whether to check a run that has no check
+    (made with `max_cost=1`), for at most as many evaluations again; parts of the posterior that it has missed are among
+    the warnings. Raises ParameterError if an option is out of range, the run has other parameters, or the prior has
+    neither `to_unit_cube` nor coordinates; NotConvergedError if the likelihood fails.
     """
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)
@@ -371,17 +367,9 @@ def refine(
     found = draw_and_weigh(best, held, space, evaluate, n_draws=n_draws, rng=rng)
     found = with_error_of_lost_parts(found, n_lineages, space, rng)
     if look and isinstance(result, NestedResult) and result.check is None:
-        checked = check_and_repeat(
-            result,
-            Evaluator(problem),
-            SliceMove(),
-            run_once,
-            max_cost=2.0,
-            max_calls=None,
-            least_live=least_live(len(result.names)),
-            rng=rng.spawn(1)[0],  # of its own: the refined evidence is the same with and without the look
-            repeat=False,
-        )
+        calling = {"max_cost": 2.0, "max_calls": None, "least_live": least_live(len(result.names)), "repeat": False}
+        own = rng.spawn(1)[0]  # the refined evidence is the same with and without the look
+        checked = check_and_repeat(result, Evaluator(problem), SliceMove(), run_once, rng=own, **calling)
         found, result = replace(found, n_calls=found.n_calls + checked.n_calls - result.n_calls), checked
     return replace(found, warnings=(*found.warnings, *_inherited_warnings(found, result)))
 

@@ -384,11 +384,10 @@ def make_problem(
     log_likelihood
         Natural log of the likelihood of one point, (n_params,) -> a number; -inf where it is impossible.
     prior
-        A prior with names (`probewise.priors`); a dict of distributions by name; a list of distributions; or a function
-        that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
-        `probewise.priors`, (low, high), ("log", low, high), ("normal", mean, sd), or frozen continuous ones of
-        scipy.stats. A function suffices for `run`; `refine`, `update` and `diversify` need the prior's density or
-        inverse.
+        A prior with names (`probewise.priors`); distributions in a dict by name, or in a list; or a function that maps
+        a point of the unit cube to parameters, both (n_params,). Distributions are those of `probewise.priors`, (low,
+        high), ("log", low, high), ("normal", mean, sd), or frozen continuous ones of scipy.stats. A function suffices
+        for `run`; `refine`, `update` and `diversify` need the prior's density or inverse.
     names, periodic
         Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default; and
         of those whose range is periodic.

@@ -158,12 +158,9 @@ def run(
     Parameters
     ----------
     problem
-        A problem with prior and log likelihood, which is evaluated in batches; or a log likelihood, a function of one
-        point.
-    prior
-        With a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
-    names, vectorized, pass_dict, periodic
-        With a log likelihood: how the functions are called; see `make_problem`.
+        A problem with prior and log likelihood, evaluated in batches; or a log likelihood, a function of one point.
+    prior, names, vectorized, pass_dict, periodic
+        With a log likelihood: its prior, and how the functions are called; see `make_problem`.
     rng
         Source of randomness; its state is stored in the result.
     n_live
@@ -187,8 +184,7 @@ def run(
     checkpoint, checkpoint_every_s
         File to which the state is saved atomically, at most once in so many seconds and ten times the saving time (0:
         after every round); its folder is created if missing. If the file exists, the run resumes and ends bit for bit
-        as if it had not been interrupted or killed; `rng` must be in the state of the run's start, made from the same
-        seed. `max_calls` may differ.
+        as if it had not been interrupted or killed; `rng` must be as at the run's start. `max_calls` may differ.
     executor, n_workers
         Evaluates each batch of a slow likelihood in `n_workers` parts, by default the number of processors. The result
         is the same to the last bit if a hypothesis' likelihood does not depend on its batch (for matrix products in
@@ -196,16 +192,10 @@ def run(
     return_interrupted
         Whether Ctrl-C returns the result so far, with a warning; otherwise it raises `KeyboardInterrupt`.
 
-    Raises
-    ------
-    ParameterError
-        If an option is out of range.
-    NotConvergedError
-        If the likelihood fails (`partial` holds the result so far, if there is one), or every hypothesis drawn from the
-        prior is impossible.
-    FileError
-        Before anything is evaluated: if the checkpoint is damaged, belongs to another problem, other settings or
-        another seed, or cannot be written. If a later saving fails, the run goes on with a warning.
+    Raises ParameterError if an option is out of range; NotConvergedError if the likelihood fails (`partial` holds the
+    result so far, if there is one), or every hypothesis drawn from the prior is impossible; FileError, before anything
+    is evaluated, if the checkpoint is damaged, belongs to another problem, other settings or another seed, or cannot be
+    written. If a later saving fails, the run goes on with a warning.
     """
     require_rng(rng)
     posed = as_problem(problem, prior, names, vectorized, pass_dict, periodic)

@@ -183,19 +183,10 @@ class Campaign(Generic[K]):
         `concurrent.futures.Executor`, also of other machines, None for here, one by one; `progress`: called with the
         noun, the number of finished tasks, earlier runs included, and the key of the last.
 
-        Raises
-        ------
-        FileError
-            If the file belongs to another campaign, is damaged before its last line, or is being written to, or if a
-            result in it is a misfit.
-        NotConvergedError
-            If a worker dies.
-        LinkError
-            If the executor drops its tasks, as where a scheduler is killed.
-        ParameterError
-            If a result is not a JSON object of finite numbers.
-        Exception
-            Whatever `work` raises ends the campaign. Finished results are kept, and the same call continues from there.
+        Whatever `work` raises ends the campaign; finished results are kept, and the same call continues from there.
+        Raises FileError if the file belongs to another campaign, is damaged before its last line, or is being written
+        to, or if a result in it is a misfit; NotConvergedError if a worker dies; LinkError if the executor drops its
+        tasks, as where a scheduler is killed; ParameterError if a result is not a JSON object of finite numbers.
         """
         path, tasks, settings = Path(path), self.tasks, json.loads(json.dumps(dict(self.settings)))
         with hold_lock(path):
@@ -234,11 +225,8 @@ class CampaignContents:
 def read_campaign(path: str | os.PathLike[str], *, misfit: Misfit = lambda result: None) -> CampaignContents:
     """Read a campaign's file, packed if its name ends in .xz; an incomplete last line is ignored.
 
-    Raises
-    ------
-    FileError
-        If it is missing, not a campaign's, or damaged before its last line, or if `misfit` (see `Campaign`) finds a
-        result that cannot be.
+    Raises FileError if it is missing, not a campaign's, or damaged before its last line, or if `misfit` (see
+    `Campaign`) finds a result that cannot be.
     """
     content = read_bytes(Path(path), "a campaign's file")
     # After the last line end there is nothing, or an incomplete line.

@@ -417,17 +417,11 @@ class Recording(ShowsItself):
     ) -> Self:
         """Make a recording from a data frame or a dict of columns, named as in a recording's CSV file.
 
-        Raises ParameterError if a column is missing, a pattern is named but not described, or an argument has the wrong
-        type; ShapeError if the columns differ in length.
-
-        Parameters
-        ----------
-        table
-            Columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
-            `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are
-            ignored, except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers.
-        patterns, unit, min, max, step, sensor, height_mm, controls, source
-            As in `Recording.from_arrays`.
+        `table` has columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
+        `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are ignored,
+        except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers. All else is as
+        in `Recording.from_arrays`. Raises ParameterError if a column is missing, a pattern is named but not described,
+        or an argument has the wrong type; ShapeError if the columns differ in length.
 
         Examples
         --------

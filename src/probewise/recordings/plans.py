@@ -29,6 +29,7 @@ PATTERNS: dict[str, Pattern] = {
 ORIENTATIONS_DEG = (0, 90, 180, 270)
 QUADRANTS = ("quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d")
 _FULL_BATTERY_MV, _DRAIN_MV_PER_S = 8300.0, 0.12
+_JITTER = 0.1  # largest change of an interval, as a share of it
 _READING_S = 1.2  # from one reading to the next, about, of the paper's arm
 # Name, places (n, 2), patterns (one, or one per reading), degrees, seconds from one reading to the next.
 _Scan: TypeAlias = tuple[str, FloatArray, tuple[str, ...], float, float]
@@ -41,9 +42,9 @@ def paper_plan() -> Plan:
     270 degrees, `edge_0` to `edge_270`, then one reading on each of the four quadrant patterns at 0 degrees,
     `quadrants`. To turn the sensor between scans, or to change the pattern, takes 30 s.
     """
-    line = _line_places(-50, 50, 1)
+    line, break_s = _line_places(-50, 50, 1), 30.0
     scans: list[_Scan] = [(f"edge_{deg}", line, ("boundary",), deg, _READING_S) for deg in ORIENTATIONS_DEG]
-    return _plan_of_scans([*scans, ("quadrants", np.zeros((4, 2)), QUADRANTS, 0, 30.0)], break_s=30.0)
+    return _plan_of_scans([*scans, ("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s)], break_s)
 
 
 def two_way_plan() -> Plan:
@@ -53,7 +54,7 @@ def two_way_plan() -> Plan:
     depends on speed and backlash does not), plain white and plain black every 8 mm. Then the four quadrants, and a scan
     along Y across a disc, the only one that moves in Y. Between scans there are 40 s.
     """
-    out, flat = _line_places(-50, 50, 1), _line_places(-40, 40, 8)
+    out, flat, break_s = _line_places(-50, 50, 1), _line_places(-40, 40, 8), 40.0
     scans: list[_Scan] = []
     for deg in ORIENTATIONS_DEG:
         scans += [
@@ -62,9 +63,9 @@ def two_way_plan() -> Plan:
             (f"white_{deg}", flat, ("white",), deg, _READING_S),
             (f"black_{deg}", flat, ("black",), deg, _READING_S),
         ]
-    scans.append(("quadrants", np.zeros((4, 2)), QUADRANTS, 0, 40.0))
+    scans.append(("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s))
     scans.append(("disc_y", _line_places(60, -60, -2)[:, ::-1] + [-5.0, 0.0], ("disc",), 0, _READING_S))
-    return _plan_of_scans(scans, break_s=40.0)
+    return _plan_of_scans(scans, break_s)
 
 
 def with_jittered_times(plan: Plan, *, rng: np.random.Generator) -> Plan:
@@ -73,7 +74,7 @@ def with_jittered_times(plan: Plan, *, rng: np.random.Generator) -> Plan:
     Its covariate `battery_mv`, if any, is computed from the new times, with noise.
     """
     intervals = np.diff(plan.time_s, prepend=0.0)
-    time_s = np.round(np.cumsum(intervals * rng.uniform(0.9, 1.1, len(plan))), 3).astype(np.float64)
+    time_s = np.round(np.cumsum(intervals * rng.uniform(1 - _JITTER, 1 + _JITTER, len(plan))), 3).astype(np.float64)
     covariates = dict(plan.covariates)
     if "battery_mv" in covariates:
         covariates["battery_mv"] = np.round(_battery_mv(time_s) + rng.normal(0.0, 4.0, len(plan)))

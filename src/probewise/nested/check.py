@@ -426,7 +426,8 @@ def _second_estimate(
             gained = first.log_likelihood[possible] + near.prior.log_prior_ratio(first.theta[possible])
             # With a log Z that is far too large the nats come out too few, or negative.
             nats = float(first.weight[possible] @ gained) - first.log_z
-            if near.prior.has_invertible_axes and (peaks or nats < _GAIN * first.information):
+            finite = np.isfinite([near.prior.root, near.prior.inverse_root]).all()  # not where samples hardly vary
+            if finite and (peaks or nats < _GAIN * first.information):
                 wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
                 enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
                 name, posed = "a second pass from near the posterior", near

@@ -46,7 +46,7 @@ class SliceChains:
     def __init__(self, start: Points, live: FloatArray, space: Space, *, width: float) -> None:
         self._space, self._width, self._columns = space, width, list(space.periodic)
         # Lower and upper bounds of the coordinates, None without any; periodic ones are not bounded.
-        low, high = space.low, space.high
+        low, high = space.bounds
         low[self._columns], high[self._columns] = -np.inf, np.inf
         self._walls = (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
         # Each periodic coordinate is cut in the middle of the widest gap between live points, so that no peak is split
@@ -515,7 +515,8 @@ class KernelMove:
         n_tries = n_chains * self.n_proposals
         u = kernels.draw(n_tries, rng=rng)
         log_target = -kernels.log_density(u)
-        inside = np.flatnonzero(((u >= space.low) & (u <= space.high)).all(axis=1))
+        low, high = space.bounds
+        inside = np.flatnonzero(((u >= low) & (u <= high)).all(axis=1))
         parts = [evaluate(u[rows], rng) for rows in np.array_split(inside, max(1, -(-inside.size // _BLOCK)))]
         tried = Points.join(*parts)
         log_target[inside] += tried.log_density

@@ -53,14 +53,10 @@ class Space:
     periodic: tuple[int, ...] = ()
 
     @property
-    def low(self) -> FloatArray:
-        """Least value of each coordinate, (n_params,)."""
-        return np.full(len(self.prior.names), 0.0 if self.coordinates is None else -np.inf)
-
-    @property
-    def high(self) -> FloatArray:
-        """Greatest value of each coordinate, (n_params,)."""
-        return np.full(len(self.prior.names), 1.0 if self.coordinates is None else np.inf)
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest value of each coordinate, (n_params,) both."""
+        low, high = (0.0, 1.0) if self.coordinates is None else (-np.inf, np.inf)
+        return np.full(len(self.prior.names), low), np.full(len(self.prior.names), high)
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates, both (n, n_params)."""
@@ -85,7 +81,8 @@ class Space:
 
     def inside_mask(self, u: FloatArray) -> BoolArray:
         """Return a mask of the points, (n, n_params) -> (n,), strictly within the bounds of every coordinate."""
-        return np.asarray(((u > self.low) & (u < self.high)).all(axis=1))
+        low, high = self.bounds
+        return np.asarray(((u > low) & (u < high)).all(axis=1))
 
 
 @dataclass(frozen=True)

@@ -432,6 +432,9 @@ def _forms_of_rate(true: SimulatedSystem, state: str, wave: Form) -> Iterator[Fo
     def term(name: str, of: str, change: Callable[[Any], Any], size: float, *seen: str, **more: Any) -> Form:
         return _rate_form(true, f"{name}:{state}", state, lambda s, now, v: change(s[of]), size, *seen, **more)
 
+    def falling(power: int) -> Callable[[Any], Any]:
+        return lambda r: -(r**power)
+
     yield term("damping", state, lambda r: -r, size, *own, signed=False)
     yield term("drag", state, lambda r: -np.abs(r) * r, size**2, *own, signed=False)
     yield term("forcing", state, lambda r: 1.0 + 0.0 * r, 1.0, "time", *own)
@@ -439,7 +442,7 @@ def _forms_of_rate(true: SimulatedSystem, state: str, wave: Form) -> Iterator[Fo
         most, seen = float(np.abs(there).max()), (f"state:{other}", "time")
         for name, power in (("cubic", 3), ("quadratic", 2), ("coupling", 1)):
             if power > 1 or other != state:
-                form = term(name, other, lambda r, power=power: -(r**power), most**power, *seen)
+                form = term(name, other, falling(power), most**power, *seen)
                 yield replace(form, name=f"{name}:{state}:{other}")
     act = lambda s, now, v: wave.act(now, v)  # noqa: E731
     yield _modulated(wave, f"periodic_forcing:{state}", "rate", 0.02 * speed, limit=100, act=act, target=state)

@@ -129,9 +129,9 @@ class Plan:
         for name, values in arrays.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n_points},), as x_mm")
-            if name in numbers:
-                require_finite(name, values)
             object.__setattr__(self, name, values)
+        for name in numbers:
+            require_finite(name, getattr(self, name))
         for name, n_names in (("scan", len(self.scan_names)), ("pattern", len(self.pattern_names))):
             codes = arrays[name]
             if n_points and (codes.min() < 0 or codes.max() >= n_names):

@@ -367,9 +367,17 @@ def refine(
     found = draw_and_weigh(best, held, space, evaluate, n_draws=n_draws, rng=rng)
     found = with_error_of_lost_parts(found, n_lineages, space, rng)
     if look and isinstance(result, NestedResult) and result.check is None:
-        calling = {"max_cost": 2.0, "max_calls": None, "least_live": least_live(len(result.names)), "repeat": False}
-        own = rng.spawn(1)[0]  # the refined evidence is the same with and without the look
-        checked = check_and_repeat(result, Evaluator(problem), SliceMove(), run_once, rng=own, **calling)
+        checked = check_and_repeat(
+            result,
+            Evaluator(problem),
+            SliceMove(),
+            run_once,
+            max_cost=2.0,
+            max_calls=None,
+            least_live=least_live(len(result.names)),
+            rng=rng.spawn(1)[0],  # of its own: the refined evidence is the same with and without the look
+            repeat=False,
+        )
         found, result = replace(found, n_calls=found.n_calls + checked.n_calls - result.n_calls), checked
     return replace(found, warnings=(*found.warnings, *_inherited_warnings(found, result)))
 

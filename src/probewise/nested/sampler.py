@@ -204,7 +204,7 @@ def run(
     once = partial(
         run_once, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
     )
-    kept = {"checkpoint": checkpoint, "checkpoint_every_s": checkpoint_every_s, "max_calls": max_calls}
+    kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_every_s": checkpoint_every_s, "max_calls": max_calls}
     result = once(posed, rng=rng, n_live=n_live, stop=stop, move=moving, n_replaced=n_replaced, **kept)
     if max_cost > 1 and result.names and result.complete:
         # A separate generator that depends only on the state after the run, hence is the same after a resumption.

@@ -154,7 +154,8 @@ def is_leading_name_right(result: Result) -> bool:
     for names, p in result["hypotheses"]:
         if (key := _without_noise(names)) or not due:
             joined[key] = joined.get(key, 0.0) + p
-    return are_names_right(result, max(joined, key=lambda key: joined[key], default=()), noise=False)
+    first = max(joined, key=lambda key: joined[key], default=())
+    return are_names_right(result, first, noise=False)
 
 
 def has_false_extra_effect(result: Result) -> bool:

@@ -43,7 +43,7 @@ class NullRefit:
     """
 
     def __init__(self) -> None:
-        self._clean: Recording | None = None
+        self._kept: tuple[Recording, Fit] | None = None
 
     def __call__(self, clean: Recording, changed: Recording) -> float:
         """Return the norm of an effect's residuals after a full refit of the null, in reading units."""
@@ -62,8 +62,8 @@ class NullRefit:
 
     def null_fit(self, clean: Recording) -> Fit:
         """Return the null model's fit to the clean readings, cached for the last recording."""
-        if self._clean is clean:
-            return self._null
+        if self._kept is not None and self._kept[0] is clean:
+            return self._kept[1]
         extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
         sensor = default_sensor(extent, 1)
         starts = starts_of_one_gaussian(sensor)
@@ -76,7 +76,7 @@ class NullRefit:
                 best, best_log_z = found, log_z
             elif log_z < best_log_z - _BEHIND:
                 break
-        self._clean, self._null = clean, best
+        self._kept = clean, best
         return best
 
 

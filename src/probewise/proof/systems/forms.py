@@ -162,7 +162,7 @@ def _modulations(true: SimulatedSystem) -> dict[str, Form]:
         hz = draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap)
         return {"hz": hz, "phase": float(rng.uniform(0, 2 * np.pi))}
 
-    step = lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at])  # noqa: E731
+    step = lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at])
     out = {"step": _modulation(step, *time, draw=change_point, breaks=(lambda v: v[at]) if timed else None)}
     if timed:
         out["drift"] = _modulation(lambda now, v: v["a"] * now.t, *time, reach=float(np.abs(rows.t).max()))
@@ -174,11 +174,11 @@ def _modulations(true: SimulatedSystem) -> dict[str, Form]:
             draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
         )
     if timed:
-        sine = lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"])  # noqa: E731
+        sine = lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"])
         out["wave"] = _modulation(sine, *time, draw=wave, signed=False)
     if timed and true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
-        tau = lambda rng: {"tau_s": draw_log_uniform(rng, 3 * rows.median_gap, 0.4 * longest)}  # noqa: E731
-        fading = lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"])  # noqa: E731
+        tau = lambda rng: {"tau_s": draw_log_uniform(rng, 3 * rows.median_gap, 0.4 * longest)}
+        fading = lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"])
         out["settling"] = _modulation(fading, "time", "run", str(rows.time), draw=tau)
     return out
 
@@ -245,11 +245,11 @@ def _forms_of_readings(true: SimulatedSystem, modulations: Mapping[str, Form]) -
     sd, typical = true.kind.sd, float(np.sqrt(np.mean(true.readings**2)))
 
     def added(name: str, how: Form) -> Form:
-        act = lambda y, rows, v: np.asarray(y + how.act(Instants.at_rows(rows), v))  # noqa: E731
+        act = lambda y, rows, v: np.asarray(y + how.act(Instants.at_rows(rows), v))
         return _modulated(how, name, "reading", sd, limit=_MANY, act=act, order=OFFSET)
 
     def multiplied(name: str, how: Form) -> Form:
-        act = lambda y, rows, v: np.asarray(y * (1 + how.act(Instants.at_rows(rows), v)))  # noqa: E731
+        act = lambda y, rows, v: np.asarray(y * (1 + how.act(Instants.at_rows(rows), v)))
         return _modulated(how, name, "reading", sd / typical, limit=_MANY, act=act, order=GAIN)
 
     for kind in ("step", "drift", "per_run"):
@@ -279,14 +279,14 @@ def _curve_and_friction_forms(true: SimulatedSystem, column: str) -> Iterator[Fo
         return {f"a{k}": float(size[k - 1]) if k <= order else 0.0 for k in orders}
 
     if len(np.unique(values)) > len(orders):
-        scaled = lambda a, drawn: {name: a * size for name, size in drawn.items()}  # noqa: E731
+        scaled = lambda a, drawn: {name: a * size for name, size in drawn.items()}
         name, limit = f"curve:{column}", _MANY * sd
         yield Form(name, "reading", curve, sd, limit, (column,), scaled, coefficients, order=OFFSET)
     speeds = np.sort(np.abs(values[values != 0]))
     if min(len(np.unique(side)) for side in (values[values < 0], values[values > 0])) >= 3:
         low, high = float(speeds[len(speeds) // 20]), 0.3 * float(speeds[-1])
-        pull = lambda y, rows, v: np.tanh(rows.columns[column] / max(v["width"], 1e-12 * half))  # noqa: E731
-        width = lambda rng: {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, low, high)}  # noqa: E731
+        pull = lambda y, rows, v: np.tanh(rows.columns[column] / max(v["width"], 1e-12 * half))
+        width = lambda rng: {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, low, high)}
         yield _added_form(true, f"friction:{column}", pull, column, draw=width)
 
 
@@ -335,10 +335,10 @@ def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
         true, "hysteresis", lambda y, rows, v: direction_of_change(y, rows), "previous", order=_HYSTERESIS
     )
     if span > 0:
-        power = lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}  # noqa: E731
+        power = lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}
         yield Form("nonlinearity", "reading", bend, sd / span, 0.5, level, draw=power, order=_BEND)
-        ceiling = lambda y, rows, v: np.minimum(y, v["level"])  # noqa: E731
-        floor = lambda y, rows, v: np.maximum(y, v["level"])  # noqa: E731
+        ceiling = lambda y, rows, v: np.minimum(y, v["level"])
+        floor = lambda y, rows, v: np.maximum(y, v["level"])
         for name, act, *end in (("saturation", ceiling, high, -1.0), ("saturation (floor)", floor, low, 1.0)):
             yield Form(name, "reading", act, 2 * sd, 0.5 * span, level, **_bounded_by(*end), order=_CEILING)
     if true.table.time is not None:
@@ -350,7 +350,7 @@ def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
 def _input_form(
     name: str, column: str, change: Callable[..., Any], first: float, limit: float, *covariates: str, **more: Any
 ) -> Form:
-    act = lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}  # noqa: E731
+    act = lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
     return Form(name, "input", act, first, limit, covariates, **more)
 
 
@@ -374,13 +374,13 @@ def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
     ceiling = _bounded_by(high, -1.0)
     yield form("input_saturation", lambda c, rows, v: np.minimum(c, v["level"]), 0.05 * span, 0.6 * span, **ceiling)
     if low <= 0.1 * span:
-        narrowed = lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0)  # noqa: E731
+        narrowed = lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0)
         yield form("dead_zone", narrowed, 0.01 * span, 0.3 * span, **_is("width"))
     moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield form("backlash", behind_gear_play, 0.01 * span, 0.3 * span, "previous", column, **_is("width"))
     if n_values > 20:
-        runout = lambda c, rows, v: c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"])  # noqa: E731
+        runout = lambda c, rows, v: c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"])
         yield form("periodic_error", runout, 0.01 * spread, 0.2 * span, draw=wave, signed=False)
     if true.table.time is not None:
         gap = true.table.median_gap
@@ -444,7 +444,7 @@ def _forms_of_rate(true: SimulatedSystem, state: str, wave: Form) -> Iterator[Fo
             if power > 1 or other != state:
                 form = term(name, other, falling(power), most**power, *seen)
                 yield replace(form, name=f"{name}:{state}:{other}")
-    act = lambda s, now, v: wave.act(now, v)  # noqa: E731
+    act = lambda s, now, v: wave.act(now, v)
     yield _modulated(wave, f"periodic_forcing:{state}", "rate", 0.02 * speed, limit=100, act=act, target=state)
     held = partial(Form, side="rate", act=lambda s, now, v: 0.0, covariates=(f"state:{state}", "level"), target=state)
     yield held(f"friction:{state}", first=0.02 * speed, limit=2 * speed, sticks=True, signed=False)
@@ -498,7 +498,7 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
             z = rows.time_since_start / longest
             return np.exp(-z / 0.05) - 1.5 * np.exp(-z / 0.35)
 
-        square = lambda y, rows, v: 1.0 * ((hz * rows.t) % 1.0 < 0.3)  # noqa: E731
+        square = lambda y, rows, v: 1.0 * ((hz * rows.t) % 1.0 < 0.3)
         yield adds("strange_square_wave", square, *timed, draw=lambda rng: {"hz": hz})
         yield adds("strange_chirp", chirp, *timed)
         if true.kind.run is not None:
@@ -508,9 +508,9 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
         values, own = true.states[state], (f"state:{state}", "level", "time")
         most, sprung = float(np.abs(values).max()), float(np.quantile(values, 0.6))
         pushes = partial(_rate_form, true, outside=True)
-        spring = lambda s, now, v: -np.maximum(s[state] - sprung, 0.0)  # noqa: E731
-        leak = lambda s, now, v: -np.expm1(np.clip(s[state] / (0.3 * most), -30, 12))  # noqa: E731
-        pull = lambda s, now, v: -(now.u[one] - middle) / spread * s[state] ** 2 / most**2  # noqa: E731
+        spring = lambda s, now, v: -np.maximum(s[state] - sprung, 0.0)
+        leak = lambda s, now, v: -np.expm1(np.clip(s[state] / (0.3 * most), -30, 12))
+        pull = lambda s, now, v: -(now.u[one] - middle) / spread * s[state] ** 2 / most**2
         yield pushes(f"strange_one_sided_spring:{state}", state, spring, float(np.ptp(values)), *own)
         yield pushes(f"strange_leak:{state}", state, leak, 20.0, *own)
         seen = (one, f"state:{state}", "time", "run", "level")

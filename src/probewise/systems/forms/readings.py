@@ -56,7 +56,7 @@ def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
     out, passes = np.zeros((4, len(values), len(time) - 1)), np.diff(time) > 0
     out[3] = values[:, :-1]
     if passes.any():
-        last, finite = np.append(passes, True), np.isfinite(values).all(axis=1)
+        last, finite = np.append(passes, True), np.asarray(np.isfinite(values).all(axis=1))
         smooth = np.where(finite[:, None], values, 0.0)  # SciPy refuses other numbers, though of one sample alone
         out[:, :, passes] = CubicSpline(time[last], smooth[:, last], axis=1).c.transpose(0, 2, 1)
         out[:, ~finite] = np.nan

@@ -27,8 +27,7 @@ from probewise.proof.campaign import Campaign, Result
 from probewise.proof.challenge import Task
 from probewise.proof.estimates import estimated_share
 from probewise.proof.refits import NullRefit
-from probewise.proof.sensors.cases import draw_case
-from probewise.proof.sensors.sensors import PLANS
+from probewise.proof.sensors.cases import PLANS, draw_case
 
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
 

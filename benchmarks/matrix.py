@@ -58,11 +58,18 @@ from probewise.proof.refits import NullRefit, SystemRefit
 from probewise.proof.sensors.cases import Stratum
 from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
 from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
-from probewise.proof.systems.cases import KINDS, DrawnSystem, SystemCase, draw_system, write_system_case
+from probewise.proof.study import BRIGHT, DARK, footprint_pixels
+from probewise.proof.systems.cases import (
+    KINDS,
+    OTHER_NOISE,
+    DrawnSystem,
+    SystemCase,
+    draw_system,
+    noise_of_size,
+    write_system_case,
+)
 from probewise.proof.systems.cases import draw_effect_of_size as conceal_in_system
 from probewise.proof.systems.forms import ADDED_FAMILIES, FAMILIES, Form, SystemEffect, family_of, forms_of
-from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
-from probewise.proof.trial import BRIGHT, DARK, footprint_pixels
 from probewise.recordings import Plan, paper_plan, two_way_plan, write_recording, write_text_atomically
 from probewise.recordings.plans import with_jittered_times
 from probewise.world import World

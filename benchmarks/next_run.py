@@ -21,8 +21,16 @@ import numpy as np
 from probewise.calibration import FittedSensor, posterior_mean_ssf_field
 from probewise.experiment import TRUST, experiment_for, explore, left_out_after_step, repaired_sensor
 from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
-from probewise.proof.configurations import FIELD, POPULATIONS, REFERENCE
-from probewise.proof.trial import BRIGHT, DARK, accuracy_measures, experiment_of, has_reached_target
+from probewise.proof.study import (
+    BRIGHT,
+    DARK,
+    FIELD,
+    POPULATIONS,
+    REFERENCE,
+    accuracy_measures,
+    experiment_of,
+    has_reached_target,
+)
 from probewise.recordings import Instrumentation
 from probewise.scene import Field
 from probewise.sensor import mixture_parameter_names

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from probewise.proof.estimates import Estimate
-from probewise.proof.plots import readings_needed
+from probewise.proof.pages import readings_needed
 
 near = (Path("docs"), Path("../docs"), Path(sys.argv[0]).resolve().parent.parent / "docs")
 file = next(path for docs in near if (path := docs / "results" / "study.csv").exists())

@@ -14,8 +14,7 @@ from probewise.experiment import experiment_for, read_journal
 from probewise.experiment.evidence import posterior_from_prior
 from probewise.experiment.kinds import prior_posterior
 from probewise.inquiry.smc import nested_sampling_from_scratch, prior_particles
-from probewise.proof.configurations import REFERENCE
-from probewise.proof.trial import experiment_of
+from probewise.proof.study import REFERENCE, experiment_of
 from probewise.recordings import Instrumentation
 from probewise.scene import Circle, Field
 

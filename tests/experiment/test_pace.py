@@ -8,8 +8,7 @@ import pytest
 from probewise.arm import Pose, Reading
 from probewise.experiment.kinds import prior_posterior
 from probewise.experiment.rivals import EACH_S, EffectInPacedTime, Pace, gain_loss, rivals_of
-from probewise.proof.configurations import REFERENCE
-from probewise.proof.trial import experiment_of
+from probewise.proof.study import REFERENCE, experiment_of
 
 
 def readings(each_s, start_s=0.0):

@@ -50,8 +50,7 @@ from probewise.experiment.stopping import trend_of_residuals
 from probewise.inference import Rounded
 from probewise.inquiry import Readout
 from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
-from probewise.proof.configurations import REFERENCE
-from probewise.proof.trial import Trial, arm_of, experiment_of, timed_steps
+from probewise.proof.study import REFERENCE, Trial, arm_of, experiment_of, timed_steps
 from probewise.recordings import Plan, Recording, Uniform
 from probewise.report.exploration import page_html, robot_view_png
 

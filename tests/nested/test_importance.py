@@ -19,9 +19,9 @@ from probewise.nested.importance import (
     draw_and_weigh,
     fit_wide_and_narrow_proposals,
     mixture_of_proposals,
+    with_error_of_lost_parts,
 )
 from probewise.nested.problem import Evaluator, unbounded_space_of
-from probewise.nested.refine import with_error_of_lost_parts
 from probewise.priors import Normal, Product
 
 FALSE_ALARM = 1e-4

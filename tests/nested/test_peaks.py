@@ -10,10 +10,9 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import NestedResult, SliceMove, refine
-from probewise.nested.check import check_and_repeat
+from probewise.nested.check import check_and_repeat, climb_to_top, find_missed_peaks, peak_of_last_live_points
 from probewise.nested.clusters import Clusters
 from probewise.nested.moves import HoppingMove
-from probewise.nested.peaks import climb_to_top, find_missed_peaks, peak_of_last_live_points
 from probewise.nested.problem import Bound, Evaluator, Samplable
 from probewise.nested.sampler import run_once
 

@@ -74,8 +74,7 @@ def test_parameters_are_found_again_from_coordinates_without_walls(prior):
     # Labels of exchangeable Gaussians may have been swapped; the density knows none.
     np.testing.assert_allclose(prior.log_prob(back), prior.log_prob(theta), atol=1e-6)
     np.testing.assert_allclose(space.enter(back), x, atol=1e-6)
-    assert np.isinf(space.low).all()
-    assert np.isinf(space.high).all()
+    assert np.isinf(space.bounds).all()
 
 
 def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():

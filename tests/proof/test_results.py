@@ -7,11 +7,10 @@ import pytest
 
 from probewise import __version__
 from probewise.cli import main
+from probewise.proof.campaign import CONCEALED_TRIAL, SENSOR_CASE, TRIAL, misfit, misfit_of_case
 from probewise.proof.challenge import Task
 from probewise.proof.concealed_study import ConcealedTrial
-from probewise.proof.configurations import REFERENCE
-from probewise.proof.results import CONCEALED_TRIAL, SENSOR_CASE, TRIAL, misfit, misfit_of_case
-from probewise.proof.trial import Trial
+from probewise.proof.study import REFERENCE, Trial
 
 from .conftest import search
 

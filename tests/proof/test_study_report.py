@@ -8,11 +8,8 @@ import pytest
 
 from probewise.experiment import CLEAN
 from probewise.proof import pages as report
-from probewise.proof import plots
 from probewise.proof.concealed_study import ConcealedTrial
-from probewise.proof.configurations import REFERENCE, SearchConfiguration
-from probewise.proof.study import summaries
-from probewise.proof.trial import Trial
+from probewise.proof.study import REFERENCE, SearchConfiguration, Trial, summaries
 from probewise.report.html import draw_or_raise
 
 from .conftest import search
@@ -51,7 +48,7 @@ def test_the_csv_holds_every_number_and_its_bounds(study):
 
 def test_each_curve_is_the_median_of_its_runs():
     widths = [np.array([100.0, 10.0, 2.0]), np.array([200.0, 50.0, 30.0, 3.0]), np.array([300.0, 3.0])]
-    axes = plots.posterior_widths_of_runs({"some": widths, "other": widths[:2]})
+    axes = report.posterior_widths_of_runs({"some": widths, "other": widths[:2]})
     assert axes.shape == (1, 2)
     for ax in axes.flat:
         (own,) = (line for line in ax.lines if line.get_label() == "median")
@@ -64,7 +61,7 @@ def test_each_curve_is_the_median_of_its_runs():
 
 
 def test_what_rows_need_is_drawn_with_its_bounds(study):
-    axes = plots.readings_needed({row.name: found for row, found in summaries(study).items()})
+    axes = report.readings_needed({row.name: found for row, found in summaries(study).items()})
     assert [text.get_text() for text in axes[0, 0].get_yticklabels()] == [row.name for row in ROWS]
     assert len(axes[0, 0].containers) == 2
     low, high = sorted(axes[0, 0].get_ylim())

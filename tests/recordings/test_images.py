@@ -8,7 +8,7 @@ import pytest
 from PIL import Image as Pillow
 
 from probewise.errors import FileError
-from probewise.recordings.images import image_bytes, read_image
+from probewise.recordings.io import image_bytes, read_image
 
 RNG = np.random.default_rng(8)
 SMOOTH = np.clip(np.add.outer(np.arange(40) * 3, np.arange(33) * 2) + RNG.integers(0, 9, (40, 33)), 0, 255)

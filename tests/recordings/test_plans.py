@@ -47,8 +47,6 @@ def test_jitter_keeps_the_order_and_the_pace():
     assert ratio.max() < 1.101
     assert ratio.std() > 0.05
     assert taken.covariates["battery_mv"][-1] < taken.covariates["battery_mv"][0] - 100
-    with pytest.raises(ParameterError):
-        with_jittered_times(plan, rng=np.random.default_rng(1), share=2)
 
 
 def test_a_recording_that_does_not_ship_is_refused():

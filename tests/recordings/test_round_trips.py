@@ -32,7 +32,7 @@ from probewise.recordings import (
     write_prediction,
     write_recording,
 )
-from probewise.recordings.description import shortest_degrees
+from probewise.recordings.files import shortest_degrees
 from probewise.recordings.table import csv_text, read_table
 
 numbers = st.floats(-1e6, 1e6)

@@ -9,8 +9,7 @@ from probewise.errors import ParameterError
 from probewise.experiment import with_cards
 from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import DiscForecast, TabulatedChain, forecast_of
-from probewise.proof.configurations import REFERENCE
-from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
+from probewise.proof.study import BRIGHT, DARK, REFERENCE, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
 from probewise.scene import Card, CardedScene
 from probewise.world import World

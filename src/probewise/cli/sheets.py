@@ -12,7 +12,7 @@ from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan
 from probewise.cli._options import refuse_options
 from probewise.errors import ParameterError, require
 from probewise.recordings import write_bytes_atomically
-from probewise.recordings.description import read_description
+from probewise.recordings.files import read_description
 from probewise.report import sheets
 from probewise.report.plots.sheets import sheets_pdf
 from probewise.scene import Field, outlines

@@ -12,8 +12,7 @@ from probewise.cli._options import SIZES
 from probewise.errors import ParameterError, require
 from probewise.proof import pages
 from probewise.proof.concealed_study import concealed_study
-from probewise.proof.configurations import SearchConfiguration, paper_comparison_rows, standard_rows
-from probewise.proof.study import study
+from probewise.proof.study import SearchConfiguration, paper_comparison_rows, standard_rows, study
 
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 _OF_CONCEALED = ("clean", "seed", "size", "varied")

@@ -6,11 +6,10 @@ when successive values of log Z agree).
 """
 
 from probewise.nested.diversify import diversify
-from probewise.nested.importance import Weighted, pareto_k
+from probewise.nested.importance import Weighted, pareto_k, refine, update
 from probewise.nested.merge import merge
 from probewise.nested.moves import KernelMove, Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import Bound, Evaluator, FunctionProblem, Points, Samplable, make_problem
-from probewise.nested.refine import refine, update
 from probewise.nested.result import Agreement, Check, NestedResult, Samples
 from probewise.nested.sampler import (
     LIVE_PER_PARAM,

@@ -175,7 +175,6 @@ def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
 
 
 def _log_det_of_covariance_cholesky(points: FloatArray) -> float:
-    """Log determinant of the Cholesky factor: half the log determinant of the covariance."""
     return float(np.log(np.diag(_cholesky_of_covariance(points))).sum())
 
 

@@ -120,10 +120,8 @@ def insertion_ranks(ident: IntArray, n_live: int, n_replaced: int) -> tuple[IntA
     rank, n_alive = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     for number in range(1, int(born_in.max()) + 1):
         n_gone = number * n_replaced
-        new, old = (
-            rows[n_live + n_gone - n_replaced : n_live + n_gone],
-            n_gone + np.flatnonzero(born_in[n_gone:] < number),
-        )
+        new = rows[n_live + n_gone - n_replaced : n_live + n_gone]
+        old = n_gone + np.flatnonzero(born_in[n_gone:] < number)
         rank.append(np.searchsorted(old, new) + np.tril(new < new[:, None], -1).sum(axis=1))
         n_alive.append(len(old) + np.arange(n_replaced))
     return np.concatenate(rank), np.concatenate(n_alive)
@@ -140,20 +138,18 @@ def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.ran
     if len(rank) < 20:
         return 1.0
     position = (rank + rng.random(len(rank))) / (n_below_or_above + 1.0)
-    tenths = np.array_split(position, 10) if len(position) >= 1000 else []
     whole = _uniform_p_value(position)
-    parts = min((_uniform_p_value(part) for part in tenths), default=1.0)
-    return min(1.0, 2.0 * min(whole, len(tenths) * parts)) if tenths else whole
+    if len(position) < 1000:
+        return whole
+    return min(1.0, 2.0 * min(whole, 10 * min(map(_uniform_p_value, np.array_split(position, 10)))))
 
 
 def _uniform_p_value(position: FloatArray) -> float:
-    """Return the Kolmogorov-Smirnov p value of positions, (n,), against the uniform distribution on 0 to 1.
-
-    Stephens' (1970) correction for finite n: `scipy.stats` has the exact distribution, but takes a second to import.
-    """
+    """Return the Kolmogorov-Smirnov p value of positions, (n,), against the uniform distribution on 0 to 1."""
     n = len(position)
     place, steps = np.sort(position), np.arange(n + 1) / n
     distance = max(float((steps[1:] - place).max()), float((place - steps[:-1]).max()))
+    # Stephens' (1970) correction for finite n: `scipy.stats` has the exact distribution, but takes a second to import.
     root = math.sqrt(n)
     return float(kolmogorov((root + 0.12 + 0.11 / root) * distance))
 
@@ -193,17 +189,14 @@ def relative_lineage_variance(parent: IntArray, birth_row: IntArray, n_at_death:
     n lineages in the evidence from there on. Two points drawn by weight belong to different lineages with probability 1
     - sum s^2, and minus its log estimates a variance of the log evidence. For independent draws it grows by 2 / n^2 per
     birth, of which 1 / n^2 per death is the shrinkage of the volume (all of it if half of the points are replaced at a
-    time) and the rest the choice of parents; the excess is due to correlated chains.
-
-    Few lineages survive a whole run, so an estimate over all of it would be noisy. Windows of half and of a quarter of
-    the run are less noisy but miss the correlations that began before them. The two are extrapolated linearly in the
-    inverse window length to the whole run.
+    time) and the rest the choice of parents; the excess is due to correlated chains. Few lineages survive a whole run,
+    so windows of half and of a quarter of it, which miss the correlations that began before, are extrapolated linearly
+    in the inverse length.
 
     `parent`: row of each point's parent, -1 for draws from the whole prior; rows are in order of death. `birth_row`:
     row of the dead point above whose level each was drawn, -1 at the start. `n_at_death`: number of points alive when
-    each died, itself included. `weight`: each point's share of the evidence. All (n_dead,).
-
-    Return the ratio of variances, 1 or more; 1 for a run of fewer than 17 rounds, too short for an estimate.
+    each died, itself included. `weight`: each point's share of the evidence. All (n_dead,). Return the ratio of
+    variances, 1 or more; 1 for a run of fewer than 17 rounds, too short for an estimate.
     """
     left = np.append(np.cumsum(weight[::-1])[::-1], 0.0)  # evidence from each row on
     from_shrinkage = np.concatenate([[0.0], np.cumsum((left[:-1] / n_at_death) ** 2)])

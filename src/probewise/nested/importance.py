@@ -3,24 +3,29 @@
 From such draws evidence and posterior are estimated independently of prior volumes, often with a hundredth of a run's
 error for a few thousand evaluations (Cameron & Pettitt 2014; Lange 2023 with neural networks); the error of a run is
 sqrt(H / n_live), with H the information in nats. The Pareto k of the weights' tail tells whether they are reliable
-(Vehtari, Simpson, Gelman, Yao & Gabry 2024). `probewise.nested.refine` uses them.
+(Vehtari, Simpson, Gelman, Yao & Gabry 2024). `refine` does so for a run, `update` for one with new readings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, own_arithmetic
+from probewise._kinds import checked_whole, require_callable, require_rng
+from probewise.errors import require
+from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import Clusters, find_disconnected_clusters
-from probewise.nested.problem import Evaluator, Space
+from probewise.nested.moves import SliceMove
+from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult, Samples
-from probewise.nested.weights import n_effective, student_t_draws, student_t_log_norm
+from probewise.nested.sampler import least_live, run_once
+from probewise.nested.weights import n_effective, resampled_rows, student_t_draws, student_t_log_norm
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 MOST_K = 0.7
@@ -70,12 +75,12 @@ class Weighted(Samples):
 
 def _warnings_of_weights(k: float, n_eff: float, missed: float = 0.0) -> tuple[str, ...]:
     """Return warnings of a heavy tail, of few effective samples, and of a share `missed` of the posterior."""
-    reasons = (
-        (not k < MOST_K, f"Pareto k of the weights is {k:.2f}, not below {MOST_K}"),
-        (not n_eff >= _FEW_EFFECTIVE, f"only {n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
-        (not missed < MOST_LOST, f"the draws miss {100 * missed:.0f} % of the posterior"),
-    )
-    return tuple(words for so, words in reasons if so)
+    reasons = {
+        f"Pareto k of the weights is {k:.2f}, not below {MOST_K}": k < MOST_K,
+        f"only {n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}": n_eff >= _FEW_EFFECTIVE,
+        f"the draws miss {100 * missed:.0f} % of the posterior": missed < MOST_LOST,
+    }
+    return tuple(words for words, fine in reasons.items() if not fine)
 
 
 def evenly_weighted(
@@ -89,11 +94,8 @@ def evenly_weighted(
     run: NestedResult | None = None,
 ) -> Weighted:
     """Return equally weighted samples, theta (n, n_params) and log_likelihood (n,), and an evidence, by default one."""
-    n = len(theta)
-    even = np.full(n, -math.log(n))
-    return Weighted(
-        names, theta, log_likelihood, even, log_z, log_z_error, float(n), n_calls, pareto_k=-math.inf, run=run
-    )
+    even, n = np.full(len(theta), -math.log(len(theta))), float(len(theta))
+    return Weighted(names, theta, log_likelihood, even, log_z, log_z_error, n, n_calls, pareto_k=-math.inf, run=run)
 
 
 def weighted_draws(
@@ -113,16 +115,12 @@ def weighted_draws(
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A mixture of Student-t kernels, of one shape within each cluster.
-
-    `centres` in each cluster's whitened frame, one array (n_kernels, n_params) per cluster; `width` of the kernels in
-    that frame; `share` of the draws for each cluster, (n_clusters,).
-    """
+    """A mixture of Student-t kernels, of one shape within each cluster."""
 
     clusters: Clusters
-    centres: tuple[FloatArray, ...]
-    width: tuple[float, ...]
-    share: FloatArray
+    centres: tuple[FloatArray, ...]  # in each cluster's whitened frame, (n_kernels, n_params) each
+    width: tuple[float, ...]  # of the kernels in that frame
+    share: FloatArray  # of the draws for each cluster, (n_clusters,)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw points, (n, n_params)."""
@@ -230,11 +228,10 @@ def draw_and_weigh(
     theta, log_density = theta[possible], log_density[possible]
     log_likelihood = evaluate.log_likelihood(theta) if possible.size else np.empty(0)
     log_ratio = log_density + log_likelihood - proposal.log_density(x[possible])
-    alive = np.isfinite(log_ratio)
+    alive, n_calls = np.isfinite(log_ratio), evaluate.n_calls
     if not alive.any():
-        nothing = np.empty(0)
-        n_calls = evaluate.n_calls
-        none, told = (-math.inf, math.inf, 0.0, n_calls, math.inf), _warnings_of_weights(math.inf, 0.0)
+        nothing, none = np.empty(0), (-math.inf, math.inf, 0.0, n_calls, math.inf)
+        told = _warnings_of_weights(math.inf, 0.0)
         return Weighted(evaluate.names, theta[:0], nothing, nothing, *none, warnings=told)
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
     k = pareto_k(log_ratio)
@@ -244,7 +241,7 @@ def draw_and_weigh(
     log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, n_held)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
-    n_eff, n_calls = n_effective(log_weight), evaluate.n_calls
+    n_eff = n_effective(log_weight)
     told = _warnings_of_weights(k, n_eff, missed)
     return Weighted(evaluate.names, theta, log_likelihood, log_weight, log_z, error, n_eff, n_calls, k, warnings=told)
 
@@ -304,3 +301,190 @@ def pareto_k(log_weight: FloatArray) -> float:
     shape = float(np.log1p(-mean_b * excess).mean())
     # Shrunk towards 0.5 by ten prior observations, to reduce the noise of short tails.
     return float((excess.size * shape + 10 * 0.5) / (excess.size + 10))
+
+
+_MOST_FITTED = 2000
+_SURPRISED = 0.01
+_HELD_OUT = 1 / 3
+_MOST_HELD = 1000
+_N_UPDATED = 1000  # samples of the old posterior whose likelihood is evaluated anew
+_APART = 4.0  # errors between the log Z of draws and of the refined run, above which they disagree
+_N_PILOTS = 2
+_FIRST = 0.75  # share of the better form of density in the mixture
+
+Posterior: TypeAlias = NestedResult | Weighted
+
+
+@own_arithmetic
+def refine(
+    result: Posterior,
+    problem: Samplable,
+    *,
+    rng: np.random.Generator,
+    n_draws: int = 5000,
+    look: bool = True,
+) -> Weighted:
+    """Reduce the error of a run's evidence and posterior by importance sampling; see `Weighted.sound` before its use.
+
+    Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot round a few
+    draws of each are weighted; the form with the larger effective sample size gets the larger share of the mixture, and
+    its weighted draws are added to the samples for the next fit. Finally `n_draws` points are drawn, 100 or more; only
+    these count, so they are independent. Each of two pilot rounds takes a quarter of that, at least 100, in addition.
+
+    The held-out third of the samples is combined with the draws by bridge sampling (Meng & Wong 1996), which estimates
+    the share of the posterior that the proposal misses. The error includes that; what a heavy tail of the weights adds,
+    which slows the convergence of their mean; and that the run may have lost a mode: with n_live points and information
+    H (nats) it knows the shares of modes as n_live / H independent samples do, so that a mode of share s is lost with
+    probability exp(-s n_live / H). The sum of s times that over the modes found is added.
+
+    `result` is a run of the same problem, or an earlier refinement. `look`: whether to check a run that has no check
+    (made with `max_cost=1`), for at most as many evaluations again; parts of the posterior that it has missed are among
+    the warnings. Raises ParameterError if an option is out of range, the run has other parameters, or the prior has
+    neither `to_unit_cube` nor coordinates; NotConvergedError if the likelihood fails.
+    """
+    require_rng(rng)
+    n_draws = checked_whole("n_draws", n_draws, least=100)
+    evaluate, space = _evaluator_and_space(problem, result, "result")
+    require(result.names, "result", "a run without parameters", "one with some; the evidence is exact without")
+    n_lineages = effective_lineages(result)
+    # Two to one at random: samples for fitting a density, by weight, and held-out ones.
+    lot = rng.random(len(result.theta)) < _HELD_OUT
+    chosen = np.flatnonzero(lot & (result.log_weight > -math.inf))
+    rows = chosen[resampled_rows(np.exp(result.log_weight[chosen]), min(_MOST_HELD, chosen.size), rng)]
+    x = space.enter(result.theta[rows])
+    held = x, space.leave(x)[1] + result.log_likelihood[rows], _HELD_OUT * n_lineages
+    known = [_resampled_for_fit(result.theta[~lot], result.log_weight[~lot], space, rng)]
+    for _ in range(_N_PILOTS):
+        proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
+        pilots = [draw_and_weigh(p, None, space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng) for p in proposals]
+        first = int(np.argmax([pilot.n_eff for pilot in pilots]))
+        better = pilots[first]
+        # The other form keeps a share: it may cover what the better one does not.
+        others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
+        best = mixture_of_proposals(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
+        if better.n_eff > 2 * len(evaluate.names):
+            known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
+    found = draw_and_weigh(best, held, space, evaluate, n_draws=n_draws, rng=rng)
+    found = with_error_of_lost_parts(found, n_lineages, space, rng)
+    if look and isinstance(result, NestedResult) and result.check is None:
+        checked = check_and_repeat(
+            result,
+            Evaluator(problem),
+            SliceMove(),
+            run_once,
+            max_cost=2.0,
+            max_calls=None,
+            least_live=least_live(len(result.names)),
+            rng=rng.spawn(1)[0],  # of its own: the refined evidence is the same with and without the look
+            repeat=False,
+        )
+        found, result = replace(found, n_calls=found.n_calls + checked.n_calls - result.n_calls), checked
+    return replace(found, warnings=(*found.warnings, *_inherited_warnings(found, result)))
+
+
+@own_arithmetic
+def update(
+    previous: Posterior,
+    problem: Samplable,
+    *,
+    rng: np.random.Generator,
+    fall_back: Callable[[], NestedResult],
+    n_draws: int = 2000,
+) -> Weighted:
+    """Update a posterior with new readings by importance sampling.
+
+    The previous samples are reweighted by the new readings' likelihood, and refined as those of a run are. The draws
+    are weighted against the whole new problem, so the evidence is absolute and errors do not accumulate from reading to
+    reading. Where the new readings are surprising (too few effective samples or too heavy a tail of the weights),
+    `fall_back` starts from scratch.
+
+    `previous` is the posterior of the same parameters given fewer readings; `problem` has the prior, and the likelihood
+    of all readings; `fall_back` solves the new problem, as `lambda: run(problem, rng=rng)`: then its samples are
+    returned, and its result as `run`. `n_draws`: number of draws, 100 or more; half as many are pilots, and each old
+    sample, at most 1000, is evaluated once. Errors as of `refine`.
+    """
+    require_rng(rng)
+    require_callable(
+        "fall_back", fall_back, "a function that solves the problem, such as lambda: run(problem, rng=rng)"
+    )
+    n_draws = checked_whole("n_draws", n_draws, least=100)
+    evaluate, _ = _evaluator_and_space(problem, previous, "previous")
+    rows = np.unique(previous.draw_rows(_N_UPDATED, rng=rng))
+    theta, before = previous.theta[rows], previous.log_weight[rows]
+    log_likelihood = evaluate.log_likelihood(theta)
+    # Rows of weight above 1 / 1000 were drawn several times and kept once: their weight makes up for it.
+    log_weight = np.maximum(before, -math.log(_N_UPDATED)) + log_likelihood - previous.log_likelihood[rows]
+    n_eff, k = n_effective(log_weight), math.inf
+    # Without parameters there is no density to fit: the fallback evaluates the only hypothesis.
+    if evaluate.names and n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
+        total = float(logsumexp(log_weight))
+        now = previous.log_z + total, math.hypot(previous.log_z_error, n_eff**-0.5)
+        n_own = effective_lineages(previous) * n_eff / len(rows)
+        old = Weighted(evaluate.names, theta, log_likelihood, log_weight - total, *now, n_own, 0, pareto_k=-math.inf)
+        found = refine(old, problem, rng=rng, n_draws=n_draws, look=False)
+        if found.sound:
+            return replace(found, n_calls=found.n_calls + evaluate.n_calls)
+        k = found.pareto_k
+    fallen = fall_back()
+    samples = fallen.names, fallen.theta, fallen.log_likelihood, fallen.log_weight
+    evidence = fallen.log_z, fallen.log_z_error, fallen.n_eff
+    n_calls = evaluate.n_calls + fallen.n_calls
+    return Weighted(*samples, *evidence, n_calls, k, run=fallen, warnings=fallen.warnings)
+
+
+def _evaluator_and_space(problem: Samplable, found: Posterior, name: str) -> tuple[Evaluator, Space]:
+    """Return a problem's evaluator and unbounded coordinates; ParameterError if `found` has other parameters."""
+    evaluate = Evaluator(problem)
+    require(found.names == evaluate.names, f"{name}.names", found.names, f"the problem's names {evaluate.names}")
+    return evaluate, unbounded_space_of(problem.prior)
+
+
+def _inherited_warnings(found: Weighted, result: Posterior) -> tuple[str, ...]:
+    """Return the warnings of `result`; of a run also where its log Z, or its check's, is four errors from `found`'s."""
+    if isinstance(result, Weighted):
+        return result.warnings
+    routes = [("the run", result.log_z, result.log_z_error)]
+    if result.check is not None:
+        routes.append((result.check.route, result.check.log_z, result.check.log_z_error))
+    apart = tuple(
+        f"{name} gives log Z = {log_z:.2f} ± {error:.2f}, the draws {found.log_z:.2f} ± {found.log_z_error:.2f}"
+        for name, log_z, error in routes
+        if not abs(log_z - found.log_z) <= _APART * math.hypot(error, found.log_z_error)
+    )
+    return (*result.warnings, *apart)
+
+
+def effective_lineages(found: Posterior) -> float:
+    """Return the number of independent samples that would give the share of a mode as precisely as this posterior.
+
+    Many samples of a run descend from one live point. The log evidence of a mode has the error sqrt(H memory / n_live),
+    with H the information and `memory` the variance factor of correlated chains; a share estimated from n independent
+    samples has the relative error 1 / sqrt(n). So n is n_live / (H memory); for `Weighted` without a run it is `n_eff`.
+    """
+    if isinstance(found, Weighted):
+        return found.n_eff if found.run is None else effective_lineages(found.run)
+    return found.n_live / max(found.information * found.memory, 1.0)
+
+
+def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
+    """Resample for fitting a density; return distinct samples in coordinates of `space`, (n, n_params).
+
+    A third as many are drawn by the square root of the weights: a proposal must have wider tails than the posterior.
+    """
+    weight = np.exp(log_weight - log_weight.max())
+    n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
+    rows = [resampled_rows(weight, n, rng), resampled_rows(np.sqrt(weight), n // 3, rng)]
+    return space.enter(theta[np.unique(np.concatenate(rows))])
+
+
+def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
+    """Add to the error, in quadrature, the share of the posterior that a run of `n_lineages` samples may have lost."""
+    if not found.n_eff > 1:
+        return found
+    n = int(min(found.n_eff, 1000))
+    parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.draw_rows(n, rng=rng))]))
+    share = parts.size / parts.size.sum()
+    lost = float(share @ np.exp(-n_lineages * share))
+    doubt = f"{100 * lost:.0f} % of the posterior may be lost: too few live points for its parts"
+    warnings = found.warnings if lost < MOST_LOST else (*found.warnings, doubt)
+    return replace(found, warnings=warnings, log_z_error=math.hypot(found.log_z_error, lost))

@@ -51,14 +51,18 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     # Each run has its own estimate: in the joined record a run is never complete between two rounds.
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _pooled_log_possible_share(parts)
-    log_likelihood = joined["log_likelihood"]
-    evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start)
+    evidence = integrate(joined["log_likelihood"], n_at_death, rng=rng, log_start=log_start)
     log_z, error = evidence.log_z, math.hypot(math.sqrt(remembered) * evidence.spread, log_start_error)
     # Fisher's method combines independent p values.
     fisher = -2.0 * float(np.log(np.maximum([r.insertion_p_value for r in parts], 1e-300)).sum())
     p_value = float(chdtrc(2 * len(parts), fisher))
-    agreement, check, doubts = agreement_of(parts), _averaged_check(parts, log_z, error), list[str]()
-    widened = error
+    agreement, check, widened, doubts = agreement_of(parts), None, error, list[str]()
+    checks = [r.check for r in parts if r.check is not None]
+    if len(checks) == len(parts):  # the runs' second estimates, weighted by their errors
+        mean, mean_error = weighted_mean_and_error([c.log_z for c in checks], [c.log_z_error for c in checks])
+        route = checks[0].route if len({c.route for c in checks}) == 1 else "the runs' second routes"
+        distance = (log_z - mean) / max(math.hypot(error, mean_error), 1e-12)
+        check = Check(route, mean, mean_error, distance, sum(c.n_calls for c in checks))
     if agreement.p_value < _DISAGREE:
         widened = max(error, agreement.log_z_sd)
         doubts.append(
@@ -136,19 +140,7 @@ def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _averaged_check(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
-    """Average the runs' second estimates, weighted by their errors, into one `Check`; None where a run has none."""
-    checks = [r.check for r in parts if r.check is not None]
-    if len(checks) < len(parts):
-        return None
-    mean, mean_error = weighted_mean_and_error([c.log_z for c in checks], [c.log_z_error for c in checks])
-    route = checks[0].route if len({c.route for c in checks}) == 1 else "the runs' second routes"
-    distance = (log_z - mean) / max(math.hypot(error, mean_error), 1e-12)
-    return Check(route, mean, mean_error, distance, sum(c.n_calls for c in checks))
-
-
 def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object]:
-    """Return the seed states of all runs; raise ParameterError if the runs cannot be merged."""
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
     names, seeds = parts[0].names, list[object]()

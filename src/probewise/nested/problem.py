@@ -53,14 +53,10 @@ class Space:
     periodic: tuple[int, ...] = ()
 
     @property
-    def low(self) -> FloatArray:
-        """Least value of each coordinate, (n_params,)."""
-        return np.full(len(self.prior.names), 0.0 if self.coordinates is None else -np.inf)
-
-    @property
-    def high(self) -> FloatArray:
-        """Greatest value of each coordinate, (n_params,)."""
-        return np.full(len(self.prior.names), 1.0 if self.coordinates is None else np.inf)
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest value of each coordinate, (n_params,) both."""
+        low, high = (0.0, 1.0) if self.coordinates is None else (-np.inf, np.inf)
+        return np.full(len(self.prior.names), low), np.full(len(self.prior.names), high)
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates, both (n, n_params)."""
@@ -85,13 +81,12 @@ class Space:
 
     def inside_mask(self, u: FloatArray) -> BoolArray:
         """Return a mask of the points, (n, n_params) -> (n,), strictly within the bounds of every coordinate."""
-        return np.asarray(((u > self.low) & (u < self.high)).all(axis=1))
+        low, high = self.bounds
+        return np.asarray(((u > low) & (u < high)).all(axis=1))
 
 
 @dataclass(frozen=True)
 class _NormalScores:
-    """Coordinates with a standard normal prior, by way of the unit cube."""
-
     prior: Prior
 
     def enter(self, theta: FloatArray) -> FloatArray:
@@ -256,8 +251,7 @@ class Evaluator:
             raise NotConvergedError(self._failure_message(error, parts[len(answers)])) from error
         # Concatenation copies: a likelihood may return the same array every time.
         values = np.concatenate([self._checked_answer(a, part) for a, part in zip(answers, parts, strict=True)])
-        fine = values < np.inf
-        if not fine.all():
+        if not (fine := values < np.inf).all():
             at = int(np.argmin(fine))
             raise NotConvergedError(
                 f"the log likelihood is {values[at]} at {self._parameters_as_text(theta[at])}; "
@@ -267,7 +261,6 @@ class Evaluator:
         return values
 
     def _likelihoods_of_parts(self, parts: list[FloatArray]) -> Iterator[object]:
-        """Yield the likelihoods of the parts in order; several parts run in parallel."""
         # Copies: a likelihood that writes into its argument must not change the samples.
         if self.executor is None or len(parts) == 1:
             yield from (self.problem.log_likelihood(part.copy()) for part in parts)
@@ -275,8 +268,7 @@ class Evaluator:
         # Not `map`: dask builds a task graph for it, which takes longer than submitting the parts.
         sent = [self.executor.submit(self.problem.log_likelihood, part.copy()) for part in parts]
         try:
-            for future in sent:
-                yield future.result()
+            yield from (future.result() for future in sent)
         finally:
             for future in sent:
                 future.cancel()
@@ -314,25 +306,26 @@ class Evaluator:
                 f"the problem cannot be sent to the executor's workers ({why}); allowed: one that pickles, so made of "
                 "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
             )
+
+        def fails(some: FloatArray) -> bool:
+            try:
+                if self.executor is None:
+                    self.problem.log_likelihood(some.copy())
+                else:
+                    self.executor.submit(self.problem.log_likelihood, some.copy()).result()
+            except Exception:
+                return True
+            return False
+
         if not isinstance(error, BrokenExecutor):  # a hypothesis that killed its worker could kill this process too
             culprit = theta
             while len(culprit) > 1:
                 half = culprit[: len(culprit) // 2]
-                culprit = half if self._fails(half) else culprit[len(culprit) // 2 :]
-            if self._fails(culprit):
+                culprit = half if fails(half) else culprit[len(culprit) // 2 :]
+            if fails(culprit):
                 return f"the likelihood raised {why}; at {self._parameters_as_text(culprit[0])}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
         return f"the likelihood raised {why}; {batch}; {self._first_hypothesis_as_text(theta)}"
-
-    def _fails(self, theta: FloatArray) -> bool:
-        try:
-            if self.executor is None:
-                self.problem.log_likelihood(theta.copy())
-            else:
-                self.executor.submit(self.problem.log_likelihood, theta.copy()).result()
-        except Exception:
-            return True
-        return False
 
     def _first_hypothesis_as_text(self, theta: FloatArray) -> str:
         return f"first of the {len(theta)} hypotheses asked for: {self._parameters_as_text(theta[0])}"
@@ -359,17 +352,17 @@ class FunctionProblem:
         if self.vectorized:
             given = dict(zip(self.prior.names, theta.T, strict=True)) if self.pass_dict else theta
             return self.function(given)  # type: ignore[no-any-return]
-        return np.array([self._log_likelihood_of_one(row) for row in theta])
-
-    def _log_likelihood_of_one(self, row: FloatArray) -> Any:
-        given = dict(zip(self.prior.names, row.tolist(), strict=True)) if self.pass_dict else row
-        answer = self.function(given)
-        if np.size(answer) != 1:
-            raise ValueError(
-                f"the likelihood of one point has shape {np.shape(answer)}; allowed: one number; a function of many "
-                "points at once needs vectorized=True"
-            )
-        return np.asarray(answer).reshape(())[()] if not np.ma.isMaskedArray(answer) else np.nan
+        names = self.prior.names
+        rows = (dict(zip(names, row.tolist(), strict=True)) for row in theta) if self.pass_dict else theta
+        answers = []
+        for answer in map(self.function, rows):
+            if np.size(answer) != 1:
+                raise ValueError(
+                    f"the likelihood of one point has shape {np.shape(answer)}; allowed: one number; a function of "
+                    "many points at once needs vectorized=True"
+                )
+            answers.append(np.nan if np.ma.isMaskedArray(answer) else np.asarray(answer).reshape(())[()])
+        return np.array(answers)
 
 
 def make_problem(
@@ -388,11 +381,10 @@ def make_problem(
     log_likelihood
         Natural log of the likelihood of one point, (n_params,) -> a number; -inf where it is impossible.
     prior
-        A prior with names (`probewise.priors`); a dict of distributions by name; a list of distributions; or a function
-        that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
-        `probewise.priors`, (low, high), ("log", low, high), ("normal", mean, sd), or frozen continuous ones of
-        scipy.stats. A function suffices for `run`; `refine`, `update` and `diversify` need the prior's density or
-        inverse.
+        A prior with names (`probewise.priors`); distributions in a dict by name, or in a list; or a function that maps
+        a point of the unit cube to parameters, both (n_params,). Distributions are those of `probewise.priors`, (low,
+        high), ("log", low, high), ("normal", mean, sd), or frozen continuous ones of scipy.stats. A function suffices
+        for `run`; `refine`, `update` and `diversify` need the prior's density or inverse.
     names, periodic
         Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default; and
         of those whose range is periodic.
@@ -461,8 +453,6 @@ class _TransformPrior:
 
 @dataclass(frozen=True)
 class _ScipyMarginal:
-    """A frozen continuous distribution of scipy.stats as a marginal."""
-
     distribution: Any
 
     def from_unit(self, u: FloatArray) -> FloatArray:
@@ -477,7 +467,6 @@ class _ScipyMarginal:
 
 
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
-    """Convert a prior in any form that `make_problem` takes to one with names; ParameterError for anything else."""
     given = None if names is None else checked_texts("names", names, "names of the parameters")
     made: Prior
     require(not isinstance(prior, type), "prior", prior, _ALLOWED_PRIOR)
@@ -506,7 +495,6 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
 
 
 def _as_marginal(name: str, one: Any) -> Marginal:
-    """Convert a distribution in any of its forms to a marginal; `name` is its name in error messages."""
     if isinstance(one, tuple | list | Marginal):
         return parse_prior(name, one)
     has_quantile = hasattr(one, "ppf") or hasattr(one, "icdf")

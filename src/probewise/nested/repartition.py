@@ -64,11 +64,6 @@ class _PriorNearPosterior:
     def coordinates(self) -> _PriorNearPosterior:
         return self
 
-    @property
-    def has_invertible_axes(self) -> bool:
-        """Whether the matrices of the axes have finite inverses: they have none where samples hardly vary."""
-        return bool(np.isfinite(self.root).all() and np.isfinite(self.inverse_root).all())
-
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         return self.original.from_unit_cube(u)  # of the original; samplers use `draw`
 

@@ -124,16 +124,12 @@ class Samples(ShowsItself):
 
 @dataclass(frozen=True)
 class Agreement:
-    """A test whether independent runs of one problem agree within their errors.
-
-    `chi_square`: sum of the squared deviations of the runs' `log_z` from their weighted mean, in units of each
-    `log_z_error`; `p_value`: probability of a chi-square at least as large if the errors are right.
-    """
+    """A test whether independent runs of one problem agree within their errors."""
 
     log_z: tuple[float, ...]
     log_z_error: tuple[float, ...]
-    chi_square: float
-    p_value: float
+    chi_square: float  # sum of the runs' squared deviations from their weighted mean, in units of their errors
+    p_value: float  # of a chi-square at least as large if the errors are right
 
     @property
     def n_runs(self) -> int:
@@ -164,58 +160,30 @@ class Check:
 class NestedResult(Samples):
     """The evidence, the weighted samples and the record of a run of nested sampling; see also `Samples`.
 
-    Attributes
-    ----------
-    theta
-        Dead points in order of death, followed by the last live points, (n_dead, n_params).
-    label
-        Number from 0 to 1 that orders points of equal likelihood, (n_dead,).
-    log_birth, birth_label
-        Log likelihood and label of the dead point above which each was drawn, (n_dead,);
-        minus infinity and 1 for draws from the whole prior.
-    parent, n_at_death
-        Row of the point at which each point's chain began, -1 for the initial draws from the prior; number of points
-        alive when each died, itself included; (n_dead,) both.
-    log_start, log_start_error
-        Natural log of the share of the prior with nonzero likelihood, and its standard error.
-    memory
-        Lineage variance: variance of log Z relative to independent points, 1 or more; `log_z_error` includes it. See
-        `probewise.nested.evidence.relative_lineage_variance`.
-    information
-        Kullback-Leibler divergence of posterior from prior, nats.
-    stop_reason, complete
-        Why the run ended; whether its stopping rule ended it, rather than a limit, an interruption or a failure.
-    insertion_rank, insertion_n_ranked, insertion_p_value
-        Rank of each new point among those alive, 0 to m, and m, both (n_inserted,); p value of the test that the ranks
-        are uniform, as for a correct sampler.
-    seed_state, versions
-        State of the random generator at the start, as JSON, a list of states for merged runs; versions of the software.
-    warnings
-        Reasons to doubt the result; empty for a sound run.
-    agreement, check
-        Agreement of the runs that were merged into this result, and a second estimate of the evidence, or None.
+    `theta` holds the dead points in order of death, followed by the last live points, (n_dead, n_params); the arrays of
+    births and deaths are (n_dead,).
     """
 
-    label: FloatArray
-    log_birth: FloatArray
-    birth_label: FloatArray
-    parent: IntArray
-    n_at_death: IntArray
-    log_start: float
+    label: FloatArray  # number from 0 to 1 that orders points of equal likelihood
+    log_birth: FloatArray  # log likelihood and label of the dead point above which each was drawn; of draws from the
+    birth_label: FloatArray  # whole prior minus infinity and 1
+    parent: IntArray  # row of the point at which each point's chain began, -1 for draws from the prior
+    n_at_death: IntArray  # number of points alive when each died, itself included
+    log_start: float  # natural log of the share of the prior with nonzero likelihood
     log_start_error: float
-    memory: float
-    information: float
+    memory: float  # variance of log Z relative to independent points (`evidence.relative_lineage_variance`)
+    information: float  # Kullback-Leibler divergence of posterior from prior, nats
     n_live: int
     stop_reason: str
-    complete: bool
-    insertion_rank: IntArray
-    insertion_n_ranked: IntArray
-    insertion_p_value: float
-    seed_state: str
-    versions: Mapping[str, str]
-    warnings: tuple[str, ...]
-    agreement: Agreement | None = None
-    check: Check | None = None
+    complete: bool  # whether the stopping rule ended the run, rather than a limit, an interruption or a failure
+    insertion_rank: IntArray  # of each new point among those alive, 0 to m, (n_inserted,)
+    insertion_n_ranked: IntArray  # m
+    insertion_p_value: float  # of the test that the ranks are uniform, as for a correct sampler
+    seed_state: str  # of the random generator at the start, as JSON, a list of states for merged runs
+    versions: Mapping[str, str]  # of the software
+    warnings: tuple[str, ...]  # reasons to doubt the result; empty for a sound run
+    agreement: Agreement | None = None  # of the runs that were merged into this result
+    check: Check | None = None  # a second estimate of the evidence
 
     @property
     def n_dead(self) -> int:
@@ -294,13 +262,10 @@ class NestedResult(Samples):
             **{name: getattr(self, name) for name in told},
         }
         rows = self.draw_rows(max(1, int(self.n_eff)) if n is None else n, rng=rng)
+        stats = {"log_l": self.log_likelihood[rows], "log_l_birth": self.log_birth[rows], "row": rows}
         groups = {
             "posterior": {name: self.theta[None, rows, i] for i, name in enumerate(self.names)},
-            "sample_stats": {
-                "log_l": self.log_likelihood[None, rows],
-                "log_l_birth": self.log_birth[None, rows],
-                "row": rows[None, :],
-            },
+            "sample_stats": {name: values[None, :] for name, values in stats.items()},
         }
         # ArviZ 1.0 takes all groups as one mapping, earlier versions one argument per group.
         if "data" in inspect.signature(arviz.from_dict).parameters:
@@ -321,8 +286,7 @@ class NestedResult(Samples):
         path = checked_path("path", path)
         arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self) if f.type in _READ_ONLY}
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
-        head["agreement"] = None if self.agreement is None else asdict(self.agreement)
-        head["check"] = None if self.check is None else asdict(self.check)
+        head |= {name: head[name] and asdict(head[name]) for name in ("agreement", "check")}
         write_bytes_atomically(path, archive_bytes({"format": _FORMAT, **head}, arrays, compressed=True))
 
     @classmethod
@@ -331,16 +295,13 @@ class NestedResult(Samples):
         path = checked_path("path", path)
         cure = "make the file anew with this version"
         head, arrays = read_archive(path, _FORMAT, "a file written by NestedResult.save", cure=cure)
-        odd = {*head, *arrays} ^ {f.name for f in fields(cls)}
-        if odd:
+        if odd := {*head, *arrays} ^ {f.name for f in fields(cls)}:
             names = ", ".join(sorted(odd))
             raise FileError(path, f"fields {names} missing or unknown", "the fields that NestedResult.save writes")
-        head["names"], head["warnings"] = tuple(head["names"]), tuple(head["warnings"])
-        head["check"] = None if head["check"] is None else Check(**head["check"])
-        runs = head["agreement"]
-        if runs is not None:
-            each = {name: tuple(runs[name]) for name in ("log_z", "log_z_error")}
-            head["agreement"] = Agreement(**(runs | each))
+        head |= {name: tuple(head[name]) for name in ("names", "warnings")}
+        head["check"] = head["check"] and Check(**head["check"])
+        if runs := head["agreement"]:
+            head["agreement"] = Agreement(**(runs | {n: tuple(runs[n]) for n in ("log_z", "log_z_error")}))
         return cls(**(head | arrays))
 
 

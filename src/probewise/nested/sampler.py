@@ -69,24 +69,17 @@ _MOST_BYTES = 2**28  # of one array of each kind for all live points; the points
 
 @dataclass(frozen=True)
 class RoundSummary:
-    """Summary of a run after a round, passed to `progress` and to the stopping rule.
+    """Summary of a run after a round, passed to `progress` and to the stopping rule."""
 
-    `n_dead`, `n_calls`: dead points and likelihood evaluations so far. `log_z` counts the dead points only.
-    `log_z_remaining` is the log of an upper bound on the live points' evidence: the best likelihood times the remaining
-    volume; `log_ratio_remaining` is the log of that bound over the evidence so far. `last_change` is the increase of
-    `log_z` by the last dead point; `log_volume` the log of the remaining share of the prior; `level` whether all live
-    points have the same likelihood.
-    """
-
-    n_dead: int
-    n_calls: int
-    log_z: float
-    log_z_remaining: float
-    log_ratio_remaining: float
-    last_change: float
-    log_volume: float
+    n_dead: int  # dead points so far
+    n_calls: int  # likelihood evaluations so far
+    log_z: float  # of the dead points only
+    log_z_remaining: float  # log of an upper bound on the live points' evidence: best likelihood times remaining volume
+    log_ratio_remaining: float  # log of that bound over the evidence so far
+    last_change: float  # increase of `log_z` by the last dead point
+    log_volume: float  # log of the remaining share of the prior
     best_log_likelihood: float
-    level: bool = False
+    level: bool = False  # whether all live points have the same likelihood
 
 
 StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
@@ -165,12 +158,9 @@ def run(
     Parameters
     ----------
     problem
-        A problem with prior and log likelihood, which is evaluated in batches; or a log likelihood, a function of one
-        point.
-    prior
-        With a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
-    names, vectorized, pass_dict, periodic
-        With a log likelihood: how the functions are called; see `make_problem`.
+        A problem with prior and log likelihood, evaluated in batches; or a log likelihood, a function of one point.
+    prior, names, vectorized, pass_dict, periodic
+        With a log likelihood: its prior, and how the functions are called; see `make_problem`.
     rng
         Source of randomness; its state is stored in the result.
     n_live
@@ -194,8 +184,7 @@ def run(
     checkpoint, checkpoint_every_s
         File to which the state is saved atomically, at most once in so many seconds and ten times the saving time (0:
         after every round); its folder is created if missing. If the file exists, the run resumes and ends bit for bit
-        as if it had not been interrupted or killed; `rng` must be in the state of the run's start, made from the same
-        seed. `max_calls` may differ.
+        as if it had not been interrupted or killed; `rng` must be as at the run's start. `max_calls` may differ.
     executor, n_workers
         Evaluates each batch of a slow likelihood in `n_workers` parts, by default the number of processors. The result
         is the same to the last bit if a hypothesis' likelihood does not depend on its batch (for matrix products in
@@ -204,16 +193,10 @@ def run(
         Whether Ctrl-C returns the result so far, with a warning, if there is one. By default it raises
         `KeyboardInterrupt`, so that no script goes on as if the run were complete.
 
-    Raises
-    ------
-    ParameterError
-        If an option is out of range.
-    NotConvergedError
-        If the likelihood fails (`partial` holds the result so far, if there is one), or every hypothesis drawn from the
-        prior is impossible.
-    FileError
-        Before anything is evaluated: if the checkpoint is damaged, belongs to another problem, other settings or
-        another seed, or cannot be written. If a later saving fails, the run goes on with a warning.
+    Raises ParameterError if an option is out of range; NotConvergedError if the likelihood fails (`partial` holds the
+    result so far, if there is one), or every hypothesis drawn from the prior is impossible; FileError, before anything
+    is evaluated, if the checkpoint is damaged, belongs to another problem, other settings or another seed, or cannot be
+    written. If a later saving fails, the run goes on with a warning.
     """
     require_rng(rng)
     posed = as_problem(problem, prior, names, vectorized, pass_dict, periodic)
@@ -222,17 +205,8 @@ def run(
     once = partial(
         run_once, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
     )
-    result = once(
-        posed,
-        rng=rng,
-        n_live=n_live,
-        stop=stop,
-        move=moving,
-        n_replaced=n_replaced,
-        max_calls=max_calls,
-        checkpoint=checkpoint,
-        checkpoint_every_s=checkpoint_every_s,
-    )
+    kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_every_s": checkpoint_every_s, "max_calls": max_calls}
+    result = once(posed, rng=rng, n_live=n_live, stop=stop, move=moving, n_replaced=n_replaced, **kept)
     if max_cost > 1 and result.names and result.complete:
         # A separate generator that depends only on the state after the run, hence is the same after a resumption.
         checking = np.random.default_rng(rng.integers(2**63, size=4))
@@ -320,12 +294,28 @@ def run_once(
     n_workers = n_workers if n_workers is None else checked_whole("n_workers", n_workers)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers, most_calls=max_calls)
     n_params = len(evaluate.names)
-    n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
+    least, most = least_live(n_params), _MOST_BYTES // (8 * (2 * n_params + 3))
+    n_live = checked_whole("n_live", n_live, least=None, most=None)
+    require(n_live >= least, "n_live", n_live, f"{least} or more for {n_params} parameters")
+    way_out = "for a smaller error merge the results of several runs: nested.merge"
+    allowed = f"up to {most:,} for {n_params} parameters, whose arrays take {_MOST_BYTES >> 20} MB; {way_out}"
+    require(n_live <= most, "n_live", n_live, allowed)
+    n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
+    require(1 <= n_replaced <= n_live // 2, "n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
+    if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
+        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(rng.bit_generator.state, default=as_json)
     moving: Move = SliceMove() if move is None else move
     if n_params == 0:
-        return _result_of_problem_without_parameters(evaluate, moving, n_live, seed_state)
+        only = np.empty((1, 0))
+        log_likelihood = evaluate.log_likelihood(only)
+        if not np.isfinite(log_likelihood[0]):
+            raise NotConvergedError("the only hypothesis has zero likelihood: it excludes what was measured")
+        live = LivePoints.drawn_from_prior(Points(only, only, np.zeros(1), log_likelihood, np.zeros(1)))
+        reason = "no free parameters: the likelihood is the evidence"
+        now = RunState(live, (), moving, 0.0, 0.0, 0.0, ended=reason)
+        return _final_result(evaluate, now, n_live, 1, reason, seed_state, np.random.default_rng(0))
     keeper = resumed = None
     if checkpoint is not None:
         settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
@@ -384,25 +374,6 @@ def run_once(
         # `progress`, `stop` or a signal handler raised.
         save()
         raise
-
-
-def _checked_n_live_and_n_replaced(
-    n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int
-) -> tuple[int, int]:
-    """Return the number of live points and that of those replaced per round, or raise ParameterError."""
-    least, most = least_live(n_params), _MOST_BYTES // (8 * (2 * n_params + 3))
-    n_live = checked_whole("n_live", n_live, least=None, most=None)
-    if n_live < least:
-        raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
-    if n_live > most:
-        way_out = "for a smaller error merge the results of several runs: nested.merge"
-        allowed = f"up to {most:,} for {n_params} parameters, whose arrays take {_MOST_BYTES >> 20} MB; {way_out}"
-        raise ParameterError("n_live", n_live, allowed)
-    n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
-    require(1 <= n_replaced <= n_live // 2, "n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and checked_whole("max_calls", max_calls, least=None, most=None) < n_live:
-        raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
-    return n_live, n_replaced
 
 
 def _do_round(
@@ -503,7 +474,6 @@ def _final_result(
     rng: np.random.Generator,
     notes: Sequence[str] = (),
 ) -> NestedResult:
-    """Let the remaining live points die and compute the result."""
     n_dead = sum(map(len, now.dead))
     last = now.live.take_rows(now.live.rows_by_rising_likelihood())
     points = LivePoints.join(*now.dead, last)
@@ -530,14 +500,11 @@ def _final_result(
         doubts.append(f"only {n_of_weight:.0f} effective samples: use more n_live")
     else:
         doubts.append(warning_of_coarse_coordinates(evaluate.names, points.u, weight))
+    of_points = ("theta", "log_likelihood", "label", "log_birth", "birth_label")
     return NestedResult(
         names=evaluate.names,
-        theta=points.theta,
-        log_likelihood=points.log_likelihood,
+        **{name: getattr(points, name) for name in of_points},
         log_weight=evidence.log_weight,
-        label=points.label,
-        log_birth=points.log_birth,
-        birth_label=points.birth_label,
         parent=parent,
         n_at_death=n_at_death,
         log_start=now.log_start,
@@ -558,17 +525,3 @@ def _final_result(
         versions=software_versions(),
         warnings=tuple(note for note in doubts if note is not None),
     )
-
-
-def _result_of_problem_without_parameters(
-    evaluate: Evaluator, move: Move, n_live: int, seed_state: str
-) -> NestedResult:
-    """Return the result of a problem without free parameters; NotConvergedError if its likelihood is zero."""
-    only = np.empty((1, 0))
-    log_likelihood = evaluate.log_likelihood(only)
-    if not np.isfinite(log_likelihood[0]):
-        raise NotConvergedError("the only hypothesis has zero likelihood: it excludes what was measured")
-    live = LivePoints.drawn_from_prior(Points(only, only, np.zeros(1), log_likelihood, np.zeros(1)))
-    reason = "no free parameters: the likelihood is the evidence"
-    now = RunState(live, (), move, 0.0, 0.0, 0.0, ended=reason)
-    return _final_result(evaluate, now, n_live, 1, reason, seed_state, np.random.default_rng(0))

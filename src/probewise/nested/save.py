@@ -54,27 +54,20 @@ class LivePoints(Points):
 
 @dataclass(frozen=True, eq=False)
 class RunState:
-    """The state of the sampler after a round: everything that the rest of the run depends on.
-
-    `dead`: the points that died, worst first, in parts; `moving`: the move as tuned so far. `log_start`,
-    `log_start_error`: log of the share of the prior with nonzero likelihood, and its error; `log_volume`: log of the
-    share that the live points fill. `best`: greatest log likelihood of the live points; `log_z_over_best`: log evidence
-    of the dead points, minus `best`. `n_stuck`: chains that never left their start, so far; `last_cost`: evaluations of
-    the last round; `ended`: the stop reason, None while the run goes on.
-    """
+    """The state of the sampler after a round: everything that the rest of the run depends on."""
 
     live: LivePoints
-    dead: tuple[LivePoints, ...]
-    moving: Move
-    log_start: float
+    dead: tuple[LivePoints, ...]  # the points that died, worst first, in parts
+    moving: Move  # as tuned so far
+    log_start: float  # log of the share of the prior with nonzero likelihood
     log_start_error: float
-    log_volume: float
-    best: float = -np.inf
-    log_z_over_best: float = -np.inf
-    n_stuck: int = 0
-    last_cost: int = 0
+    log_volume: float  # log of the share that the live points fill
+    best: float = -np.inf  # greatest log likelihood of the live points
+    log_z_over_best: float = -np.inf  # log evidence of the dead points, minus `best`
+    n_stuck: int = 0  # chains that never left their start, so far
+    last_cost: int = 0  # evaluations of the last round
     n_calls: int = 0
-    ended: str | None = None
+    ended: str | None = None  # the stop reason, None while the run goes on
     rng_state: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -100,14 +93,11 @@ def _value_as_text(value: object) -> str:
 
 @dataclass
 class CheckpointFile:
-    """The checkpoint file of a run: the run's state is written to `path` atomically, and read to resume the run.
-
-    `every_s`: least seconds between two writes, 0 for every round; `settings`: see `settings_of_run`.
-    """
+    """The checkpoint file of a run: the run's state is written to `path` atomically, and read to resume the run."""
 
     path: Path
-    every_s: float
-    settings: dict[str, object]
+    every_s: float  # least seconds between two writes, 0 for every round
+    settings: dict[str, object]  # see `settings_of_run`
     _last_saving: float = field(default_factory=time.monotonic)
     _saving_time_s: float = 0.0
     _state_in_file: RunState | None = None
@@ -156,8 +146,16 @@ class CheckpointFile:
             return None
         cure = "delete the file to start anew"
         head, arrays = read_archive(self.path, _FORMAT, "a checkpoint of this run; delete it to start anew", cure=cure)
-        if (settings := head.pop("settings")) != self.settings:
-            raise self._error_for_other_settings(settings)
+        settings = head.pop("settings")
+        # The first setting in which the file differs from this run.
+        if differs := [n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n)]:
+            texts = [str(each.get(differs[0])) for each in (settings, self.settings)]
+            there, here = (text if len(text) <= 200 else f"{text[:200]}..." for text in texts)
+            why, allowed = f"{differs[0]} = {there}, not {here}", "the same problem, settings and seed"
+            if differs[0] == "seed_state":
+                why = "another seed: its generator began in another state"
+                allowed = "rng as it was when that run began, made anew from its seed"
+            raise FileError(self.path, f"of a run with {why}", f"{allowed}; {_WAY_OUT}")
         assert is_dataclass(move)  # as settings_of_run requires
         moving = replace(move, **head.pop("moving"))
 
@@ -172,18 +170,6 @@ class CheckpointFile:
         rng.bit_generator.state = now.rng_state
         self._last_saving, self._state_in_file = time.monotonic(), now
         return now
-
-    def _error_for_other_settings(self, settings: dict[str, object]) -> FileError:
-        """Return the error that names the first setting in which the file differs from this run."""
-        name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
-        if name == "seed_state":
-            why = "another seed: its generator began in another state"
-            allowed = "rng as it was when that run began, made anew from its seed"
-        else:
-            texts = [str(each.get(name)) for each in (settings, self.settings)]
-            there, here = (text if len(text) <= 200 else f"{text[:200]}..." for text in texts)
-            why, allowed = f"{name} = {there}, not {here}", "the same problem, settings and seed"
-        return FileError(self.path, f"of a run with {why}", f"{allowed}; {_WAY_OUT}")
 
     def _require_same_problem(self, now: RunState, evaluate: Evaluator) -> None:
         theta, log_density = evaluate.space.leave(now.live.u)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -26,7 +26,7 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, ProbewiseError
 from probewise.investigation import investigate
-from probewise.proof.campaign import Campaign, Result
+from probewise.proof.campaign import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, Campaign, Result, misfit_of_case
 from probewise.proof.refits import (
     NullRefit,
     SystemRefit,
@@ -36,7 +36,6 @@ from probewise.proof.refits import (
     rivals_with_nats,
     run_table,
 )
-from probewise.proof.results import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, misfit_of_case
 from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
 from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup, CovariateRegion
 from probewise.proof.systems.cases import SystemCase, draw_system_case, system_stratum_of, write_system_case
@@ -53,8 +52,6 @@ from probewise.world.world import World
 
 __all__ = ["challenge", "run_case"]
 
-Hidden = TypeVar("Hidden", HiddenEffect, SystemEffect)
-_RESULTS = {"": SENSOR_CASE, "systems": SYSTEM_CASE}
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
@@ -76,10 +73,7 @@ def effect_truths_and_intervals(parameters: Mapping[str, Any], found: EffectFoun
 
 
 def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str, list[float]]:
-    """Pair the true moments of the footprint, and the levels, with their 95 % intervals: name -> [truth, low, high].
-
-    Names: "u_mm", "v_mm", "var_u_mm2", "var_v_mm2", "cov_uv_mm2", "I_min", "I_max".
-    """
+    """Pair the true moments of the footprint, and the levels, with their 95 % intervals: name -> [truth, low, high]."""
     mean, covariance = world.spot.moments()
     ssf, levels = np.split(samples.theta, [6 * samples.n_gaussians], axis=1)
     f = footprint_of(ssf, samples.n_gaussians)
@@ -126,7 +120,7 @@ def log_densities_of_scans(
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
-    extent = Extent.of(case.recording)
+    extent, world = Extent.of(case.recording), case.world
     names = [h.name for h in case.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
     if showing and len(showing) == len(case.hidden):
@@ -139,15 +133,12 @@ def log_densities_of_scans(
             scores[name] = scores["null"]
             continue
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
-        scores[name] = {
-            scan: float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
-            for scan, recording in scans.items()
-        }
+        scored = {scan: predict(sensor, later.plan, later.readings).log_density for scan, later in scans.items()}
+        scores[name] = {scan: float(np.nansum(density)) for scan, density in scored.items()}
     scores["true"] = {}
-    for scan, recording in scans.items():
-        expected = case.world.expected_readings(recording.plan)
-        density = log_gaussian_density(recording.readings, expected, case.world.noise_sd)
-        scores["true"][scan] = float(density[recording.usable].sum())
+    for scan, later in scans.items():
+        density = log_gaussian_density(later.readings, world.expected_readings(later.plan), world.noise_sd)
+        scores["true"][scan] = float(density[later.usable].sum())
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
 
 
@@ -245,10 +236,7 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
         for own, other in zip(hidden, reversed(hidden), strict=True):
             own["size_beside"] = left[other["name"]] / case.world.noise_sd
     return {
-        "plan": case.plan,
-        "ssf": case.ssf,
-        "noise_level": case.noise_level,
-        "noise_model": case.noise_model,
+        **{name: getattr(case, name) for name in ("plan", "ssf", "noise_level", "noise_model")},
         "readings": len(case.recording),
         "truth": list(case.combination),
         "hidden": hidden,
@@ -262,24 +250,27 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     begun_s = time.process_time()
     diagnosis = diagnose(case.recording, rng=blind)
     cpu_s = time.process_time() - begun_s
-    named = _named_effects(case.hidden, diagnosis)
     region = case.hidden[0].region if len(case.hidden) == 1 else None
+    settled = None
+    if case.stratum.kind == "alias" and (advised := diagnosis.next_measurement) is not None:
+        more = case.world.simulate(advised.plan, rng=later)
+        settled = {"readings": len(more), **statements_to_score(diagnose([case.recording, more], rng=later))}
     return {
         **statements_to_score(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
-        "parameters": {h.name: effect_truths_and_intervals(h.effect.parameters, found) for h, found in named},
+        "parameters": _intervals_of_named(diagnosis, {h.name: h.effect.parameters for h in case.hidden}),
         "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
         "held_out": log_densities_of_scans(case, diagnosis, rng=files),
-        "settled": _result_after_advice(case, diagnosis, later) if case.stratum.kind == "alias" else None,
+        "settled": settled,
         "cpu_s": cpu_s,
     }
 
 
-def _named_effects(hidden: Iterable[Hidden], diagnosis: Diagnosis) -> list[tuple[Hidden, EffectFound]]:
-    """Return the concealed effects that a diagnosis names, each with what was found."""
-    found = {effect.name: effect for effect in diagnosis.effects if effect.name in diagnosis.combination}
-    return [(one, found[one.name]) for one in hidden if one.name in found]
+def _intervals_of_named(diagnosis: Diagnosis, truths: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return `effect_truths_and_intervals` of the concealed effects that a diagnosis names, given their true ones."""
+    named = {effect.name: effect for effect in diagnosis.effects if effect.name in diagnosis.combination}
+    return {name: effect_truths_and_intervals(true, named[name]) for name, true in truths.items() if name in named}
 
 
 def _investigation_result(case: Case, task: Task, rounds: int) -> dict[str, Any]:
@@ -298,23 +289,14 @@ def _investigation_result(case: Case, task: Task, rounds: int) -> dict[str, Any]
 
 def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return "verdict", "p_value", "combination", "hypotheses" ([names, probability]) and "credible_set", for JSON."""
+    likely = [[list(h.effects), h.probability] for h in diagnosis.hypotheses if h.probability > _LEAST_PROBABILITY]
     return {
         "verdict": diagnosis.verdict,
         "p_value": diagnosis.p_value,
         "combination": list(diagnosis.combination),
-        "hypotheses": [
-            [list(h.effects), h.probability] for h in diagnosis.hypotheses if h.probability > _LEAST_PROBABILITY
-        ],
+        "hypotheses": likely,
         "credible_set": list(diagnosis.credible),
     }
-
-
-def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
-    """Diagnose the recording together with simulated readings of the advised plan; None if none was advised."""
-    if (asked := diagnosis.next_measurement) is None:
-        return None
-    more = case.world.simulate(asked.plan, rng=rng)
-    return {"readings": len(more), **statements_to_score(diagnose([case.recording, more], rng=rng))}
 
 
 def challenge(
@@ -326,7 +308,7 @@ def challenge(
     what is diagnosed, if not the light sensor: a file of another name is refused.
     """
     settings = {"challenge": __version__, "seed": seed} | ({"of": of} if of else {})
-    schema = _RESULTS.get(of, ROUNDS_CASE)
+    schema = {"": SENSOR_CASE, "systems": SYSTEM_CASE}.get(of, ROUNDS_CASE)
     tasks = {task.key: task for task in (Task(seed, n) for n in numbers)}
     return Campaign(work, tasks, settings, partial(misfit_of_case, schema=schema), "cases")
 
@@ -344,24 +326,22 @@ def log_densities_of_runs(
     reading. What is not finite is left out.
     """
     fitting, *drawing = rng.spawn(3)
-    readings = later.covariates[case.drawn.kind.reading]
-    sd = case.drawn.kind.sd
-    rows = case.drawn.held_out_row_numbers
+    drawn, rows = case.drawn, case.drawn.held_out_row_numbers
+    readings = later.covariates[drawn.kind.reading]
     about = cast(SimulatorApparatus, diagnosis.apparatus).about
+    null, repaired = diagnosis.null, diagnosis.repaired
     scores = {
-        "null": _log_mean_density(*predict_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
-        "true": _log_mean_density(case.noise_free[None, rows], np.array([sd]), readings),
+        "null": _log_mean_density(*predict_runs(null, about, later, rng=drawing[0]), readings),
+        "true": _log_mean_density(case.noise_free[None, rows], np.array([drawn.kind.sd]), readings),
     }
     scores["repaired"] = scores["null"]
-    if diagnosis.repaired is not diagnosis.null:
-        scores["repaired"] = _log_mean_density(
-            *predict_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings
-        )
+    if repaired is not null:
+        scores["repaired"] = _log_mean_density(*predict_runs(repaired, about, later, rng=drawing[1]), readings)
     if case.effects:
         with suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
             scores["right"] = _log_mean_density(*_right_predictions(case, refit, rng=fitting), readings)
-    run = case.drawn.table.run[rows]
-    names = {case.drawn.table.n_runs - 2: "inside", case.drawn.table.n_runs - 1: "beyond"}
+    run = drawn.table.run[rows]
+    names = {drawn.table.n_runs - 2: "inside", drawn.table.n_runs - 1: "beyond"}
     return {
         name: {model: float(own[run == k].sum()) for model, own in scores.items() if np.isfinite(own[run == k]).all()}
         for k, name in names.items()
@@ -424,7 +404,6 @@ def predict_runs(
 
 
 def _log_mean_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
-    """Return the log of the mean density over samples, (n_points,), of readings predicted with `sd` (n_samples,)."""
     each = log_gaussian_density(readings, predicted, sd[:, None])
     return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 
@@ -465,15 +444,15 @@ def _system_diagnosis_result(case: SystemCase, task: Task, refit: SystemRefit) -
         begun_s = time.process_time()
         diagnosis = diagnose_system(simulator, seen, rng=blind)
         cpu_s = time.process_time() - begun_s
-    named = _named_effects(case.effects, diagnosis)
     # Values per run by the names of the runs, as in a diagnosis.
     of_run = {f"values[{k}]": f"values[{run}]" for k, run in enumerate(case.labels)}
-    truths = {e.name: {of_run.get(name, name): value for name, value in e.values.items()} for e, _ in named}
+    truths = {e.name: {of_run.get(name, name): value for name, value in e.values.items()} for e in case.effects}
+    said = statements_to_score(diagnosis)
     return {
-        **(said := statements_to_score(diagnosis)),
+        **said,
         "alternative_nats": nats_of_alternatives(case, said, refit),
         "where": [place.covariate for place in diagnosis.where],
-        "parameters": {e.name: effect_truths_and_intervals(truths[e.name], found) for e, found in named},
+        "parameters": _intervals_of_named(diagnosis, truths),
         "formula": any(getattr(e, "expression", "") for e in getattr(diagnosis.repaired.chain, "effects", ())),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, refit, rng=later),
         "cpu_s": cpu_s,

@@ -22,14 +22,16 @@ from probewise._version import __version__
 from probewise.arm import Pose, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
 from probewise.inference import Rounded
-from probewise.proof.campaign import Campaign, Result
-from probewise.proof.configurations import FIELD, MOST_CIRCLES, REFERENCE, SEED, true_circle
+from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Result, misfit
 from probewise.proof.estimates import Estimate, estimated_share, grouped
-from probewise.proof.results import CONCEALED_TRIAL, misfit
-from probewise.proof.trial import (
+from probewise.proof.study import (
     BLOB,
     BRIGHT,
     DARK,
+    FIELD,
+    MOST_CIRCLES,
+    REFERENCE,
+    SEED,
     WRONG_MM,
     accuracy_measures,
     arm_that_reads,
@@ -39,6 +41,7 @@ from probewise.proof.trial import (
     has_reached_target,
     mixture_of,
     timed_steps,
+    true_circle,
 )
 from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
@@ -96,14 +99,6 @@ def _step_at_any_moment(a: float, now: Conditions, rng: np.random.Generator) -> 
     return known.ambient_step(a, float(now.each_s * rng.uniform(1, 20)))
 
 
-def _wandering_gain(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
-    return strange.thermal_gain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10)))
-
-
-def _chirp(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
-    return strange.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0)
-
-
 _W, _UNITS, _PLACES, _SHARES = FIELD.width_mm, (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4)
 
 CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
@@ -142,12 +137,18 @@ CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
         "step_at_any_moment": (_step_at_any_moment, (2.0, 8.0, 16.0), "ambient_step"),
     },
     "another form": {
-        "thermal_gain": (_wandering_gain, _and_tenfold(0.02), "gain_drift"),
+        "thermal_gain": (
+            lambda a, now, rng: strange.thermal_gain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10))),
+            *(_and_tenfold(0.02), "gain_drift"),
+        ),
         "soft_saturation": (_of(known.saturation, 10.0), (55.0, 40.0, 25.0), "saturation"),
         "dead_zone": (_of(strange.floor), _and_tenfold(0.05), "nonlinearity"),
         "ghost": (_of(strange.ghost, 25.0, 0.0), _SHARES, "halo"),
         "stick_slip": (_of(strange.stick_slip, 60.0, 0.0), _and_tenfold(1.0), "periodic_position_error"),
-        "chirp": (_chirp, _UNITS, "flicker"),
+        "chirp": (
+            lambda a, now, rng: strange.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0),
+            *(_UNITS, "flicker"),
+        ),
     },
     "in no list": {
         "bent_rail": (lambda a, now, rng: strange.bent_rail(a * (10 / _W) ** 2), _and_tenfold(2.0)),
@@ -212,12 +213,10 @@ class ConcealedTrial:
     @property
     def right_answers(self) -> tuple[str, ...]:
         """The names that a run may give: of the concealed effect or an equivalent one, or "clean"; none in no list."""
-        if not self.effect:
-            return (CLEAN,)
         if self.effect in CONCEALED_BY_FORM["in no list"]:
             return ()
-        _, _, *names = CONCEALED[self.effect]
-        return tuple(" ".join(names or [self.effect]).split())
+        names = (CONCEALED[self.effect][2:] or (self.effect,)) if self.effect else (CLEAN,)
+        return tuple(" ".join(names).split())
 
     @property
     def key(self) -> str:
@@ -229,10 +228,9 @@ class ConcealedTrial:
 def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     """Search for a circle with a sensor that has a concealed effect; return a `results.CONCEALED_TRIAL`."""
     experiment = replace(trial.conditions.experiment(), trust=trial.trust)
-    arm, run, cpu = _arm_in_concealed_world(trial), {"seed": trial.seed, "circle": trial.circle}, []
-    for step, cpu_s in timed_steps(arm, experiment, **run, max_readings=trial.max_readings):
-        last = step
-        cpu.append(cpu_s)
+    run: Any = {"seed": trial.seed, "circle": trial.circle, "max_readings": trial.max_readings}
+    steps, cpu = zip(*timed_steps(_arm_in_concealed_world(trial), experiment, **run), strict=True)
+    last = steps[-1]
     left_out = left_out_after_step(last, trial.trust)
     return {
         "known": has_reached_target(last, experiment),
@@ -252,21 +250,15 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     if trial.effect:
         make, sizes, *_ = CONCEALED[trial.effect]
         made = make(sizes[trial.size], now, np.random.default_rng([trial.seed, trial.circle, trial.size, 2]))
-    world = World(
-        footprint_pixels(now.blobs),
-        black=DARK,
-        white=BRIGHT,
-        noise_sd=now.noise_sd,
-        step=now.step,
-        concealed=made if isinstance(made, tuple) else (made,),
-    )
+    noisy: Any = {"noise_sd": now.noise_sd, "step": now.step, "concealed": made if isinstance(made, tuple) else (made,)}
+    world = World(footprint_pixels(now.blobs), black=DARK, white=BRIGHT, **noisy)
     disc = disc_of(trial.circle_mm)
     came: list[tuple[Pose, float, tuple[float, float]]] = []
 
     def light_reading(pose: Pose, time_s: float, height_mm: float) -> float:
-        direction = came[-1][2] if came else (0.0, 0.0)
-        if came and (away := math.hypot(pose.x_mm - came[-1][0].x_mm, pose.y_mm - came[-1][0].y_mm)) > 0:
-            direction = ((pose.x_mm - came[-1][0].x_mm) / away, (pose.y_mm - came[-1][0].y_mm) / away)
+        before, _, direction = came[-1] if came else (pose, 0.0, (0.0, 0.0))
+        if (away := math.hypot(pose.x_mm - before.x_mm, pose.y_mm - before.y_mm)) > 0:
+            direction = ((pose.x_mm - before.x_mm) / away, (pose.y_mm - before.y_mm) / away)
         came.append((pose, time_s, direction))
         if trial.effect in _REMEMBERING:
             so_far = recording_of([Reading(0.0, was, at_s) for was, at_s, _ in came], patterns={"field": disc}).plan
@@ -312,53 +304,41 @@ def concealed_study(
 
 @dataclass(frozen=True)
 class ConcealedRow:
-    """Summary of a row: shares with Wilson's 95 % intervals, `readings` (median), `mean_readings`, processor time.
-
-    `size` is None where nothing is concealed. `reached`: runs that reached the target precision. `intervals_hold`: 95 %
-    intervals that hold the truth, over all parameters and runs. `sure_and_wrong`: ended by the robot's own rule with a
-    length off by more than 12 mm. `noticed`: an effect leads, or the fit is doubted. `in_credible_set`: the right
-    answer is in the credible set, which has `names` names on average. `cpu_s_median`, `cpu_s_95`: medians over runs of
-    each run's median and 95 % quantile of the processor time per decision, s.
-    """
+    """Summary of a row: shares with Wilson's 95 % intervals, medians and means over its runs."""
 
     concealed: str
-    size: float | None
+    size: float | None  # None where nothing is concealed
     trust: float
     runs: int
-    readings: float
+    readings: float  # median
     mean_readings: float
-    reached: Estimate
-    intervals_hold: Estimate
-    sure_and_wrong: Estimate
-    noticed: Estimate
-    in_credible_set: Estimate
-    names: float
-    cpu_s_median: float
+    reached: Estimate  # runs that reached the target precision
+    intervals_hold: Estimate  # 95 % intervals that hold the truth, over all parameters and runs
+    sure_and_wrong: Estimate  # ended by the robot's own rule with a length off by more than 12 mm
+    noticed: Estimate  # an effect leads, or the fit is doubted
+    in_credible_set: Estimate  # the right answer is
+    names: float  # in the credible set, mean
+    cpu_s_median: float  # medians over runs of each run's median and 95 % quantile per decision
     cpu_s_95: float
 
 
-def concealed_rows(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedRow]:
-    """Summarise the runs of each row (effect, size and trust), in the order of `results`."""
-    return _summaries(
-        results, lambda t: (t.effect or "nothing", CONCEALED[t.effect][1][t.size] if t.effect else None, t.trust)
-    )
+def concealed_rows(results: Mapping[ConcealedTrial, Result], *, by_form: bool = False) -> list[ConcealedRow]:
+    """Summarise the runs of each row (effect, size and trust), in the order of `results`.
 
-
-def concealed_forms(results: Mapping[ConcealedTrial, Result]) -> list[ConcealedRow]:
-    """Summarise the runs with effects of each form, at each trust, in the order of `results`."""
+    `by_form`: instead those with effects of each form, at each trust.
+    """
     form = {name: form for form, rows in CONCEALED_BY_FORM.items() for name in rows}
-    hidden = {trial: result for trial, result in results.items() if trial.effect}
-    return _summaries(hidden, lambda t: (form[t.effect], None, t.trust))
 
+    def row_of(t: ConcealedTrial) -> tuple[str, float | None, float]:
+        if by_form:
+            return form[t.effect], None, t.trust
+        return t.effect or "nothing", CONCEALED[t.effect][1][t.size] if t.effect else None, t.trust
 
-def _summaries(
-    results: Mapping[ConcealedTrial, Result], row_of: Callable[[ConcealedTrial], tuple[str, float | None, float]]
-) -> list[ConcealedRow]:
+    counted = [(t, run) for t, run in results.items() if t.effect or not by_form]
     rows = []
-    for key, runs in grouped((row_of(t), (t.right_answers, run)) for t, run in results.items()).items():
+    for key, runs in grouped((row_of(t), (t.right_answers, run)) for t, run in counted).items():
         found = [run for _, run in runs]
         readings, cpu_s = [run["readings"] for run in found], np.median([run["cpu_s"] for run in found], axis=0)
-        right = [not {*names}.isdisjoint(run["credible"]) for names, run in runs if names]
         row = ConcealedRow(
             *key,
             runs=len(found),
@@ -368,7 +348,7 @@ def _summaries(
             intervals_hold=estimated_share(hit for run in found for hit in run["held"]),
             sure_and_wrong=estimated_share(run["known"] and run["error_mm"] > WRONG_MM for run in found),
             noticed=estimated_share(run["noticed"] for run in found),
-            in_credible_set=estimated_share(right),
+            in_credible_set=estimated_share(not {*names}.isdisjoint(run["credible"]) for names, run in runs if names),
             names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
             cpu_s_median=round(float(cpu_s[0]), 2),
             cpu_s_95=round(float(cpu_s[1]), 2),
@@ -386,4 +366,4 @@ def concealed_csv(rows: Sequence[ConcealedRow]) -> str:
         return "" if value is None else value
 
     names = [column.name for column in fields(ConcealedRow)]
-    return csv_text_of_rows(names, ([cell(getattr(row, name)) for name in names] for row in rows))
+    return csv_text_of_rows(names, (map(cell, vars(row).values()) for row in rows))

@@ -41,7 +41,7 @@ class Estimate:
         return f"{self.value:.3g} ± {self.half_width:.2g}"
 
 
-_NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
+_NOTHING = Estimate(math.nan, math.nan, math.nan)
 
 
 def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
@@ -54,11 +54,11 @@ def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
 
 def estimated_share(hits: Iterable[bool]) -> Estimate:
     """Estimate a proportion, with Wilson's interval."""
-    each = list(hits)
-    if not each:
+    n_hits, n = sum(each := list(hits)), len(each)
+    if not n:
         return _NOTHING
-    found = binomtest(sum(each), len(each)).proportion_ci(method="wilson")
-    return Estimate(sum(each) / len(each), float(found.low), float(found.high), len(each))
+    found = binomtest(n_hits, n).proportion_ci(method="wilson")
+    return Estimate(n_hits / n, float(found.low), float(found.high), n)
 
 
 def estimated_mean(values: Iterable[float]) -> Estimate:

@@ -3,34 +3,31 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias, TypeVar
 
 import numpy as np
+from matplotlib.axes import Axes
 
+from probewise._arrays import FloatArray, IntArray
 from probewise._words import count_with_noun
+from probewise.diagnosis.words import effect_has_words, effect_in_words
 from probewise.experiment import least_readings
 from probewise.proof.campaign import Result
-from probewise.proof.concealed_study import (
-    ConcealedRow,
-    ConcealedTrial,
-    concealed_csv,
-    concealed_forms,
-    concealed_rows,
-)
-from probewise.proof.configurations import REFERENCE, SearchConfiguration
+from probewise.proof.concealed_study import ConcealedRow, ConcealedTrial, concealed_csv, concealed_rows
 from probewise.proof.estimates import LEAST_FOR_MEDIAN, Estimate
-from probewise.proof.plots import (
-    confusion_matrix,
-    doubt_against_trust,
-    effect_and_size_in_words,
-    posterior_widths_of_runs,
-    readings_needed,
-    reliability_diagram,
+from probewise.proof.study import (
+    REFERENCE,
+    SearchConfiguration,
+    Summary,
+    Trial,
+    experiment_of,
+    summaries,
+    trials_by_row,
 )
-from probewise.proof.study import Summary, summaries, trials_by_row
 from probewise.proof.tables import (
     NOISE,
     Results,
@@ -43,21 +40,172 @@ from probewise.proof.tables import (
     name_without_target,
     reliability_bins,
 )
-from probewise.proof.trial import Trial, experiment_of
 from probewise.recordings.table import csv_text_of_rows
-from probewise.report.html import (
-    Draw,
-    Markup,
-    Section,
-    definition_list,
-    figure,
-    fragment,
-    page,
-    paragraph,
-    table,
+from probewise.report.html import Draw, Markup, Section, definition_list, figure, fragment, page, paragraph, table
+from probewise.report.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    PAGE_IN,
+    SMALL_PT,
+    VERMILLION,
+    AxesGrid,
+    grid_of_axes,
+    label_axes,
+    legend_above,
+    legend_below,
+    png,
 )
-from probewise.report.plots.canvas import png
+from probewise.report.plots.search import set_up_width_axes
 from probewise.report.words import number_text, typeset_numbers, value_with_error
+
+_BAND = (0.16, 0.84)
+
+
+def posterior_widths_of_runs(runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0) -> AxesGrid:
+    """Draw the widest posterior sd after each reading: median and middle 68 % of the runs, one panel per row.
+
+    Thin lines are the medians of the other panels. A run that has ended keeps its last width.
+
+    `runs`: for each row, by name, the widest posterior sd after each reading of every run, (n_readings,), mm.
+    """
+    n_columns = min(len(runs), 2)
+    n_rows = -(-len(runs) // max(n_columns, 1))
+    size_in = (PAGE_IN if n_columns == 2 else 6.8, 0.5 + 2.9 * n_rows)
+    axes = grid_of_axes(n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
+    longest = {name: max(len(w) for w in widths) for name, widths in runs.items()}
+    tables = {
+        name: np.array([np.pad(w, (0, longest[name] - len(w)), mode="edge") for w in widths])
+        for name, widths in runs.items()
+    }
+    number = {name: np.arange(1.0, own.shape[1] + 1) for name, own in tables.items()}
+    for ax, (name, own) in zip(axes.flat, tables.items(), strict=False):
+        for other, more in tables.items():
+            if other != name:
+                label = "median of another panel"
+                ax.plot(number[other], np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
+        low, high = np.quantile(own, _BAND, axis=0)
+        ax.fill_between(number[name], low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs")
+        ax.plot(number[name], np.median(own, axis=0), color=BLUE, linewidth=1.8, label="median")
+        set_up_width_axes(ax, target_mm)
+        ax.set_title(f"{name} ({count_with_noun(len(own), 'run')})", fontsize="medium", loc="left")
+        ax.label_outer()
+    for ax in list(axes.flat)[len(runs) :]:
+        ax.set_visible(False)
+        axes.flat[len(runs) - n_columns].xaxis.set_tick_params(labelbottom=True)
+        axes.flat[len(runs) - n_columns].set_xlabel("number of readings")
+    legend_below(axes)
+    return axes
+
+
+def _value_and_whiskers(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray]:
+    """Return values, (n,), and whiskers down and up, (2, n): rounding may put an end a hair inside the value."""
+    value, low, high = (np.array([getattr(e, k) for e in estimates]) for k in ("value", "low", "high"))
+    return value, np.maximum([value - low, high - value], 0.0)
+
+
+def readings_needed(rows: Mapping[str, Summary]) -> AxesGrid:
+    """Draw mean and median readings needed in each row of a study, in all and after the first reading on white.
+
+    `rows` are drawn from the top in this order. Returns axes, (1, 2).
+    """
+    names = ["\n".join(textwrap.wrap(name, 30)) for name in rows]
+    n_lines = sum(1 + name.count("\n") for name in names)
+    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.5 + 0.2 * len(names) + 0.16 * n_lines), sharey=True)
+    y = np.arange(len(names))
+    for ax, parts, title in (
+        (axes[0, 0], (("mean", BLUE, "o", -0.14), ("median", VERMILLION, "s", 0.14)), "in all"),
+        (axes[0, 1], (("after_white", BLUE, "o", 0.0),), "after the first on white"),
+    ):
+        for part, colour, marker, shift in parts:
+            value, whiskers = _value_and_whiskers([getattr(summary, part) for summary in rows.values()])
+            known = "median, 95 % interval" if np.isfinite(whiskers).any() else "median"
+            label = "mean ± standard error" if part != "median" else known
+            style = {"fmt": marker, "color": colour, "markersize": 5, "capsize": 3, "label": label}
+            ax.errorbar(value, y + shift, xerr=whiskers, **style)
+        ax.set_xlim(left=0)
+        ax.grid(axis="x", color=GREY, alpha=0.25)
+        ax.set_yticks(y, names)
+        label_axes(ax, x="number of readings", y="", title=title)
+    # Half a row of margin at either end, also for a single row.
+    axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
+    legend_below(axes)
+    return axes
+
+
+def reliability_diagram(bins: Sequence[tuple[float, Estimate]]) -> Axes:
+    """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases."""
+    ax = grid_of_axes(1, 1, size_in=(5.2, 5.0))[0, 0]
+    ax.plot([0, 1], [0, 1], color=GREY, linewidth=0.9, linestyle="--", label="honest")
+    value, whiskers = _value_and_whiskers([right for _, right in bins])
+    at = np.array([stated for stated, _ in bins])
+    ax.errorbar(at, value, yerr=whiskers, fmt="o", color=BLUE, markersize=5, capsize=3, label="found, 95 %")
+    for stated, right in bins:
+        place = {"xytext": (6, -3), "textcoords": "offset points", "fontsize": SMALL_PT}
+        ax.annotate(str(right.n), (stated, right.value), **place)
+    ax.set(xlim=(0, 1.04), ylim=(-0.02, 1.04), aspect="equal")
+    legend_above(ax)
+    return label_axes(ax, x="probability stated", y="share that was right")
+
+
+def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray) -> Axes:
+    """Draw the number of cases by truth and answer, (n_truths, n_said), shaded by its share of the row."""
+    ax = grid_of_axes(1, 1, size_in=(3.0 + 0.34 * len(said), 2.4 + 0.3 * len(truths)))[0, 0]
+    shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    ax.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for (row, column), n in np.ndenumerate(counts):
+        if n:
+            colour = "white" if shares[row, column] > 0.6 else BLACK
+            ax.text(column, row, str(n), ha="center", va="center", fontsize=SMALL_PT, color=colour)
+    ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=SMALL_PT)
+    ax.set_yticks(np.arange(len(truths)), truths, fontsize=SMALL_PT)
+    return label_axes(ax, x="most probable", y="concealed")
+
+
+_PANELS = (
+    ("sure_and_wrong", "sure and wrong", "share of the runs"),
+    ("intervals_hold", "95 % intervals that hold", "share of the intervals"),
+    ("readings", "readings, median", "number"),
+)
+
+
+def effect_and_size_in_words(row: ConcealedRow) -> str:
+    """Name a row: the concealed effect in words and, if it has one, its size."""
+    name = effect_in_words(row.concealed) if effect_has_words(row.concealed) else row.concealed.replace("_", " ")
+    return name if row.size is None else f"{name}, {row.size:g}"
+
+
+def doubt_against_trust(rows: Sequence[ConcealedRow]) -> AxesGrid:
+    """Compare doubt in the sensor model with trust: runs sure and wrong, intervals that hold, median readings.
+
+    `rows` are drawn from the top in this order. Returns axes, (1, 3).
+    """
+    names = list(dict.fromkeys(effect_and_size_in_words(row) for row in rows))
+    axes = grid_of_axes(1, 3, size_in=(PAGE_IN, 1.7 + 0.32 * len(names)), sharey=True)
+    arms: Mapping[str, tuple[list[ConcealedRow], str, str, float]] = {
+        "trusts its sensor": ([row for row in rows if row.trust == 1], VERMILLION, "s", 0.15),
+        "doubts its sensor": ([row for row in rows if row.trust < 1], BLUE, "o", -0.15),
+    }
+    for ax, (field, title, x) in zip(axes[0], _PANELS, strict=True):
+        for label, (those, colour, marker, shift) in arms.items():
+            y = np.array([names.index(effect_and_size_in_words(row)) for row in those]) + shift
+            values = [getattr(row, field) for row in those]
+            style = {"fmt": marker, "color": colour, "markersize": 4.5, "label": label}
+            if all(isinstance(value, Estimate) for value in values):
+                value, whiskers = _value_and_whiskers(values)
+                ax.errorbar(value, y, xerr=whiskers, capsize=2.5, **style)
+            else:
+                ax.errorbar(values, y, **style)
+        ax.set_xlim(*((0, None) if field == "readings" else (-0.03, 1.03)))
+        if field == "intervals_hold":
+            ax.axvline(0.95, color=GREY, linewidth=0.9, linestyle="--")
+        ax.grid(axis="x", color=GREY, alpha=0.25)
+        ax.set_yticks(np.arange(len(names)), names)
+        label_axes(ax, x=x, y="", title=title)
+    axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
+    legend_below(axes)
+    return axes
+
 
 T = TypeVar("T")
 
@@ -100,9 +248,8 @@ def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage
     curves = {row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in own[row]] for row in usual}
 
     def html(draw: Draw) -> str:
-        by_name = {row.name: summary for row, summary in found.items()}
         needed = figure(
-            draw("readings needed", lambda: png(readings_needed(by_name))),
+            draw("readings needed", lambda: png(readings_needed({row.name: own for row, own in found.items()}))),
             f"Readings until every length is known to 4 mm, of at most {first.max_readings}; a miss counts as that "
             "many.",
         )
@@ -118,8 +265,7 @@ def study_page(results: Mapping[Trial, Result], *, command: str) -> CampaignPage
                 "width.",
             )
             sections.insert(0, Section("How fast", (drawn,)))
-        least = lower_bound_table(found)
-        if least is not None:
+        if (least := lower_bound_table(found)) is not None:
             sections.append(Section("Lower bound for any strategy", (least, paragraph(_BOUNDS))))
         sections.append(_how_it_was_made(command))
         return page("How many measurements?", answer=sentence, key_figure=needed, sections=sections)
@@ -199,34 +345,32 @@ def lower_bound_table(found: Mapping[SearchConfiguration, Summary]) -> Markup | 
         if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
             least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
             search = over(least.search_bits, least.search_capacity_bits), _with_error(own.to_white)
-            lines.append(
-                (row.name, *search, over(least.refinement_bits, least.capacity_bits), _with_error(own.after_white))
-            )
+            after = over(least.refinement_bits, least.capacity_bits), _with_error(own.after_white)
+            lines.append((row.name, *search, *after))
     places = "up to white, at least (bits over bits per reading)", "from there, at least"
     return table(("row", places[0], "measured", places[1], "measured"), lines) if lines else None
 
 
 def study_csv(table: Mapping[SearchConfiguration, Summary]) -> str:
     """Return a study's table as CSV text: estimates with bounds; processor times, which vary, are left out."""
-    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
+    ends, others = ("value", "low", "high"), ("error_mm", "wrong", "wrong_expected", "wrong_limit")
     rows = []
     for row, found in table.items():
-        estimates = [getattr(found, name) for name in _COLUMNS]
-        values = [value for e in estimates for value in (e.value, e.low, e.high)]
-        values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
+        values = [getattr(getattr(found, name), end) for name in _COLUMNS for end in ends]
+        values += [getattr(found, name) for name in others]
         rows.append([row.name, found.n_runs, *map(_csv_cell, values)])
-    return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
+    bounds = [f"{name}{end}" for name in _COLUMNS for end in ("", "_low", "_high")]
+    return csv_text_of_rows(["row", "runs", *bounds, *others], rows)
 
 
 def _with_error(estimate: Estimate, *, scale: float = 1.0) -> str:
-    """Write an estimate, times a scale, with its error; without, if that is 0 or unknown."""
     value, half = scale * estimate.value, scale * estimate.half_width
     return value_with_error(value, half) if half > 0 else number_text(value, 1)
 
 
 def concealed_page(results: Mapping[ConcealedTrial, Result], *, command: str) -> CampaignPage:
     """Return what a study of concealed effects comes to; `command` is the command line that made it."""
-    rows, forms = concealed_rows(results), concealed_forms(results)
+    rows, forms = concealed_rows(results), concealed_rows(results, by_form=True)
 
     def sure_and_wrong(doubts: bool) -> str:
         own = [row for row in rows if (row.trust < 1) == doubts]
@@ -291,9 +435,6 @@ _CONCEALED_LEGEND = (
 )
 
 
-_DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
-
-
 def challenge_page(
     results: Results, score: Callable[[Results], Sequence[ScoreRow]], *, command: str, systems: bool
 ) -> CampaignPage:
@@ -314,8 +455,10 @@ def challenge_page(
                 "truth." + (" Targets are left out." if systems else ""),
             )
             sections.append(Section("Confusion matrix", (drawn,)))
-            each = ("Case by case", _case_table(results)) if systems else (_AT_LAMBDA_8, _effect_table(done))
-            sections.append(Section(each[0], each[1:]))
+            if systems:
+                sections.append(Section("Case by case", (_case_table(results),)))
+            else:
+                sections.append(Section("Each effect at lambda 8", (_effect_table(done),)))
         failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
         if failures:
             sections.append(Section("Cases that failed", (definition_list(failures),)))
@@ -330,7 +473,6 @@ def challenge_page(
     return CampaignPage(challenge_csv(rows), html, sentence)
 
 
-_AT_LAMBDA_8 = "Each effect at lambda 8"
 _CHALLENGE_LEGEND = (
     "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is undecided. "
     "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
@@ -349,29 +491,23 @@ def challenge_sentence(rows: Sequence[ScoreRow], n_cases: int) -> str:
 
 
 _TARGETS: Columns[ScoreRow] = {
-    "what": lambda row: _indented_row_name(row.name),
+    # Indented by an em space, since HTML drops plain spaces.
+    "what": lambda row: "\u2003" * row.name.startswith(" ") + row.name.lstrip().replace("_", " "),
     "found": lambda row: _value_text(row.found) if row.found.n else "–",
     "95 % interval": lambda row: typeset_numbers(_interval_text(row.found)),
     "of": lambda row: str(row.found.n),
     "target": lambda row: _target_text(row),
-    "decision": lambda row: "undecided" if row.decision == "open" else _DECISIONS[row.decision],
+    "decision": lambda row: {"open": "undecided", None: ""}.get(row.decision, str(row.decision)),
 }
-
-
-def _indented_row_name(name: str) -> str:
-    """Write a row's name with spaces for underscores, indented by an em space, since HTML drops plain spaces."""
-    own = name.lstrip()
-    return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
 def challenge_csv(rows: Sequence[ScoreRow]) -> str:
     """Return a challenge's table as CSV text: quantity, value, interval, cases, target's bounds, decision."""
     cells = []
     for row in rows:
-        numbers, bounds = (row.found.value, row.found.low, row.found.high), (row.least, row.most)
-        cells.append(
-            [row.name.strip(), *map(_csv_cell, numbers), row.found.n, *map(_csv_cell, bounds), _DECISIONS[row.decision]]
-        )
+        numbers = map(_csv_cell, (row.found.value, row.found.low, row.found.high))
+        decision = {"open": "cannot decide", None: ""}.get(row.decision, row.decision)
+        cells.append([row.name.strip(), *numbers, row.found.n, *map(_csv_cell, (row.least, row.most)), decision])
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
@@ -430,5 +566,4 @@ def _target_text(row: ScoreRow) -> str:
 
 
 def _csv_cell(value: float) -> str:
-    """Write a number as a cell of a CSV file; one that is not finite is empty."""
     return f"{value:.6g}" if math.isfinite(value) else ""

@@ -44,7 +44,7 @@ class NullRefit:
     """
 
     def __init__(self) -> None:
-        self._clean: Recording | None = None
+        self._kept: tuple[Recording, Fit] | None = None
 
     def __call__(self, clean: Recording, changed: Recording) -> float:
         """Return the norm of an effect's residuals after a full refit of the null, in reading units."""
@@ -63,31 +63,29 @@ class NullRefit:
 
     def null_fit(self, clean: Recording) -> Fit:
         """Return the null model's fit to the clean readings, cached for the last recording."""
-        if self._clean is not clean:
-            self._clean, self._null = clean, _fit_of_best_order(clean)
-        return self._null
+        if self._kept is not None and self._kept[0] is clean:
+            return self._kept[1]
+        extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
+        sensor = default_sensor(extent, 1)
+        starts = starts_of_one_gaussian(sensor)
+        found = min((_white_noise_fit(Model(sensor, (), clean.plan), clean, z) for z in starts), key=_objective)
+        best, best_log_z = found, laplace_evidence(found, noise).log_z
+        for _ in range(_MOST_GAUSSIANS - 1):
+            found = min(_fits_with_one_more_gaussian(found, clean, extent), key=_objective)
+            log_z = laplace_evidence(found, noise).log_z
+            if log_z > best_log_z:
+                best, best_log_z = found, log_z
+            elif log_z < best_log_z - _BEHIND:
+                break
+        self._kept = clean, best
+        return best
 
 
-def _fit_of_best_order(clean: Recording) -> Fit:
-    extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
-    sensor = default_sensor(extent, 1)
-    found = min(
-        (_white_noise_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),
-        key=lambda f: f.objective,
-    )
-    best, best_log_z = found, laplace_evidence(found, noise).log_z
-    for _ in range(_MOST_GAUSSIANS - 1):
-        found = min(_fits_with_one_more_gaussian(found, clean, extent), key=lambda f: f.objective)
-        log_z = laplace_evidence(found, noise).log_z
-        if log_z > best_log_z:
-            best, best_log_z = found, log_z
-        elif log_z < best_log_z - _BEHIND:
-            break
-    return best
+def _objective(found: Fit) -> float:
+    return found.objective
 
 
 def _fits_with_one_more_gaussian(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
-    """Yield fits with one more Gaussian than `found`, one from each way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
     for z in starts_with_more_gaussians(found.model.sensor, found.z, wanted):
         yield _white_noise_fit(Model(wanted, (), recording.plan), recording, z)
@@ -124,7 +122,6 @@ class _Rivalry:
         return templates, order, float(np.sqrt(min(explained[order[0]] / whole, 1.0)))
 
     def refits(self, effect: Effect, templates: EffectTemplates, entries: Iterable[int]) -> Iterator[Fit]:
-        """Yield the fit of the model with an effect from each of these entries of its template bank."""
         found, n = self.found, len(self._usable)
         for at in entries:
             columns = templates.columns[at]
@@ -239,9 +236,8 @@ class SystemRefit:
         simulator = replace(simulator, noise=Noise(sd=kind.sd))
         table = run_table(drawn.diagnosed_table, kind, true.readings)
         system = System.of(simulator, table)
-        values: dict[str, float] = dict(drawn.shared)
-        for name, by_run in drawn.by_run.items():
-            values |= {f"{name}[{run}]": float(by_run[int(run)]) for run in table.scan_names}
+        of_runs = {f"{n}[{run}]": float(v[int(run)]) for n, v in drawn.by_run.items() for run in table.scan_names}
+        values = {**drawn.shared, **of_runs}
         theta = np.array([[values[name] for name in system.marginals]])
         system = with_converged_step(system, table, theta, tolerance=STANDS_STILL * kind.sd)
         self.model, self._true_z = Model(system, (), cast(Plan, table)), ndtri(system.prior.to_unit_cube(theta))[0]
@@ -258,7 +254,6 @@ def run_table(rows: SystemTable, kind: SystemKind, readings: FloatArray) -> RunT
 
 
 def _best_fit(found: Fit, readings: Recording, forms: Sequence[Effect]) -> Fit:
-    """Add forms to a fit, one after the other, from their best starts; return the best fit of all."""
     if not forms:
         return found
     rivalry = _Rivalry(found, readings)
@@ -292,11 +287,11 @@ def rivals_with_nats(refit: SystemRefit, case: SystemCase, effect: SystemEffect)
         templates, entries, rho = rivalry.entries(forms[name])
         if 0.5 * size * (1 - rho**2) < _NEAR or rho > _LIKE:
             near.append((-rho, name, templates, entries[:_STARTS]))
-    nats = {
-        name: 0.5 * min(map(_sum_of_squares, rivalry.refits(forms[name], templates, entries))) / drawn.kind.sd**2
-        for _, name, templates, entries in sorted(near, key=lambda each: each[:2])[:_MOST_FITS]
-    }
-    return dict(sorted(((name, loss) for name, loss in nats.items() if loss < _NEAR), key=lambda item: item[1]))
+    nats = []
+    for _, name, templates, entries in sorted(near, key=lambda each: each[:2])[:_MOST_FITS]:
+        left = min(map(_sum_of_squares, rivalry.refits(forms[name], templates, entries)))
+        nats.append((0.5 * left / drawn.kind.sd**2, name))
+    return {name: loss for loss, name in sorted(nats, key=lambda each: each[0]) if loss < _NEAR}
 
 
 def nats_of_alternative(refit: SystemRefit, case: SystemCase, names: Sequence[str]) -> float:
@@ -313,6 +308,5 @@ def nats_of_alternative(refit: SystemRefit, case: SystemCase, names: Sequence[st
         return np.inf
     # Which effect is added first decides where the fit begins.
     orders = itertools.permutations([forms[name] for name in names])
-    return min(_sum_of_squares(_best_fit(found, refit.recording(readings), order)) for order in orders) / (
-        2 * case.drawn.kind.sd**2
-    )
+    left = min(_sum_of_squares(_best_fit(found, refit.recording(readings), order)) for order in orders)
+    return left / (2 * case.drawn.kind.sd**2)

@@ -18,8 +18,8 @@ from probewise.diagnosis.prior_odds import Names
 from probewise.effects import VOCABULARY
 from probewise.proof.campaign import Result
 from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic, grouped
+from probewise.proof.sensors.cases import NOISE_NAMES
 from probewise.proof.sensors.effects import NO_PHYSICS, SINGLES
-from probewise.proof.sensors.sensors import NOISE_NAMES
 
 Results: TypeAlias = Sequence[Result]
 
@@ -104,34 +104,19 @@ def names_in_label(label: str) -> Names:
     return () if label == "clean" else tuple(label.split("+"))
 
 
-def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
-    """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
-    labels = [names_in_label(label) for label in result["credible_set"]]
-    if merged:
-        return any(are_names_right(result, names) for names in labels)
-    wanted = right_names_of_each_effect(result, merged=False)
-    return any(names_match(names, wanted) for names in labels)
+def leading_hypothesis(result: Result, *, clean: bool = True) -> tuple[Names, float]:
+    """Return (names, probability) of the most probable hypothesis; the clean one, (), counts only if `clean`."""
+    options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
+    return max(options, key=lambda option: option[1], default=((), 0.0))
 
 
-def credible_set_size_with_aliases_merged(result: Result) -> float:
-    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
-    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
-    return float(len(result["credible_set"]) - max(right - 1, 0))
+def _without_noise(names: Iterable[str]) -> Names:
+    return tuple(name for name in names if name not in NOISE)
 
 
-def has_false_extra_effect(result: Result) -> bool:
-    """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
-    named = _without_noise(leading_hypothesis(result, clean=True)[0])
-    return count_extra_names(named, right_names_of_each_effect(result, merged=True, noise=False)) > 0
-
-
-def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
-    """Count the names left over when as many as possible match a wanted effect, one name per effect."""
-    most = max(
-        sum(name in right for name, right in zip(order, wanted, strict=False))
-        for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
-    )
-    return len(names) - most
+def acts_on_mean(result: Result) -> bool:
+    """Return whether no concealed effect acts on the noise only; True if nothing is concealed."""
+    return not any(h["on_noise"] for h in result["hidden"])
 
 
 def is_distinguishable_from_ssf(result: Result) -> bool:
@@ -151,19 +136,9 @@ def is_recognised_as_out_of_vocabulary(result: Result) -> bool:
     return result["verdict"] == "unknown" or named
 
 
-def acts_on_mean(result: Result) -> bool:
-    """Return whether no concealed effect acts on the noise only; True if nothing is concealed."""
-    return not any(h["on_noise"] for h in result["hidden"])
-
-
-def leading_hypothesis(result: Result, *, clean: bool) -> tuple[Names, float]:
-    """Return (names, probability) of the most probable hypothesis; the clean one, (), counts only if `clean`."""
-    options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
-    return max(options, key=lambda option: option[1], default=((), 0.0))
-
-
-def _without_noise(names: Iterable[str]) -> Names:
-    return tuple(name for name in names if name not in NOISE)
+def names_effect_on_mean(result: Result) -> bool:
+    """Return whether the diagnosis names an effect on the mean ("unknown" is none)."""
+    return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
 def is_leading_name_right(result: Result) -> bool:
@@ -177,49 +152,66 @@ def is_leading_name_right(result: Result) -> bool:
     due = is_distinguishable_from_ssf(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
-        key = _without_noise(names)
-        if key or not due:
+        if (key := _without_noise(names)) or not due:
             joined[key] = joined.get(key, 0.0) + p
     first = max(joined, key=lambda key: joined[key], default=())
     return are_names_right(result, first, noise=False)
 
 
+def has_false_extra_effect(result: Result) -> bool:
+    """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
+    named = _without_noise(leading_hypothesis(result)[0])
+    return count_extra_names(named, right_names_of_each_effect(result, merged=True, noise=False)) > 0
+
+
+def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
+    """Count the names left over when as many as possible match a wanted effect, one name per effect."""
+    orders = itertools.permutations([*names, *[""] * len(wanted)], len(wanted))
+    return len(names) - max(sum(n in right for n, right in zip(order, wanted, strict=False)) for order in orders)
+
+
 def leading_probability_and_correctness(result: Result) -> tuple[float, bool]:
     """Return the leading hypothesis's probability and whether it is right; an alias is, outside the vocabulary only."""
-    names, probability = leading_hypothesis(result, clean=True)
+    names, probability = leading_hypothesis(result)
     return probability, names_match(names, right_names_of_each_effect(result, merged=False))
-
-
-def names_effect_on_mean(result: Result) -> bool:
-    """Return whether the diagnosis names an effect on the mean ("unknown" is none)."""
-    return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
 def is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect, or an alias, has a probability above 0.9; "clean" and "unknown" do not count."""
     probability, right = leading_probability_and_correctness(result)
-    return probability > 0.9 and not right and leading_hypothesis(result, clean=True)[0] not in ((), ("unknown",))
+    return probability > 0.9 and not right and leading_hypothesis(result)[0] not in ((), ("unknown",))
+
+
+def credible_set_holds_truth(result: Result, *, merged: bool) -> bool:
+    """Return whether the credible set holds the truth or, if `merged`, aliases of it."""
+    sets, wanted = map(names_in_label, result["credible_set"]), right_names_of_each_effect(result, merged=False)
+    return any(are_names_right(result, names) if merged else names_match(names, wanted) for names in sets)
+
+
+def credible_set_size_with_aliases_merged(result: Result) -> float:
+    """Count the hypotheses of a credible set; the right one and its aliases count as one."""
+    right = sum(are_names_right(result, names_in_label(label)) for label in result["credible_set"])
+    return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
 _EDGES = np.linspace(0, 1, 11)
 
 
-@dataclass(frozen=True)
-class Bin:
-    """Cases of similar stated probability: its mean, and the share of right answers."""
-
-    stated: float
-    right: Estimate
+def _bin_numbers(probability: FloatArray) -> IntArray:
+    return np.clip(np.searchsorted(_EDGES, probability, side="right") - 1, 0, len(_EDGES) - 2)
 
 
-def reliability_bins(results: Results) -> tuple[Bin, ...]:
-    """Bin cases by the probability of their leading hypothesis into ten equal bins, ascending, without empty bins."""
+def reliability_bins(results: Results) -> list[tuple[float, Estimate]]:
+    """Bin cases by the probability of their leading hypothesis into ten equal bins; return those that are not empty.
+
+    Of each, ascending: the mean probability stated, and the share of right answers.
+    """
     said = [leading_probability_and_correctness(result) for result in results]
     bins = grouped(zip(_bin_numbers(np.array([p for p, _ in said])).tolist(), said, strict=True))
-    return tuple(
-        Bin(float(np.mean([p for p, _ in own])), estimated_share(right for _, right in own))
+    return [
+        (float(np.mean([p for p, _ in own])), estimated_share(right for _, right in own))
         for _, own in sorted(bins.items())
-    )
+    ]
 
 
 def calibration_error(results: Results) -> Estimate:
@@ -234,10 +226,6 @@ def calibration_error(results: Results) -> Estimate:
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
 
 
-def _bin_numbers(probability: FloatArray) -> IntArray:
-    return np.clip(np.searchsorted(_EDGES, probability, side="right") - 1, 0, len(_EDGES) - 2)
-
-
 OUTSIDE, SEVERAL = "outside", "several"
 
 
@@ -246,13 +234,22 @@ def confusion_counts(
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
     """Count answers by truth, over cases of kind "clean", "single" and "outside".
 
-    An answer that is an alias of the truth counts as the truth. `label` maps a name to that of its row and column, e.g.
-    to merge several. Returns the truths and answers that occur, and counts, (n_truths, n_answers).
+    An answer is that of the leading hypothesis: "clean", its one name, or `SEVERAL`; an alias of the truth counts as
+    the truth. If the concealed effects act on the mean, names of noise effects are ignored. `label` maps a name to that
+    of its row and column, e.g. to merge several. Returns the truths and answers that occur, and counts, (n_truths,
+    n_answers).
     """
     counts: Counter[tuple[str, str]] = Counter()
     for result in _of(results, "clean", "single", "outside"):
         truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
-        counts[label(truth), label(_stated_name(result, truth))] += 1
+        names, on_mean = leading_hypothesis(result)[0], acts_on_mean(result)
+        names = _without_noise(names) if on_mean else names
+        answer = SEVERAL if len(names) > 1 else "".join(names) or "clean"
+        if truth not in ("clean", OUTSIDE) and names_match(
+            names, right_names_of_each_effect(result, merged=True, noise=not on_mean)
+        ):
+            answer = truth
+        counts[label(truth), label(answer)] += 1
 
     def in_order(found: set[str], order: Sequence[str]) -> tuple[str, ...]:
         return (*(name for name in order if name in found), *sorted(found - set(order)))
@@ -260,20 +257,6 @@ def confusion_counts(
     columns = in_order({s for _, s in counts}, ["clean", *SINGLES, "unknown", SEVERAL])
     truths = in_order({t for t, _ in counts}, ["clean", *SINGLES, OUTSIDE])
     return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
-
-
-def _stated_name(result: Result, truth: str) -> str:
-    """Return the name for which a leading hypothesis counts: `truth` if right, "clean", its one name, or `SEVERAL`.
-
-    If the concealed effects act on the mean, names of noise effects are ignored.
-    """
-    names, on_mean = leading_hypothesis(result, clean=True)[0], acts_on_mean(result)
-    if on_mean:
-        names = _without_noise(names)
-    wanted = right_names_of_each_effect(result, merged=True, noise=not on_mean)
-    if truth not in ("clean", OUTSIDE) and names_match(names, wanted):
-        return truth
-    return SEVERAL if len(names) > 1 else "".join(names) or "clean"
 
 
 _DRAWS = 400
@@ -316,8 +299,7 @@ def oracle_credible_set_size(hidden: Hidden) -> float:
 
 def readings_to_separate_alias(result: Result) -> float:
     """Return how many readings of the same plan would separate a case's aliased pair by 3 nats (inf if identical)."""
-    size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
-    apart = size**2 * (1 - rho**2) / 2
+    apart = float(result["hidden"][0]["size_lambda"]) ** 2 * (1 - float(result["cosine"]) ** 2) / 2
     return float(result["readings"]) * HONEST_NATS / apart if apart > 0 else np.inf
 
 
@@ -327,11 +309,8 @@ def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
 
 
 def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
-    """Return the distance of each rival in noise sds, by name; {} for a noise effect.
-
-    It is lambda sqrt(1 - rho^2), or sqrt(2 nats) where the case holds the rival's loss of log likelihood (systems).
-    """
-    if "rival_nats" in hidden:
+    """Return the distance of each rival in noise sds, by name; {} for a noise effect."""
+    if "rival_nats" in hidden:  # of a system, the rival's loss of log likelihood
         return {name: float(np.sqrt(2 * nats)) for name, nats in hidden["rival_nats"].items()}
     size, rivals = float(hidden["size_lambda"]), {n: r for n, r in hidden["cosines"].items() if n != hidden["name"]}
     return {name: size * float(np.sqrt(max(1 - rho**2, 0.0))) for name, rho in rivals.items()}
@@ -351,11 +330,7 @@ _BOOTSTRAPS = 2000
 
 @dataclass(frozen=True)
 class ScoreRow:
-    """One row of the table.
-
-    `found`: estimate with its 95 % interval; `least`, `most`: bounds of the target, infinite by default; if both are,
-    there is no target.
-    """
+    """One row of the table: an estimate with its 95 % interval, and the bounds of its target, infinite without one."""
 
     name: str
     found: Estimate
@@ -372,6 +347,10 @@ class ScoreRow:
         return "missed" if self.found.low > self.most or self.found.high < self.least else "open"
 
 
+Part: TypeAlias = Callable[[list[Result]], Iterator[ScoreRow]]
+"""Rows of a table, of the cases that did not fail."""
+
+
 def _share(name: str, hits: Iterable[bool], least: float = -math.inf, most: float = math.inf) -> ScoreRow:
     return ScoreRow(name, estimated_share(hits), least, most)
 
@@ -381,7 +360,6 @@ def _mean(name: str, values: Iterable[float], least: float = -math.inf, most: fl
 
 
 def _of(results: Iterable[Result], *kinds: str, **wanted: object) -> list[Result]:
-    """Return the results of these kinds of cases, with the wanted values of their parts."""
     return [r for r in results if r["kind"] in kinds and all(r[name] == value for name, value in wanted.items())]
 
 
@@ -410,23 +388,23 @@ def _unknown(results: Iterable[Result]) -> list[bool]:
     return [r["verdict"] == "unknown" for r in results]
 
 
-def _rows(results: Results, *parts: Callable[[list[Result]], Iterator[ScoreRow]]) -> tuple[ScoreRow, ...]:
-    """Return the rows of these parts of a table, and that of the cases that failed."""
+def _scored(results: Results, *parts: Part) -> tuple[ScoreRow, ...]:
     done = [r for r in results if "failed" not in r]
-    failed = _share("cases that failed", ["failed" in r for r in results])
-    return (*(row for part in parts for row in part(done)), failed)
+    return (
+        *(row for part in parts for row in part(done)),
+        _share("cases that failed", ["failed" in r for r in results]),
+    )
 
 
-def score(results: Results) -> tuple[ScoreRow, ...]:
-    """Return the rows of a challenge of the light sensor, from results of `run_case`."""
-    parts = _alarms_and_detection, _names, _probabilities, _places_and_intervals, _held_out_scans
-    return _rows(results, *parts, _pairs_aliases_and_unlisted, _seconds_by_plan)
+def _seconds(part: str, *kinds: tuple[object, str, float]) -> Part:
+    """Return the rows of processor times of the cases whose `part` has each value, with its words and most seconds."""
 
+    def rows(done: list[Result]) -> Iterator[ScoreRow]:
+        for value, words, most in kinds:
+            seconds = [r["cpu_s"] for r in done if r[part] == value]
+            yield _mean(f"processor time of a diagnosis, {words} (s)", seconds, most=most)
 
-def _seconds_by_plan(done: list[Result]) -> Iterator[ScoreRow]:
-    for plan, most in (("paper", 5.0), ("two_way", math.inf)):
-        seconds = [r["cpu_s"] for r in done if r["plan"] == plan]
-        yield _mean(f"processor time of a diagnosis, {plan} plan (s)", seconds, most=most)
+    return rows
 
 
 def detected_and_named_by_effect(results: Results, size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
@@ -562,18 +540,17 @@ def _pairs_aliases_and_unlisted(done: list[Result]) -> Iterator[ScoreRow]:
     yield _mean("  readings advised, of those that repeating the plan needs", needed, most=0.25)
 
 
-def score_rounds(results: Results) -> tuple[ScoreRow, ...]:
-    """Return the rows of a challenge in rounds: each target after the last round and the first, then costs."""
-    return _rows(results, _rounds)
-
-
 def _rounds(last: list[Result]) -> Iterator[ScoreRow]:
     first = [r | r["rounds"][0] for r in last]
     for after_last, after_first in zip(_of_round(last), _of_round(first), strict=True):
         yield after_last
         yield ScoreRow(f"  after one round: {after_first.name}", after_first.found)
     further = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in last], dtype=np.float64)
-    extra = _bootstrapped_median(further[further > 0])
+    further, extra = further[further > 0], estimated_mean([])
+    if further.size:  # a bootstrap's percentiles
+        drawn = np.random.default_rng(0).choice(further, (_BOOTSTRAPS, further.size))
+        low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+        extra = Estimate(float(np.median(further)), float(low), float(high), int(further.size))
     yield ScoreRow("extra readings, median of those not settled at once", extra, most=80.0)
     yield _share("settled at last", [r["rounds"][-1]["settled"] for r in last])
     yield _mean("processor time of an investigation (s)", [r["cpu_s"] for r in last])
@@ -593,26 +570,6 @@ def _of_round(results: list[Result]) -> Iterator[ScoreRow]:
     yield _share("physics named, clean", map(names_effect_on_mean, _of(results, "clean")), most=0.005)
 
 
-def _bootstrapped_median(values: FloatArray) -> Estimate:
-    if not values.size:
-        return estimated_mean([])
-    drawn = np.random.default_rng(0).choice(values, (_BOOTSTRAPS, values.size))
-    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
-    return Estimate(float(np.median(values)), float(low), float(high), int(values.size))
-
-
-def score_systems(results: Results) -> tuple[ScoreRow, ...]:
-    """Return the rows of a challenge of systems, from results of `run_system_case`."""
-    parts = _alarms_and_names_of_systems, _probabilities_and_intervals_of_systems, _held_out_runs
-    return _rows(results, *parts, _unlisted_laws, _seconds_by_law)
-
-
-def _seconds_by_law(done: list[Result]) -> Iterator[ScoreRow]:
-    for kind, law, most in (("closed form", False, 5.0), ("differential equations", True, 20.0)):
-        seconds = [r["cpu_s"] for r in done if r["law"] is law]
-        yield _mean(f"processor time of a diagnosis, {kind} (s)", seconds, most=most)
-
-
 def name_without_target(name: str) -> str:
     """Return a name, or several joined by "+", without the targets after ":"."""
     return "+".join(part.split(":")[0] for part in name.split("+"))
@@ -625,7 +582,7 @@ def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
     yield from _alarms_by_noise(other)
     yield _share("physics named, no effect, white noise", map(names_effect_on_mean, white), most=0.005)
     yield _share("physics named, no effect, other noise", map(names_effect_on_mean, other), most=0.005)
-    noise_is_right = [leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]
+    noise_is_right = [leading_hypothesis(r)[0] == tuple(r["truth"]) for r in other]
     yield _share("noise named right, no effect, other noise", noise_is_right)
     for size, least in ((6.0, -math.inf), (8.0, 0.9), (12.0, 0.95), (20.0, 0.98)):
         singles = _of(done, "single", size=size)
@@ -638,7 +595,6 @@ def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
 
 
 def _effects_with_rivals(singles: Results) -> list[Result]:
-    """List the concealed effects of cases with one effect whose rivals are on file."""
     return [r["hidden"][0] for r in singles if "rival_nats" in r["hidden"][0]]
 
 
@@ -651,7 +607,7 @@ def _probabilities_and_intervals_of_systems(done: list[Result]) -> Iterator[Scor
     yield _mean("size of the credible set, the truth and its aliases as one, lambda 12", sizes, most=1.4)
     if oracle := [oracle_credible_set_size(hidden) for hidden in _effects_with_rivals(singles)]:
         yield _mean("  oracle, so counted, lambda 12", oracle)
-    wrong = [is_confidently_wrong(r) and not are_names_right(r, leading_hypothesis(r, clean=True)[0]) for r in done]
+    wrong = [is_confidently_wrong(r) and not are_names_right(r, leading_hypothesis(r)[0]) for r in done]
     yield _share("wrong name stated above .9", wrong, most=0.01)
     yield ScoreRow("expected calibration error", calibration_error(done))
     stated = [item for r in done for effect in r["parameters"].values() for item in effect.items()]
@@ -696,8 +652,27 @@ def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:
 
 def _gains_as_much_as_true_law(result: Result) -> bool:
     """Return whether the right name or an alias leads, or the repaired model gains 80 % of the right model's nats."""
-    names = leading_hypothesis(result, clean=True)[0]
+    names = leading_hypothesis(result)[0]
     if names_match(names, right_names_of_each_effect(result, merged=True)) and result["verdict"] != "unknown":
         return True
     gains = gains_on_held_out_runs(result, "right")
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
+
+
+def score(results: Results) -> tuple[ScoreRow, ...]:
+    """Return the rows of a challenge of the light sensor, from results of `run_case`."""
+    parts = _alarms_and_detection, _names, _probabilities, _places_and_intervals, _held_out_scans
+    times = _seconds("plan", ("paper", "paper plan", 5.0), ("two_way", "two_way plan", math.inf))
+    return _scored(results, *parts, _pairs_aliases_and_unlisted, times)
+
+
+def score_rounds(results: Results) -> tuple[ScoreRow, ...]:
+    """Return the rows of a challenge in rounds: each target after the last round and the first, then costs."""
+    return _scored(results, _rounds)
+
+
+def score_systems(results: Results) -> tuple[ScoreRow, ...]:
+    """Return the rows of a challenge of systems, from results of `run_system_case`."""
+    parts = _alarms_and_names_of_systems, _probabilities_and_intervals_of_systems, _held_out_runs
+    times = _seconds("law", (False, "closed form", 5.0), (True, "differential equations", 20.0))
+    return _scored(results, *parts, _unlisted_laws, times)

@@ -189,7 +189,11 @@ def where_white_in_words(pattern: Pattern) -> str:
         case Image(_, _, _, file):
             return f"the picture {file}, black around it"
         case HalfPlane(normal, offset):
-            where = _half_plane_in_words(normal, offset)
+            quarter = normal / (math.pi / 2)
+            side = round(quarter) % 4
+            where = f"towards {math.degrees(normal):g} degrees of the line {offset:g} mm from the origin"
+            if abs(quarter - round(quarter)) <= _EVEN:
+                where = _SIDES[side].format((offset if side < 2 else -offset) + 0.0)
         case Quadrant((x, y), (dx, dy)):
             where = f"{'above' if dy > 0 else 'below'} y = {y:g} mm and {'right' if dx > 0 else 'left'} of x = {x:g} mm"
         case Disc((x, y), radius):
@@ -200,15 +204,6 @@ def where_white_in_words(pattern: Pattern) -> str:
             across = f"across {math.degrees(normal):g} degrees"
             where = f"in stripes of {duty * period:g} mm, one every {period:g} mm, {across}"
     return f"{_shade_in_words(pattern.inside)} {where}, {_shade_in_words(pattern.outside)} elsewhere"
-
-
-def _half_plane_in_words(normal_rad: float, offset_mm: float) -> str:
-    quarter = normal_rad / (math.pi / 2)
-    if abs(quarter - round(quarter)) > _EVEN:
-        towards = f"towards {math.degrees(normal_rad):g} degrees"
-        return f"{towards} of the line {offset_mm:g} mm from the origin"
-    side = round(quarter) % 4
-    return _SIDES[side].format((offset_mm if side < 2 else -offset_mm) + 0.0)
 
 
 def _shade_in_words(albedo: float) -> str:

@@ -24,6 +24,7 @@ from probewise._display import ShowsItself, data_frame
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError, require
+from probewise.recordings.cells import times_to_numbers
 from probewise.recordings.columns import (
     A_PATTERN,
     SESSION,
@@ -41,7 +42,6 @@ from probewise.recordings.columns import (
     texts_to_numbers,
 )
 from probewise.recordings.patterns import Pattern
-from probewise.recordings.times import times_to_numbers
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Instrumentation:
     unit: str = "LEGO"
     min: float | None = None
     max: float | None = None
-    step: float | None = None  # declared quantisation; None if not declared
+    step: float | None = None
     sensor: str = ""
     height_mm: float | None = None
     controls: tuple[str, ...] = ()
@@ -66,14 +66,14 @@ class Instrumentation:
         for name in ("min", "max", "step", "height_mm"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, checked_finite_number(name, getattr(self, name), "a number or None"))
-        if self.min is not None and self.max is not None and self.min >= self.max:
-            raise ParameterError("max", self.max, f"greater than min, {self.min:g}")
+        if self.min is not None and self.max is not None:
+            require(self.min < self.max, "max", self.max, f"greater than min, {self.min:g}")
         for name in ("step", "height_mm"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "a number greater than 0")
+            if getattr(self, name) is not None:
+                require(getattr(self, name) > 0, name, getattr(self, name), "a number greater than 0")
         listed = isinstance(self.controls, Iterable) and not isinstance(self.controls, str)
-        if not listed or not all(isinstance(name, str) for name in self.controls):
-            raise ParameterError("controls", self.controls, "a tuple of texts")
+        fits = listed and all(isinstance(name, str) for name in self.controls)
+        require(fits, "controls", self.controls, "a tuple of texts")
         object.__setattr__(self, "controls", tuple(self.controls))
 
     @property
@@ -123,19 +123,19 @@ class Plan:
         require_patterns(self.patterns)
         require_kind("instrumentation", self.instrumentation, Instrumentation, "an Instrumentation(unit=...)")
         n_points = np.size(self.x_mm)
-        for name in ("x_mm", "y_mm", "orientation_rad", "time_s"):
-            values = read_only_floats(getattr(self, name), name)
+        numbers = ("x_mm", "y_mm", "orientation_rad", "time_s")
+        arrays: dict[str, FloatArray | IntArray] = {n: read_only_floats(getattr(self, n), n) for n in numbers}
+        arrays |= {name: frozen_int(getattr(self, name)) for name in ("scan", "pattern")}
+        for name, values in arrays.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n_points},), as x_mm")
-            require_finite(name, values)
             object.__setattr__(self, name, values)
+        for name in numbers:
+            require_finite(name, getattr(self, name))
         for name, n_names in (("scan", len(self.scan_names)), ("pattern", len(self.pattern_names))):
-            codes = frozen_int(getattr(self, name))
-            if codes.shape != (n_points,):
-                raise ShapeError(f"{name} has shape {codes.shape}; allowed: ({n_points},), as x_mm")
+            codes = arrays[name]
             if n_points and (codes.min() < 0 or codes.max() >= n_names):
                 raise ParameterError(name, (int(codes.min()), int(codes.max())), f"0 to {n_names - 1}")
-            object.__setattr__(self, name, codes)
         covariates = {name: read_only_floats(values, f"covariate {name}") for name, values in self.covariates.items()}
         for name, values in covariates.items():
             if values.shape != (n_points,):
@@ -423,17 +423,11 @@ class Recording(ShowsItself):
     ) -> Self:
         """Make a recording from a data frame or a dict of columns, named as in a recording's CSV file.
 
-        Raises ParameterError if a column is missing, a pattern is named but not described, or an argument has the wrong
-        type; ShapeError if the columns differ in length.
-
-        Parameters
-        ----------
-        table
-            Columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
-            `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are
-            ignored, except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers.
-        patterns, unit, min, max, step, sensor, height_mm, controls, source
-            As in `Recording.from_arrays`.
+        `table` has columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
+        `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are ignored,
+        except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers. All else is as
+        in `Recording.from_arrays`. Raises ParameterError if a column is missing, a pattern is named but not described,
+        or an argument has the wrong type; ShapeError if the columns differ in length.
 
         Examples
         --------
@@ -542,10 +536,8 @@ def require_patterns_described(plan: Plan) -> None:
 
 def range_in_words(low: float | None, high: float | None) -> str:
     """Write a declared range in words; `low` or `high` is None if that end is not declared."""
-    if low is None and high is None:
-        return "any range"
     if low is None:
-        return f"the range up to {high:g}"
+        return "any range" if high is None else f"the range up to {high:g}"
     return f"{low:g} to {high:g}" if high is not None else f"the range from {low:g}"
 
 

@@ -10,7 +10,6 @@ from typing import TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.errors import require
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Quadrant, Uniform
 from probewise.recordings.plan import Instrumentation, Plan
 
@@ -30,53 +29,52 @@ PATTERNS: dict[str, Pattern] = {
 ORIENTATIONS_DEG = (0, 90, 180, 270)
 QUADRANTS = ("quadrant_a", "quadrant_b", "quadrant_c", "quadrant_d")
 _FULL_BATTERY_MV, _DRAIN_MV_PER_S = 8300.0, 0.12
+_JITTER = 0.1  # largest change of an interval, as a share of it
+_READING_S = 1.2  # from one reading to the next, about, of the paper's arm
 # Name, places (n, 2), patterns (one, or one per reading), degrees, seconds from one reading to the next.
 _Scan: TypeAlias = tuple[str, FloatArray, tuple[str, ...], float, float]
 
 
-def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
+def paper_plan() -> Plan:
     """Return the plan of the paper's 408 readings (section "Data Collection for SSF Estimation").
 
     Four scans across the black-and-white boundary from -50 to 50 mm in steps of 1 mm with the sensor at 0, 90, 180 and
     270 degrees, `edge_0` to `edge_270`, then one reading on each of the four quadrant patterns at 0 degrees,
-    `quadrants`. `reading_s`: seconds from one reading to the next; about 1.2 for the paper's arm; `break_s`: seconds to
-    turn the sensor between scans, or to change the pattern.
+    `quadrants`. To turn the sensor between scans, or to change the pattern, takes 30 s.
     """
-    line = _line_places(-50, 50, 1)
-    scans: list[_Scan] = [(f"edge_{deg}", line, ("boundary",), deg, reading_s) for deg in ORIENTATIONS_DEG]
-    scans.append(("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s))
-    return _plan_of_scans(scans, break_s)
+    line, break_s = _line_places(-50, 50, 1), 30.0
+    scans: list[_Scan] = [(f"edge_{deg}", line, ("boundary",), deg, _READING_S) for deg in ORIENTATIONS_DEG]
+    return _plan_of_scans([*scans, ("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s)], break_s)
 
 
-def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
+def two_way_plan() -> Plan:
     """Return a plan of 961 readings that distinguishes lag from backlash and gain from offset.
 
     For each orientation: the boundary out and back (the way back at double speed for 180 and 270 degrees, since lag
     depends on speed and backlash does not), plain white and plain black every 8 mm. Then the four quadrants, and a scan
-    along Y across a disc, the only one that moves in Y. `reading_s`, `break_s` as of `paper_plan`.
+    along Y across a disc, the only one that moves in Y. Between scans there are 40 s.
     """
-    out, flat = _line_places(-50, 50, 1), _line_places(-40, 40, 8)
+    out, flat, break_s = _line_places(-50, 50, 1), _line_places(-40, 40, 8), 40.0
     scans: list[_Scan] = []
     for deg in ORIENTATIONS_DEG:
         scans += [
-            (f"edge_{deg}_out", out, ("boundary",), deg, reading_s),
-            (f"edge_{deg}_back", out[::-1], ("boundary",), deg, reading_s / 2 if deg >= 180 else reading_s),
-            (f"white_{deg}", flat, ("white",), deg, reading_s),
-            (f"black_{deg}", flat, ("black",), deg, reading_s),
+            (f"edge_{deg}_out", out, ("boundary",), deg, _READING_S),
+            (f"edge_{deg}_back", out[::-1], ("boundary",), deg, _READING_S / 2 if deg >= 180 else _READING_S),
+            (f"white_{deg}", flat, ("white",), deg, _READING_S),
+            (f"black_{deg}", flat, ("black",), deg, _READING_S),
         ]
     scans.append(("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s))
-    scans.append(("disc_y", _line_places(60, -60, -2)[:, ::-1] + [-5.0, 0.0], ("disc",), 0, reading_s))
+    scans.append(("disc_y", _line_places(60, -60, -2)[:, ::-1] + [-5.0, 0.0], ("disc",), 0, _READING_S))
     return _plan_of_scans(scans, break_s)
 
 
-def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
-    """Return the plan with jittered time intervals; its covariate `battery_mv`, if any, is computed anew, with noise.
+def with_jittered_times(plan: Plan, *, rng: np.random.Generator) -> Plan:
+    """Return the plan with time intervals changed by up to a tenth.
 
-    `share`, 0 to 1 (else ParameterError), is the largest change of an interval as a share of it.
+    Its covariate `battery_mv`, if any, is computed from the new times, with noise.
     """
-    require(0 <= share <= 1, "share", share, "0 to 1")
     intervals = np.diff(plan.time_s, prepend=0.0)
-    time_s = np.round(np.cumsum(intervals * rng.uniform(1 - share, 1 + share, len(plan))), 3).astype(np.float64)
+    time_s = np.round(np.cumsum(intervals * rng.uniform(1 - _JITTER, 1 + _JITTER, len(plan))), 3).astype(np.float64)
     covariates = dict(plan.covariates)
     if "battery_mv" in covariates:
         covariates["battery_mv"] = np.round(_battery_mv(time_s) + rng.normal(0.0, 4.0, len(plan)))

@@ -25,12 +25,14 @@ from probewise.recordings.cells import (
     first_cell_without_number,
     is_missing,
     looks_like_number,
+    looks_like_time,
     parsed_numbers,
     plain_cells,
+    require_unit_of_time,
+    texts_to_times,
     unit_of_cells,
 )
 from probewise.recordings.io import read_text
-from probewise.recordings.times import looks_like_time, require_unit_of_time, texts_to_times
 
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
@@ -165,14 +167,12 @@ class _Layout:
         return (*row, *[""] * n)[:n]
 
     def error_of_row(self, path: Path, row: Sequence[str], number: int) -> FileError:
-        """Return the error of a row that has not as many cells as the header."""
         commas = self.mark == "," and len(row) > len(self.header) and all(_is_value(cell.strip()) for cell in row)
         cure = "; a decimal comma cannot be told from one between cells: write 1.5, or separate cells by semicolons"
         found = f"the row has {len(row)} cells; row {self.at + 1} is taken for the header: {_in_words(self.header)}"
         return FileError(path, found, f"{len(self.header)} cells as in the header{cure * commas}", row=number)
 
     def is_comment(self, row: Sequence[str]) -> bool:
-        """Return whether a row that has not as many cells as the header is a comment."""
         return 0 in self.numeric and row[0].lstrip().startswith("#")
 
     def is_below_table(self, row: Sequence[str]) -> bool:
@@ -183,7 +183,6 @@ class _Layout:
         return len(row) not in (len(self.header), self.width) or _SUMMARY.match(first) is not None
 
     def notes(self) -> list[str]:
-        """Say how the file is laid out, where it is not plain CSV."""
         separators = {";": "semicolons", "\t": "tabs", ",": "commas"}
         separator = "blanks" if self.blanks else separators.get(self.mark, repr(self.mark))
         out = [f"cells separated by {separator}"] * (self.mark != "," or self.declared)
@@ -192,7 +191,6 @@ class _Layout:
 
 
 def _separated(text: str, blanks: str) -> str:
-    """Return a text with a tab where some of these blanks separate its cells."""
     return re.sub(blanks, "\t", re.sub(r"(?m)^[ \t]+|[ \t]+$", "", text)) if blanks else text
 
 

@@ -84,31 +84,28 @@ def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
     """Trace the closed edge of each hypothesis, for drawing, rasterising and culling.
 
     `region`: ellipses, polygons, a mixture of these, or any kind that registers its outline (`outlines.register`);
-    `n_vertices`: number of vertices of a curved edge. Returns one array (n, 2) per hypothesis, mm, the first vertex
-    repeated at the end; pieces of a polygon that crosses itself are separated by NaN. Raises ParameterError if the
-    region has no closed edge.
+    `n_vertices`: of a curved edge. Returns one array (n, 2) per hypothesis, mm, the first vertex repeated at the end;
+    pieces of a polygon that crosses itself are separated by NaN. ParameterError if the region has no closed edge.
     """
     raise ParameterError("region", type(region).__name__, "EllipseRegion, PolygonRegion or a mixture of them")
 
 
 @singledispatch
 def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Return the distance of places from the nearest edge of a region, mm.
+    """Return the distance of places from the nearest edge of a region, mm; infinite for kinds without edges.
 
-    `region`: A region of n_regions hypotheses; the distance is infinite for kinds without edges (uniform, ramp, image);
-    `x_mm`, `y_mm`: places, (n_samples or 1, n_points). Returns distances, (n_samples or n_regions or 1, n_points):
-    exact, but to first order in the distance for an ellipse that is no disc.
+    `x_mm`, `y_mm`: places, (n_samples or 1, n_points). Returns (n_samples or n_regions or 1, n_points): exact, but to
+    first order in the distance for an ellipse that is no disc.
     """
     return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
 
 
 def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
-    """Return the share of each square pixel on the positive side of a straight edge.
+    """Return the share, 0 to 1, of each square pixel of side `pixel_mm` on the positive side of a straight edge.
 
-    Returns share, 0 to 1: the cumulative of the square's projection on the normal, a trapezium.
-
-    `distance_mm`: signed distance of the pixel's centre from the edge, positive inside; `angle_rad`: angle between the
-    edge's normal and a side of the square; broadcasts with the distance; `pixel_mm`: side of the square.
+    It is the cumulative of the square's projection on the normal, a trapezium. `distance_mm`: signed distance of the
+    pixel's centre from the edge, positive inside; `angle_rad`, which broadcasts with it: angle between the edge's
+    normal and a side of the square.
     """
     cosine, sine = np.abs(np.cos(angle_rad)), np.abs(np.sin(angle_rad))
     wide = 0.5 * pixel_mm * np.maximum(cosine, sine)
@@ -127,15 +124,11 @@ def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixe
 def share_inside_polygon(
     edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray
 ) -> FloatArray:
-    """Return the share of each square inside a polygon, exactly.
+    """Return the share of each square inside a polygon, exactly, (n_regions, n_points).
 
-    Green's theorem on the polygon clipped to the square: the sum over directed edges (inside
-    on their left) of the area between the edge, clamped to the square, and its lower side.
-
-    Returns share, shape (n_regions, n_points).
-
-    `edges_mm`: directed edges, shape (n_regions, n_edges, 2 ends, 2); `centers_mm`: centres of the pixels, shape
-    (n_points, 2); `pixel_mm`: side of the square; `turn_rad`: angle by which each square is turned, shape (n_points,).
+    Green's theorem on the polygon clipped to the square: the sum over directed edges, the inside on their left, of the
+    area between the edge, clamped to the square, and its lower side. `edges_mm`: (n_regions, n_edges, 2 ends, 2);
+    `centers_mm`: of the pixels, (n_points, 2), of side `pixel_mm` and turned by `turn_rad`, (n_points,).
     """
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
     total = np.zeros((len(edges_mm), len(centers_mm)))
@@ -318,18 +311,17 @@ def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
 
 @outlines.register
 def _outlines_of_polygon(region: PolygonRegion, *, n_vertices: int = 96) -> list[FloatArray]:
-    return [_outline_of_edges(edges) for edges in region.edges_mm]
-
-
-def _outline_of_edges(edges: FloatArray) -> FloatArray:
-    if np.array_equal(edges[1, 1], edges[0, 0]):  # given clockwise: each edge was turned round in its place
-        edges = edges[::-1]
-    points = [edges[0, 0]]
-    for start, end in edges:
-        if not np.array_equal(points[-1], start):
-            points += [np.full(2, np.nan), start]
-        points.append(end)
-    return np.array(points)
+    traces = []
+    for edges in region.edges_mm:
+        if np.array_equal(edges[1, 1], edges[0, 0]):  # given clockwise: each edge was turned round in its place
+            edges = edges[::-1]
+        points = [edges[0, 0]]
+        for start, end in edges:
+            if not np.array_equal(points[-1], start):
+                points += [np.full(2, np.nan), start]
+            points.append(end)
+        traces.append(np.array(points))
+    return traces
 
 
 @edge_distance.register
@@ -577,10 +569,8 @@ class ImageRegion:
 
     @cached_property
     def _summed_area_table(self) -> FloatArray:
-        """Summed-area table: sums of the pixels to the lower left of each corner, (n_rows + 1, n_columns + 1)."""
-        padded = np.zeros((self.values.shape[0] + 1, self.values.shape[1] + 1))
-        padded[1:, 1:] = self.values[::-1].cumsum(axis=0).cumsum(axis=1)
-        return padded
+        """Sums of the pixels to the lower left of each corner, (n_rows + 1, n_columns + 1)."""
+        return np.pad(self.values[::-1].cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
     def _albedo_integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Return the integral of the albedo to the lower left of each point (x, y), in mm^2."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_number, require_kind
-from probewise.errors import ParameterError, require
+from probewise.errors import require
 from probewise.priors import Prior, Product
 from probewise.recordings.columns import require_patterns
 from probewise.recordings.patterns import Pattern
@@ -111,15 +111,13 @@ class Card:
     def __post_init__(self) -> None:
         for name in ("x_mm", "y_mm", "width_mm", "height_mm", "albedo"):
             checked_number(name, getattr(self, name))
-        if not (math.isfinite(self.x_mm) and math.isfinite(self.y_mm)):
-            raise ParameterError("(x_mm, y_mm) of a card", (self.x_mm, self.y_mm), "finite: its centre")
+        place = self.x_mm, self.y_mm
+        require(all(map(math.isfinite, place)), "(x_mm, y_mm) of a card", place, "finite: its centre")
         for name in ("width_mm", "height_mm"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ParameterError(f"{name} of a card", getattr(self, name), "finite, greater than 0")
-        if not 0 <= self.albedo <= 1:
-            raise ParameterError(
-                "albedo of a card", self.albedo, "0 to 1: 0 is as dark as the field, 1 as white as the shape"
-            )
+            side = getattr(self, name)
+            require(0 < side < math.inf, f"{name} of a card", side, "finite, greater than 0")
+        allowed = "0 to 1: 0 is as dark as the field, 1 as white as the shape"
+        require(0 <= self.albedo <= 1, "albedo of a card", self.albedo, allowed)
 
     @property
     def corners_mm(self) -> FloatArray:

@@ -21,8 +21,8 @@ from probewise.effects.noise_distribution import PredictiveMixture, RecordedBefo
 from probewise.errors import DoubtfulResultWarning, ParameterError, require
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
+from probewise.recordings.files import prediction_summary
 from probewise.recordings.plan import Plan
-from probewise.recordings.prediction import prediction_summary
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system

@@ -21,11 +21,10 @@ from probewise._display import data_frame
 from probewise._kinds import checked_path, require_kind
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
-from probewise.recordings.cells import first_cell_without_number, parsed_numbers
+from probewise.recordings.cells import first_cell_without_number, parsed_numbers, times_to_numbers
 from probewise.recordings.columns import text_of_name
 from probewise.recordings.plan import masks_of_readings_at_ends
 from probewise.recordings.table import csv_text, number_text, read_table
-from probewise.recordings.times import times_to_numbers
 
 _ONE_RUN = "all"
 _OF_COLUMN = "column:"

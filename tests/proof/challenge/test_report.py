@@ -6,7 +6,6 @@ import pytest
 
 from probewise.cli import main
 from probewise.proof import pages as report
-from probewise.proof import plots
 from probewise.proof.challenge import Task
 from probewise.proof.tables import confusion_counts, reliability_bins, score
 from probewise.report.html import draw_or_raise
@@ -35,7 +34,7 @@ def test_the_page_stands_alone_and_tells_of_failures(results):
 
 @pytest.mark.slow
 def test_the_diagram_says_of_how_many(results):
-    ax = plots.reliability_diagram(reliability_bins(results[:-1]))
+    ax = report.reliability_diagram(reliability_bins(results[:-1]))
     assert [t.get_text() for t in ax.texts] == ["1", "4"]
 
 
@@ -55,6 +54,6 @@ def test_the_verb_scores_what_its_file_holds(results, tmp_path, capsys):
 
 def test_the_matrix_writes_every_count(results):
     truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
-    ax = plots.confusion_matrix(truths, said, counts)
+    ax = report.confusion_matrix(truths, said, counts)
     assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
     assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)

@@ -88,8 +88,8 @@ def test_the_calibration_error_of_hand_made_bins(make):
     results = [make.case(p=0.8), make.case(p=0.8, said=["lag"]), make.case(p=0.95), make.case(p=0.95)]
     assert calibration_error(results).value == pytest.approx(0.175)
     bins = reliability_bins(results)
-    assert [(round(b.stated, 3), b.right.value, b.right.n) for b in bins] == [(0.8, 0.5, 2), (0.95, 1.0, 2)]
-    assert reliability_bins([]) == ()
+    assert [(round(stated, 3), right.value, right.n) for stated, right in bins] == [(0.8, 0.5, 2), (0.95, 1.0, 2)]
+    assert reliability_bins([]) == []
 
 
 def test_the_place_counts_where_there_is_one(make):

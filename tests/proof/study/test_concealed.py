@@ -6,9 +6,8 @@ import pytest
 from probewise.arm import Pose
 from probewise.experiment import CLEAN
 from probewise.experiment.rivals import rivals_of
-from probewise.proof.concealed_study import CONCEALED, ConcealedTrial, _arm_in_concealed_world, concealed_forms
-from probewise.proof.configurations import FIELD, REFERENCE
-from probewise.proof.trial import BRIGHT, DARK, experiment_of, footprint_pixels
+from probewise.proof.concealed_study import CONCEALED, ConcealedTrial, _arm_in_concealed_world, concealed_rows
+from probewise.proof.study import BRIGHT, DARK, FIELD, REFERENCE, experiment_of, footprint_pixels
 from probewise.recordings import Disc, Plan
 from probewise.world import World
 
@@ -63,7 +62,7 @@ def test_forms_are_summed_up_by_form():
         ConcealedTrial(name, 1, 0, 0.9): {**run, "credible": ["backlash"]}
         for name in ("", "backlash", "play_of_axes", "halo", "ghost", "bent_rail")
     }
-    forms = {row.concealed: row for row in concealed_forms(results)}
+    forms = {row.concealed: row for row in concealed_rows(results, by_form=True)}
     assert {name: (row.runs, row.in_credible_set.n) for name, row in forms.items()} == {
         "in the list": (3, 3),
         "another form": (1, 1),

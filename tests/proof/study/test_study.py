@@ -3,13 +3,20 @@
 import pytest
 
 from probewise.errors import ParameterError
-from probewise.proof.configurations import REFERENCE, SearchConfiguration, paper_comparison_rows
+from probewise.proof.study import (
+    REFERENCE,
+    SearchConfiguration,
+    Trial,
+    experiment_of_trial,
+    paper_comparison_rows,
+    run_trial,
+    summaries,
+    trials_by_row,
+)
 from probewise.proof.study import study as campaign_of
-from probewise.proof.study import summaries, trials_by_row
-from probewise.proof.trial import Trial, experiment_of_trial, run_trial
 
-ROWS = [REFERENCE, SearchConfiguration(model="naive")]
-BRIEF = {"n_circles": 2, "max_readings": 3}
+ROWS = {REFERENCE: 2, SearchConfiguration(model="naive"): 2}
+BRIEF = {"max_readings": 3}
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,8 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.proof.configurations import SearchConfiguration
 from probewise.proof.estimates import estimated_share
-from probewise.proof.study import summarise
+from probewise.proof.study import SearchConfiguration, summarise
 
 from ..conftest import search
 

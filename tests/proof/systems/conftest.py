@@ -24,9 +24,9 @@ def rates(s, p, u):
         name="by hand",
         text=text,
         shared={"k": (k, k)},
-        design=lambda rng, n, regime: (T, {}),
-        decimals={},
-        drives=("u",),
+        gap=0.0,
+        design=lambda rng, t, regime: {},
+        decimals={"u": 0},
         sd=0.01,
     )
     u = np.zeros(len(T)) if u is None else np.asarray(u, dtype=float)

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from probewise.proof.sensors.cases import Stratum
-from probewise.proof.systems.cases import KINDS, SystemCase, draw_system, simulator_file_text, write_system_case
+from probewise.proof.systems.cases import (
+    KINDS,
+    SystemCase,
+    draw_system,
+    noise_of_size,
+    simulator_file_text,
+    write_system_case,
+)
 from probewise.proof.systems.forms import forms_of
 from probewise.proof.systems.kinds import FLOW
-from probewise.proof.systems.noise import noise_of_size
 from probewise.systems import System, read_run_table, read_simulator
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.proof.systems.cases import KINDS, draw_system
-from probewise.proof.systems.noise import OTHER_NOISE, noise_of_size
+from probewise.proof.systems.cases import KINDS, OTHER_NOISE, draw_system, noise_of_size
 
 DRAWN = draw_system(KINDS[3], rng=np.random.default_rng(4))
 CLEAN = DRAWN.true_system.readings

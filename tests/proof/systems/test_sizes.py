@@ -15,12 +15,12 @@ from probewise.proof.systems.cases import (
     draw_effect_of_size,
     draw_system,
     draw_system_case,
+    noise_of_size,
     simulator_file_text,
     system_stratum_of,
     table_text,
 )
 from probewise.proof.systems.forms import SystemEffect, forms_of
-from probewise.proof.systems.noise import noise_of_size
 
 BY_NAME = {kind.name: kind for kind in KINDS}
 

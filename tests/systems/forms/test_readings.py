@@ -69,6 +69,15 @@ def test_no_lag_and_no_delay_change_nothing_also_where_rows_share_a_time(smooth)
     assert np.isfinite(delayed_readings(x, np.array([[0.3, smooth]]), table)).all()
 
 
+@pytest.mark.parametrize("act", [lagged_readings, delayed_readings])
+def test_a_sample_that_diverges_leaves_the_others_as_they_are(act):
+    x = np.stack([_reading(_T), np.where(_T > 5, np.inf, _reading(_T))])
+    with np.errstate(invalid="ignore"):
+        found = act(x, np.full((2, 2), [0.3, 1.0]), _rows())
+    np.testing.assert_array_equal(found[0], act(x[:1], np.array([[0.3, 1.0]]), _rows())[0])
+    assert not np.isfinite(found[1]).all()
+
+
 def _cups(every_min, tau_min, delay_min=0.0):
     """Two cups that are stirred in a bath that swings, read every so many minutes by a thermometer."""
     t = np.arange(0.0, 60.0, every_min)

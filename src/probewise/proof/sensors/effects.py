@@ -58,22 +58,18 @@ class CleanSetup:
         return world.simulate(self.plan, rng=None, view=view).without_declared_range()
 
     def size(self, *concealed: Concealed) -> float:
-        """Return the joint lambda of effects: norm after the refit / noise sd; for noise `_size_on_noise`."""
-        if len(concealed) == 1 and concealed[0].disturbs:
-            return self._size_on_noise(concealed[0])
-        changed = self.recording_with_effects(*concealed)
-        return self.norm_after_refit(self.clean_recording, changed) / self.world.noise_sd
+        """Return the joint lambda of effects: the norm after the refit over the noise sd.
 
-    def _size_on_noise(self, effect: Concealed) -> float:
-        """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
-
-        lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
-        variance (Kullback-Leibler divergence summed over readings). Lost readings count as an effect on the mean:
-        lambda is the norm of their expected deviations in noise sds.
+        Of one on the noise it is that of an equally detectable effect on the mean: lambda^2 / 2 is the expected gain in
+        log likelihood of the truth over white Gaussian noise of the best constant variance (Kullback-Leibler divergence
+        summed over readings). Lost readings deviate by their distance from the right value.
         """
-        view, own = self._view, effect.parameters
+        if len(concealed) > 1 or not concealed[0].disturbs:
+            changed = self.recording_with_effects(*concealed)
+            return self.norm_after_refit(self.clean_recording, changed) / self.world.noise_sd
+        view, own, name = self._view, concealed[0].parameters, concealed[0].name
         n_points = len(view.seen)
-        match effect.name:
+        match name:
             case "correlated_noise":
                 n_correlated = n_points - int(view.rows.scan_start_mask().sum())
                 return math.sqrt(-n_correlated * math.log(1 - own["rho"] ** 2))
@@ -83,11 +79,9 @@ class CleanSetup:
             case "outliers":
                 return math.sqrt(2 * n_points * _outlier_divergence(**own))
             case "dropouts":
-                # As for the mean: a lost reading deviates by its distance from the right value.
                 squared = float(((own["value"] - self.clean_recording.readings) ** 2).sum())
                 return math.sqrt(own["share"] * squared) / self.world.noise_sd
-            case _:
-                raise ParameterError("effect", effect.name, "a noise effect of the vocabulary")
+        raise ParameterError("effect", name, "a noise effect of the vocabulary")
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
         """Return the cosine between two effects' residuals after the refit, from the sizes of each and of both."""
@@ -118,8 +112,7 @@ class CleanSetup:
                 strength = np.where(along_x, np.abs(self.recording_with_effects(effect).readings - clean), 0.0)
                 there = plan.x_mm[strength >= strength.max() / 2]
                 return CovariateRegion("place", float(there.min()), float(there.max()))
-            case _:
-                return None
+        return None
 
 
 @dataclass(frozen=True)
@@ -149,23 +142,13 @@ Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], Any]
 
 @dataclass(frozen=True)
 class EffectSampler:
-    """A distribution over one kind of effect, up to its amplitude.
+    """A distribution over one kind of effect, up to its amplitude."""
 
-    `covariates`: those along which its residual is visible; `make`: function of the amplitude and the values that
-    `draws` drew, in this order; returns the effect; `first`: first amplitude of the search for a size; `limit`: largest
-    plausible amplitude, or `first` if the search does not choose it.
-    """
-
-    covariates: tuple[str, ...]
-    make: Callable[..., Concealed]
-    first: float
-    limit: float
+    covariates: tuple[str, ...]  # along which its residual is visible
+    make: Callable[..., Concealed]  # from the amplitude and the values that `draws` drew, in this order
+    first: float  # amplitude of the search for a size
+    limit: float  # largest plausible amplitude, or `first` if the search does not choose it
     draws: tuple[Draw, ...] = ()
-
-    @property
-    def scalable(self) -> bool:
-        """Whether the search chooses the amplitude."""
-        return self.limit > self.first
 
     def draw(self, setup: CleanSetup, rng: np.random.Generator) -> Callable[[float], Concealed]:
         """Draw all parameters but the amplitude; return a function from that, greater than 0, to the effect."""
@@ -190,7 +173,6 @@ def _log_uniform(low: float, high: float | Callable[[CleanSetup], float]) -> Dra
 
 
 def _moment(low: float, high: float) -> Draw:
-    """Draw a time between these shares of the recording, s."""
     return lambda setup, rng: float(setup.plan.time_s[0]) + rng.uniform(low, high) * setup.duration_s
 
 
@@ -204,7 +186,6 @@ def _edge_scan(setup: CleanSetup, rng: np.random.Generator) -> str:
 
 
 def _edge_scans(setup: CleanSetup, rng: np.random.Generator) -> tuple[str, ...]:
-    """Draw a scan, or all scans that start at its orientation."""
     scan, plan = _edge_scan(setup, rng), setup.plan
     if rng.random() >= 0.5:
         return (scan,)
@@ -216,8 +197,7 @@ def _duration_s(setup: CleanSetup, *_: np.random.Generator) -> float:
     return setup.duration_s
 
 
-def _nyquist_hz(setup: CleanSetup) -> float:
-    """Return half the median rate of the readings: the highest frequency that they determine."""
+def _nyquist_hz(setup: CleanSetup) -> float:  # half the median rate of the readings
     return 0.5 / float(np.median(np.diff(setup.plan.time_s)))
 
 
@@ -227,7 +207,6 @@ _SPOT = (_uniform(-40, 40), _uniform(-4, 4), _log_uniform(3.0, 10.0))  # x, y an
 
 
 def _signed(kind: Callable[..., Concealed]) -> Callable[..., Concealed]:
-    """Return the maker of an effect whose amplitude has a random sign."""
     return lambda a, sign, *more: kind(sign * a, *more)
 
 
@@ -237,7 +216,6 @@ def _directed(kind: Callable[[float, float], Concealed]) -> Callable[..., Concea
 
 
 def _saturation(a: float, levels: tuple[float, float], softness: float) -> Concealed:
-    """Saturate at a share `a` of the span below white, sharply or rounded over one reading unit."""
     black, white = levels
     return known.saturation(white - a * (white - black), softness)
 
@@ -252,14 +230,6 @@ def _chirp(a: float, phase: float, cycles: float, duration_s: float) -> Conceale
     return strange.chirp(a, first_hz, 7 * first_hz / duration_s, phase)
 
 
-def _levels(setup: CleanSetup, rng: np.random.Generator) -> tuple[float, float]:
-    return setup.world.black, setup.world.white
-
-
-def _phases(setup: CleanSetup, rng: np.random.Generator) -> tuple[float, ...]:
-    return tuple(float(phase) for phase in rng.uniform(0, 2 * math.pi, 12))
-
-
 INSIDE: Mapping[str, EffectSampler] = {
     "ambient_gradient": _effect("place", _directed(known.ambient_gradient), 0.01, 2.0, *_DIRECTION),
     "ambient_step": _effect("time", _signed(known.ambient_step), 0.5, 30.0, _SIGN, _moment(0.15, 0.85)),
@@ -267,7 +237,9 @@ INSIDE: Mapping[str, EffectSampler] = {
     "gain_drift": _effect("time", _signed(known.gain_drift), 0.03, 0.9, _SIGN, _log_uniform(60.0, _duration_s)),
     "battery_sag": _effect("battery_mv", _signed(known.battery_sag), 0.5, 10.0, _SIGN),
     "flicker": _effect("time", known.flicker, 0.3, 20.0, _log_uniform(0.01, _nyquist_hz), _PHASE),
-    "saturation": _effect("level", _saturation, 0.05, 0.9, _levels, _one_of(0.0, 1.0)),
+    "saturation": _effect(
+        "level", _saturation, 0.05, 0.9, lambda setup, rng: (setup.world.black, setup.world.white), _one_of(0.0, 1.0)
+    ),
     "nonlinearity": _effect("level", _signed(lambda a: known.nonlinearity(math.exp(a))), 0.1, 1.5, _SIGN),
     "quantisation": _effect("lattice", known.quantisation, 1.0, 20.0),
     "hysteresis": _effect("direction", _signed(known.hysteresis), 0.3, 20.0, _SIGN),
@@ -318,26 +290,33 @@ PAIRABLE = tuple(name for name in SINGLES[: SINGLES.index("signal_dependent_nois
 """Effects on the mean of the readings, for which a pair has a cosine."""
 
 
-def _ghost(a: float, sign: float, dx_mm: float, dy_mm: float) -> Concealed:
-    return strange.ghost(a, sign * dx_mm, dy_mm)
-
-
-def _mid_level(setup: CleanSetup, rng: np.random.Generator) -> float:
-    return (setup.world.black + setup.world.white) / 2
-
-
 OUTSIDE: Mapping[str, EffectSampler] = {
     "bent_rail": _effect("place", _signed(strange.bent_rail), 0.5, 20.0, _SIGN),
     "twisted_rail": _effect("place", _signed(strange.twisted_rail), 0.5, 20.0, _SIGN),
     "place_step": _effect("place", _signed(strange.place_step), 0.5, 10.0, _SIGN, _uniform(-3, 3)),
     "stick_slip": _effect("place", strange.stick_slip, 0.5, 8.0, _log_uniform(3.0, 8.0), _uniform(0, 1)),
     "slipped_paper": _effect("time", _signed(strange.slipped_paper), 0.5, 10.0, _SIGN, _moment(0.2, 0.8)),
-    "ghost": _effect("edge_distance", _ghost, 0.03, 0.5, _SIGN, _uniform(8, 20), _uniform(-5, 5)),
-    "thermal_gain": _effect("time", strange.thermal_gain, 0.02, 0.5, _duration_s, _phases),
+    "ghost": _effect(
+        "edge_distance",
+        lambda a, sign, dx_mm, dy_mm: strange.ghost(a, sign * dx_mm, dy_mm),
+        *(0.03, 0.5),
+        *(_SIGN, _uniform(8, 20), _uniform(-5, 5)),
+    ),
+    "thermal_gain": _effect(
+        "time",
+        strange.thermal_gain,
+        *(0.02, 0.5),
+        *(_duration_s, lambda setup, rng: tuple(float(phase) for phase in rng.uniform(0, 2 * math.pi, 12))),
+    ),
     "cross_talk": _effect("orientation", strange.cross_talk, 0.03, 0.9, _PHASE),
     "floor": _effect("level", strange.floor, 0.03, 0.6),
     "peak_memory": _effect("level", strange.peak_memory, 0.05, 2.0),
-    "after_glow": _effect("time", strange.after_glow, 1.0, 40.0, _log_uniform(5.0, 20.0), _mid_level),
+    "after_glow": _effect(
+        "time",
+        strange.after_glow,
+        *(1.0, 40.0),
+        *(_log_uniform(5.0, 20.0), lambda setup, rng: (setup.world.black + setup.world.white) / 2),
+    ),
     "chirp": _effect("time", _chirp, 0.3, 20.0, _PHASE, _log_uniform(2.0, 6.0), _duration_s),
 }
 """Samplers of effects outside the vocabulary."""

@@ -1,16 +1,21 @@
-"""Draw a case: a system, its concealed effects, a recording, and held-out runs; write it as a user would provide it."""
+"""Draw a case: a system, its concealed effects, a recording, and held-out runs; write it as a user would provide it.
+
+The kinds of noise, most of them not white, come first; of some, the strength follows from a requested detectability.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.optimize import brentq
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
@@ -28,10 +33,125 @@ from probewise.proof.systems.forms import (
     forms_out_of_vocabulary,
 )
 from probewise.proof.systems.kinds import FORMULAS, LAWS, SystemKind, SystemTable, design_runs, draw_values
-from probewise.proof.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
 from probewise.proof.systems.simulate import simulate_noise_free
 from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text
+
+OTHER_NOISE = (
+    "correlated_noise",
+    "outliers",
+    "signal_dependent_noise",
+    "t4",
+    "random_walk",
+    "quantised",
+    "noise_per_run",
+    "dropouts",
+)
+"""Kinds of noise of a clean recording, besides white; "t4" and "quantised" are not in the vocabulary."""
+
+
+@dataclass(frozen=True, eq=False)
+class SystemNoise:
+    """A noise model of a case."""
+
+    name: str  # "white" or one of OTHER_NOISE
+    # Readings with noise, (n_points,), from noise-free ones, table and a generator.
+    draw: Callable[[FloatArray, SystemTable, np.random.Generator], FloatArray]
+    parameters: Mapping[str, object] = field(default_factory=dict)  # by name, as in the vocabulary
+    size_lambda: float = 0.0  # root of twice the expected gain in log likelihood over white noise; 0: fixed strength
+    step: float | None = None  # to which this noise asks to round readings
+
+
+def noise_of_size(
+    name: str, wanted: float, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
+) -> SystemNoise:
+    """Return the noise `name` at the strength at which it is as detectable as an effect of lambda `wanted`.
+
+    If none suffices, at the largest. "white", "outliers", "dropouts", "t4" and "quantised" have a fixed strength.
+    """
+    n = len(rows)
+
+    def of(in_sds: Callable[..., FloatArray], size_lambda: float = 0.0, **parameters: Any) -> SystemNoise:
+        return SystemNoise(name, lambda y, rows, rng: y + sd * in_sds(y, rows, rng), parameters, size_lambda)
+
+    def white(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
+        return rng.standard_normal(len(y))
+
+    match name:
+        case "white":
+            return of(white)
+        case "correlated_noise":
+            rho = math.sqrt(1 - math.exp(-(wanted**2) / (n - len(rows.rows_by_run))))
+
+            def correlated(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
+                """Draw AR(1) noise of sd 1, which starts afresh in each run."""
+                out = rng.standard_normal(len(rows))
+                for run in rows.rows_by_run:
+                    for before, row in pairwise(run):
+                        out[row] = rho * out[before] + math.sqrt(1 - rho**2) * out[row]
+                return out
+
+            return of(correlated, wanted, rho=rho)
+        case "random_walk":
+            # Eigenvalues of the covariance of n steps of a centred unit-step walk, without that of the mean.
+            count = np.arange(1.0, n + 1)
+            walk = np.minimum(count[:, None], count)
+            centered = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
+            spectrum = np.maximum(np.linalg.eigvalsh(centered)[1:], 0.0)
+            q, size = _strength_and_size(lambda a: 1 + a**2 * spectrum, wanted, 1e-4, 1.0)
+            steps = lambda y, rows, rng: white(y, rows, rng) + q * np.cumsum(white(y, rows, rng))  # noqa: E731
+            return of(steps, size, sd_per_row=q * sd)
+        case "signal_dependent_noise":
+            low, span = float(readings.min()), float(np.ptp(readings))
+
+            def variance(y: FloatArray, ratio: float) -> FloatArray:
+                return 1 + ratio * np.clip((y - low) / span, 0, None)
+
+            ratio, size = _strength_and_size(lambda a: variance(readings, a), wanted, 1e-3, 1e4)
+            return of(lambda y, rows, rng: np.sqrt(variance(y, ratio)) * white(y, rows, rng), size, ratio=ratio)
+        case "noise_per_run":
+            logs = rng.standard_normal(rows.n_runs)
+            power, size = _strength_and_size(lambda a: np.exp(2 * a * logs)[rows.run], wanted, 1e-2, 3.0)
+            each = np.exp(power * logs)
+            return of(lambda y, rows, rng: each[rows.run] * white(y, rows, rng), size, values=(sd * each).tolist())
+        case "outliers":
+            share, wide = 0.03, 7.0
+
+            def outlying(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
+                return white(y, rows, rng) + np.where(rng.random(len(y)) < share, wide * white(y, rows, rng), 0.0)
+
+            return of(outlying, share=share, size=wide)
+        case "dropouts":
+            share, value = 0.02, 0.0
+
+            def lost(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
+                return np.where(rng.random(len(y)) < share, value, y + sd * white(y, rows, rng))
+
+            return SystemNoise(name, lost, {"share": share, "value": value})
+        case "t4":  # its scale is the sd of the normal that matches its centre
+            return of(lambda y, rows, rng: rng.standard_t(4.0, len(y)), freedom=4.0)
+        case _:  # quantised, to that of 1, 2 and 5 times powers of ten which is nearest on a logarithmic scale
+            power = 10.0 ** math.floor(math.log10(2.0 * sd))
+            step = min((m * power for m in (1.0, 2.0, 5.0, 10.0)), key=lambda m: abs(math.log(m / (2.0 * sd))))
+            return replace(of(white, step=step), step=step)
+
+
+def _strength_and_size(
+    variances: Callable[[float], FloatArray], wanted: float, low: float, high: float
+) -> tuple[float, float]:
+    """Return (strength, `wanted`) where noise of the `variances` has lambda `wanted` against noise of their mean.
+
+    That is (`high`, its lambda) if it is less there.
+    """
+
+    def size(strength: float) -> float:
+        each = variances(strength)
+        return math.sqrt(max(len(each) * math.log(each.mean()) - float(np.log(each).sum()), 0.0))
+
+    if (largest := size(high)) <= wanted:
+        return high, largest
+    return float(np.exp(brentq(lambda a: size(math.exp(a)) - wanted, math.log(low), math.log(high), xtol=1e-4))), wanted
+
 
 SYSTEMS_WHEEL: tuple[Stratum, ...] = (
     *[Stratum("clean")] * 6,
@@ -67,8 +187,8 @@ _RUN_AWAY = 1e3  # times the largest reading: larger ones count as divergence
 class DrawnSystem:
     """A system with true parameters, without effects.
 
-    `kind`, `table`: the system, and the table of all its rows, including those of the two held-out runs; `shared`,
-    `by_run`: true parameters by name; those per run as arrays over all runs of `table`, held-out runs last.
+    `table` has all rows, those of the two held-out runs included. True parameters are by name, those of `by_run` as
+    arrays over all runs of the table, held-out runs last.
     """
 
     kind: SystemKind
@@ -94,29 +214,27 @@ class DrawnSystem:
     @cached_property
     def true_system(self) -> SimulatedSystem:
         """The system at its true parameters with readings and states, over the rows that are not held out."""
-        return simulate_noise_free(self.kind, self.diagnosed_table, self._parameters(self.diagnosed_table))
-
-    def _parameters(self, table: SystemTable) -> dict[str, Any]:
-        per_run = {name: values[table.run] for name, values in self.by_run.items()}
-        return {name: per_run[name] if name in per_run else self.shared[name] for name in self.kind.parameters}
+        return self._simulate(self.diagnosed_table, ())
 
     def simulate_all_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at all rows of `table`, (n_points,); not finite if diverged."""
-        return self._simulate(self.table, effects)
+        with np.errstate(all="ignore"):
+            return self._simulate(self.table, effects).readings
 
     def simulate_diagnosed_rows(self, effects: Sequence[SystemEffect]) -> FloatArray:
         """Return noise-free readings with these effects at the rows that are not held out, (n_points,).
 
         Raises NotConvergedError if a reading is not finite.
         """
-        readings = self._simulate(self.diagnosed_table, effects)
+        with np.errstate(all="ignore"):
+            readings = self._simulate(self.diagnosed_table, effects).readings
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
 
-    def _simulate(self, table: SystemTable, effects: Sequence[SystemEffect]) -> FloatArray:
-        with np.errstate(all="ignore"):
-            return simulate_noise_free(self.kind, table, self._parameters(table), effects).readings
+    def _simulate(self, table: SystemTable, effects: Sequence[SystemEffect]) -> SimulatedSystem:
+        own = {**self.shared, **{name: values[table.run] for name, values in self.by_run.items()}}
+        return simulate_noise_free(self.kind, table, {name: own[name] for name in self.kind.parameters}, effects)
 
 
 AfterRefit: TypeAlias = Callable[[DrawnSystem, FloatArray], FloatArray]
@@ -125,22 +243,17 @@ AfterRefit: TypeAlias = Callable[[DrawnSystem, FloatArray], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class SystemCase:
-    """One case of a challenge on systems.
-
-    `effects`: the concealed ones; `noise_text`: the line on noise in the simulator file; may be empty; `labels`: names
-    of the runs, as in the table; `noise_free`, `readings`: readings with the effects, without and with noise, at all
-    rows, (n_points,); `cosine`: of a pair after the refit; None: no pair.
-    """
+    """One case of a challenge on systems."""
 
     stratum: Stratum
     drawn: DrawnSystem
-    effects: tuple[SystemEffect, ...]
+    effects: tuple[SystemEffect, ...]  # concealed
     noise: SystemNoise
-    noise_text: str
-    labels: tuple[str, ...]
-    noise_free: FloatArray
-    readings: FloatArray
-    cosine: float | None = None
+    noise_text: str  # the line on noise in the simulator file; may be empty
+    labels: tuple[str, ...]  # names of the runs, as in the table
+    noise_free: FloatArray  # readings with the effects at all rows, (n_points,)
+    readings: FloatArray  # with noise
+    cosine: float | None = None  # of a pair after the refit
 
 
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
@@ -206,21 +319,18 @@ def _draw_effects(
     """Draw the effects of a stratum once; return them and the cosine of a pair (None: no pair)."""
     if stratum.kind == "clean":
         return (), None
-    forms = forms_of(drawn.true_system)
-    families = [family]
+    forms, name_of, families = forms_of(drawn.true_system), family_of, [family]
     if stratum.kind == "outside":
         families = [OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]]
-        strange = forms_out_of_vocabulary(drawn.true_system, rng)
-        own = [[f for f in strange if f.name.removeprefix("strange_").split(":")[0] == families[0]]]
-    else:
-        if stratum.kind == "pair":
-            families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
-        own = [[f for f in forms if family_of(f) == name] for name in families]
+        forms = list(forms_out_of_vocabulary(drawn.true_system, rng))
+        name_of = lambda form: form.name.removeprefix("strange_").split(":")[0]  # noqa: E731
+    elif stratum.kind == "pair":
+        families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
     chosen = []
-    for of, name in zip(own, families, strict=True):
-        if not of:
-            raise NotConvergedError(f"this system has no target for {name}")
-        chosen.append(of[int(rng.integers(len(of)))])
+    for family in families:
+        if not (own := [form for form in forms if name_of(form) == family]):
+            raise NotConvergedError(f"this system has no target for {family}")
+        chosen.append(own[int(rng.integers(len(own)))])
     effects = tuple(draw_effect_of_size(form, stratum.size, drawn, after_refit, rng) for form in chosen)
     left = [after_refit(drawn, drawn.simulate_diagnosed_rows([e])) for e in effects]
     cosine = None
@@ -255,14 +365,9 @@ def draw_effect_of_size(
     seen = size_at(form.first)
     if not seen > _SHOWS * whole:
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
+    first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
     amplitude = amplitude_of_size(
-        size_at,
-        wanted,
-        first=min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit),
-        limit=form.limit,
-        tolerance=_TOLERANCE,
-        acceptable=0.01,
-        max_calls=14,
+        size_at, wanted, first=first, limit=form.limit, tolerance=_TOLERANCE, acceptable=0.01, max_calls=14
     )
     return SystemEffect(form, form.of_amplitude(sign * amplitude, more), size_at(amplitude))
 
@@ -277,7 +382,7 @@ def _residual_covariates(form: Form, residuals: FloatArray, true: SimulatedSyste
 
     `residuals`: those of the effect after the refit, (n_points,).
     """
-    rows, change = true.table, np.zeros(len(true.table))
+    rows, change, n_points = true.table, np.zeros(len(true.table)), len(true.table)
     for own in rows.rows_by_run:
         change[own[1:]] = np.diff(true.readings[own])
     pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
@@ -285,38 +390,30 @@ def _residual_covariates(form: Form, residuals: FloatArray, true: SimulatedSyste
     pooled |= {f"state:{name}": values for name, values in true.states.items()}
     if rows.time is not None:
         pooled["time"] = rows.t
-    shares = {name: _excess_share_explained(residuals, _bin_numbers(values)) for name, values in pooled.items()}
+    groups = {}
+    for name, values in pooled.items():
+        edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+        groups[name] = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
     if len(rows.rows_by_run) > 1:
-        shares["run"] = _excess_share_explained(residuals, rows.run)
+        groups["run"] = rows.run
+    shares = {}
+    for name, group in groups.items():  # of the sum of squares, by the groups' means, minus what white noise gives
+        n, of_group = np.bincount(group), np.bincount(group, residuals)
+        explained = float(np.sum(of_group[n > 0] ** 2 / n[n > 0]))
+        shares[name] = explained / float(residuals @ residuals) - np.count_nonzero(n) / n_points
     best = max(shares.values())
     plain = [name for name, share in shares.items() if share >= _AS_PLAIN * best and share > _PLAIN]
     return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
-
-
-def _bin_numbers(values: FloatArray) -> IntArray:
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
-
-
-def _excess_share_explained(residuals: FloatArray, groups: IntArray) -> float:
-    """Return the share of the sum of squares that group means explain, minus its expectation for white noise."""
-    n, of_group = np.bincount(groups), np.bincount(groups, residuals)
-    explained = float(np.sum(of_group[n > 0] ** 2 / n[n > 0]))
-    return explained / float(residuals @ residuals) - np.count_nonzero(n) / len(residuals)
 
 
 def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path]:
     """Write simulator.py, table.csv and table_test.csv into a directory; return the paths in this order."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    texts = {
-        "simulator.py": simulator_file_text(case),
-        "table.csv": table_text(case, case.drawn.diagnosed_row_numbers),
-        "table_test.csv": table_text(case, case.drawn.held_out_row_numbers),
-    }
-    for name, text in texts.items():
-        write_text_atomically(directory / name, text)
-    simulator, table, test = (directory / name for name in texts)
+    simulator, table, test = (directory / name for name in ("simulator.py", "table.csv", "table_test.csv"))
+    write_text_atomically(simulator, simulator_file_text(case))
+    write_text_atomically(table, table_text(case, case.drawn.diagnosed_row_numbers))
+    write_text_atomically(test, table_text(case, case.drawn.held_out_row_numbers))
     return simulator, table, test
 
 
@@ -328,11 +425,11 @@ def simulator_file_text(case: SystemCase) -> str:
 def table_text(case: SystemCase, rows: IntArray) -> str:
     """Return the rows with these indices, readings last, as CSV text with a header."""
     kind, laid = case.drawn.kind, case.drawn.table
-    columns: dict[str, list[str]] = {}
+    columns: dict[str, Sequence[str]] = {}
     if kind.run is not None:
         columns[kind.run] = [case.labels[k] for k in laid.run[rows]]
-    names = [n for n in (kind.time, *kind.drives) if n is not None]
     values = {**laid.columns, kind.reading: case.readings}
-    for name in (*names, *(n for n in laid.columns if n not in names), kind.reading):
+    first = [name for name in (kind.time, *kind.drives) if name is not None]
+    for name in dict.fromkeys((*first, *values)):
         columns[name] = [f"{value:.{kind.column_decimals[name]}f}" for value in values[name][rows].tolist()]
-    return csv_text(dict(columns))
+    return csv_text(columns)

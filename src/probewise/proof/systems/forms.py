@@ -45,39 +45,29 @@ class Instants:
 class Form:
     """The formula of an effect, in the vocabulary or outside, bound to a target.
 
-    It is called `name` or `name:target`, and changes a `side`: `act`, of an input, is a function of columns, rows and
-    parameters that returns columns; of a parameter, of now and parameters, that returns a term to add; of the rate of a
-    state, of states, now and parameters, that returns a term to add; of the reading, of readings, rows and parameters,
-    that returns readings. `first` and `limit` are the first amplitude tried and the largest, `covariates` those along
-    which its residual is visible. `draw` draws all parameters except the amplitude and its sign (negative ones too if
-    `signed`), and `of_amplitude` returns all by name. `target` is the parameter or state on which it acts; forms of
-    readings act in ascending `order`; `uses` are the columns that it uses; `breaks` is a function of the parameters
-    that returns the time of a discontinuity; `late` is the column that it delays. `sticks` and `stops`: it is dry
-    friction, or an upper bound, of the target; `outside`: of the vocabulary of a diagnosis.
+    It changes a `side` by `act`: of an input, a function of columns, rows and parameters that returns columns; of a
+    parameter, of now and parameters, that returns a term to add; of the rate of a state, of states, now and parameters,
+    that returns a term to add; of the reading, of readings, rows and parameters, that returns readings.
     """
 
-    name: str
+    name: str  # or name:target
     side: Side
     act: Callable[..., Any]
-    first: float
-    limit: float
-    covariates: tuple[str, ...]
+    first: float  # amplitude that is tried first
+    limit: float  # largest amplitude
+    covariates: tuple[str, ...]  # along which its residual is visible
+    # All parameters by name, from the amplitude and the others; `draw` draws these.
     of_amplitude: Callable[[float, dict[str, float]], dict[str, float]] = lambda a, drawn: {"a": a, **drawn}
     draw: Callable[[np.random.Generator], dict[str, float]] = lambda rng: {}
-    signed: bool = True
-    target: str = ""
-    order: int = 0
-    uses: tuple[str, ...] = ()
-    breaks: Callable[[Numbers], float] | None = None
-    late: str = ""
-    sticks: bool = False
-    stops: bool = False
-    outside: bool = False
-
-    @property
-    def vocabulary_name(self) -> str:
-        """Name in the vocabulary: that of "saturation (floor)" is "saturation"."""
-        return self.name.removesuffix(" (floor)")
+    signed: bool = True  # whether the amplitude may be negative
+    target: str = ""  # the parameter or state on which it acts
+    order: int = 0  # forms of readings act in ascending order
+    uses: tuple[str, ...] = ()  # columns that it uses
+    breaks: Callable[[Numbers], float] | None = None  # time of a discontinuity, from the parameters
+    late: str = ""  # the column that it delays
+    sticks: bool = False  # it is dry friction of the target
+    stops: bool = False  # it is an upper bound of the target
+    outside: bool = False  # of the vocabulary of a diagnosis
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +81,8 @@ class SystemEffect:
 
     @property
     def name(self) -> str:
-        """The effect's name, with its target."""
-        return self.form.vocabulary_name
+        """The effect's name in the vocabulary, with its target: "saturation (floor)" is a saturation."""
+        return self.form.name.removesuffix(" (floor)")
 
     @property
     def in_vocabulary(self) -> bool:
@@ -162,11 +152,9 @@ def _modulations(true: SimulatedSystem) -> dict[str, Form]:
     """
     rows, timed = true.table, true.table.time is not None
     at, time = ("at_s", ("time", str(rows.time))) if timed else ("at_row", ("row",))
-    names = [f"values[{k}]" for k in range(rows.n_runs)]
-    longest = float(rows.time_since_start.max())
+    names, longest = [f"values[{k}]" for k in range(rows.n_runs)], float(rows.time_since_start.max())
 
-    def change_point(rng: np.random.Generator) -> dict[str, float]:
-        """Draw a time, or a row plus 0.5, from the middle 60 % of the rows."""
+    def change_point(rng: np.random.Generator) -> dict[str, float]:  # from the middle 60 % of the rows
         found = float(np.quantile(rows.t, rng.uniform(0.2, 0.8)))
         return {at: found if timed else math.floor(found) + 0.5}
 
@@ -174,13 +162,8 @@ def _modulations(true: SimulatedSystem) -> dict[str, Form]:
         hz = draw_log_uniform(rng, 1.5 / rows.duration, 0.25 / rows.median_gap)
         return {"hz": hz, "phase": float(rng.uniform(0, 2 * np.pi))}
 
-    step = _modulation(
-        lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at]),
-        *time,
-        draw=change_point,
-        breaks=(lambda v: v[at]) if timed else None,
-    )
-    out = {"step": step}
+    step = lambda now, v: v["a"] * ((now.t if timed else now.row) > v[at])
+    out = {"step": _modulation(step, *time, draw=change_point, breaks=(lambda v: v[at]) if timed else None)}
     if timed:
         out["drift"] = _modulation(lambda now, v: v["a"] * now.t, *time, reach=float(np.abs(rows.t).max()))
     if true.kind.run is not None and len(rows.rows_by_run) > 1:
@@ -191,19 +174,16 @@ def _modulations(true: SimulatedSystem) -> dict[str, Form]:
             draw=lambda rng: dict(zip(names, rng.standard_normal(len(names)).tolist(), strict=True)),
         )
     if timed:
-        sine = lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"])  # noqa: E731
+        sine = lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"])
         out["wave"] = _modulation(sine, *time, draw=wave, signed=False)
     if timed and true.kind.run is not None:  # a table that does not name its runs cannot show that it settles in each
-        out["settling"] = _modulation(
-            lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"]),
-            *("time", "run", str(rows.time)),
-            draw=lambda rng: {"tau_s": draw_log_uniform(rng, 3 * rows.median_gap, 0.4 * longest)},
-        )
+        tau = lambda rng: {"tau_s": draw_log_uniform(rng, 3 * rows.median_gap, 0.4 * longest)}
+        fading = lambda now, v: v["a"] * np.exp(-now.since / v["tau_s"])
+        out["settling"] = _modulation(fading, "time", "run", str(rows.time), draw=tau)
     return out
 
 
 def _proportional_to_column(true: SimulatedSystem, column: str) -> Form:
-    """Return the modulation a (column - its mean over the recording)."""
     middle, sd = true.deviation(column)
     return _modulation(lambda now, v: v["a"] * (now.u[column] - middle), column, reach=sd, uses=(column,))
 
@@ -226,8 +206,8 @@ ADDED_FAMILIES = "curve", "friction of a column"
 
 def family_of(form: Form) -> str:
     """Return the family of a form."""
-    of_column = form.side == "reading" and form.name.startswith("friction:")
-    return ADDED_FAMILIES[1] if of_column else form.vocabulary_name.split(":")[0]
+    name = form.name.split(":")[0]
+    return ADDED_FAMILIES[1] if (name, form.side) == ("friction", "reading") else name.removesuffix(" (floor)")
 
 
 def forms_of(true: SimulatedSystem) -> list[Form]:
@@ -241,43 +221,35 @@ def forms_of(true: SimulatedSystem) -> list[Form]:
     if time is not None and (true.kind.law is not None or true.kind.restarts_time):
         out.append(_input_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, "time", time))
     out += _forms_of_parameters(true, modulations)
-    for state in true.states if true.kind.defines_states else ():
+    for state in true.states if true.kind.stated_law is None else ():
         out += _forms_of_rate(true, state, modulations["wave"])
     return out
 
 
 def _is(number: str) -> dict[str, Any]:
-    """Return the fields of a form of one parameter, the `number`, which is the amplitude."""
     return {"of_amplitude": lambda a, drawn: {number: a}, "signed": False}
 
 
 def _bounded_by(end: float, inwards: float) -> dict[str, Any]:
-    """Return the fields of a form with a "level", which the amplitude moves inwards from an end of the range."""
     return {"of_amplitude": lambda a, drawn: {"level": end + inwards * a}, "signed": False}
 
 
 def _added_form(
     true: SimulatedSystem, name: str, addition: Callable[..., Any], *covariates: str, order: int = OFFSET, **more: Any
 ) -> Form:
-    """Return the form that adds `a` times `addition` (readings, rows, parameters) to the reading."""
-    sd = true.kind.sd
-
-    def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        return np.asarray(y + v["a"] * addition(y, rows, v))
-
+    sd, act = true.kind.sd, lambda y, rows, v: np.asarray(y + v["a"] * addition(y, rows, v))
     return Form(name, "reading", act, sd, _MANY * sd, covariates, order=order, **more)
 
 
 def _forms_of_readings(true: SimulatedSystem, modulations: Mapping[str, Form]) -> Iterator[Form]:
-    """Yield what is added to the reading, or multiplies it, over rows, runs and columns."""
     sd, typical = true.kind.sd, float(np.sqrt(np.mean(true.readings**2)))
 
     def added(name: str, how: Form) -> Form:
-        act = lambda y, rows, v: np.asarray(y + how.act(Instants.at_rows(rows), v))  # noqa: E731
+        act = lambda y, rows, v: np.asarray(y + how.act(Instants.at_rows(rows), v))
         return _modulated(how, name, "reading", sd, limit=_MANY, act=act, order=OFFSET)
 
     def multiplied(name: str, how: Form) -> Form:
-        act = lambda y, rows, v: np.asarray(y * (1 + how.act(Instants.at_rows(rows), v)))  # noqa: E731
+        act = lambda y, rows, v: np.asarray(y * (1 + how.act(Instants.at_rows(rows), v)))
         return _modulated(how, name, "reading", sd / typical, limit=_MANY, act=act, order=GAIN)
 
     for kind in ("step", "drift", "per_run"):
@@ -294,9 +266,8 @@ def _forms_of_readings(true: SimulatedSystem, modulations: Mapping[str, Form]) -
 
 def _curve_and_friction_forms(true: SimulatedSystem, column: str) -> Iterator[Form]:
     """Yield a polynomial of an order of two to five in a column, and its friction if it moves both ways."""
-    values, sd = true.table.columns[column], true.kind.sd
+    values, sd, orders = true.table.columns[column], true.kind.sd, range(1, 6)
     middle, half = 0.5 * float(values.max() + values.min()), 0.5 * float(np.ptp(values))
-    orders = range(1, 6)
 
     def curve(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         z = (rows.columns[column] - middle) / half
@@ -307,22 +278,15 @@ def _curve_and_friction_forms(true: SimulatedSystem, column: str) -> Iterator[Fo
         size = np.append(rng.uniform(-1, 1, order - 1), 1.0)  # the highest is the largest
         return {f"a{k}": float(size[k - 1]) if k <= order else 0.0 for k in orders}
 
-    def scaled(a: float, drawn: dict[str, float]) -> dict[str, float]:
-        return {name: a * size for name, size in drawn.items()}
-
     if len(np.unique(values)) > len(orders):
+        scaled = lambda a, drawn: {name: a * size for name, size in drawn.items()}
         name, limit = f"curve:{column}", _MANY * sd
         yield Form(name, "reading", curve, sd, limit, (column,), scaled, coefficients, order=OFFSET)
     speeds = np.sort(np.abs(values[values != 0]))
     if min(len(np.unique(side)) for side in (values[values < 0], values[values > 0])) >= 3:
         low, high = float(speeds[len(speeds) // 20]), 0.3 * float(speeds[-1])
-
-        def pull(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-            return np.tanh(rows.columns[column] / max(v["width"], 1e-12 * half))
-
-        def width(rng: np.random.Generator) -> dict[str, float]:
-            return {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, low, high)}
-
+        pull = lambda y, rows, v: np.tanh(rows.columns[column] / max(v["width"], 1e-12 * half))
+        width = lambda rng: {"width": 0.0 if rng.random() < 0.5 else draw_log_uniform(rng, low, high)}
         yield _added_form(true, f"friction:{column}", pull, column, draw=width)
 
 
@@ -342,8 +306,7 @@ def delayed_values(values: FloatArray, rows: SystemTable, tau: float) -> FloatAr
     """Delay values (n_points,) by `tau` within runs: interpolated, constant before the first row."""
     out = np.empty(values.shape)
     for own in rows.rows_by_run:
-        t = rows.t[own]
-        out[own] = np.interp(t - tau, t, values[own])
+        out[own] = np.interp(rows.t[own] - tau, rows.t[own], values[own])
     return out
 
 
@@ -361,7 +324,6 @@ def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
 
 
 def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
-    """Yield what depends on the reading itself: hysteresis, a bend, a ceiling and a floor, a lag and a delay."""
     low, high, sd = float(true.readings.min()), float(true.readings.max()), true.kind.sd
     span, level = high - low, ("level",)
 
@@ -369,20 +331,14 @@ def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
         z = (y - low) / span
         return np.asarray(y + v["a"] * span * (np.sign(z) * np.abs(z) ** v["power"] - z))
 
-    def power(rng: np.random.Generator) -> dict[str, float]:
-        return {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}
-
-    def ceiling(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        return np.minimum(y, v["level"])
-
-    def floor(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        return np.maximum(y, v["level"])
-
     yield _added_form(
         true, "hysteresis", lambda y, rows, v: direction_of_change(y, rows), "previous", order=_HYSTERESIS
     )
     if span > 0:
+        power = lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))}
         yield Form("nonlinearity", "reading", bend, sd / span, 0.5, level, draw=power, order=_BEND)
+        ceiling = lambda y, rows, v: np.minimum(y, v["level"])
+        floor = lambda y, rows, v: np.maximum(y, v["level"])
         for name, act, *end in (("saturation", ceiling, high, -1.0), ("saturation (floor)", floor, low, 1.0)):
             yield Form(name, "reading", act, 2 * sd, 0.5 * span, level, **_bounded_by(*end), order=_CEILING)
     if true.table.time is not None:
@@ -394,16 +350,11 @@ def _forms_of_levels(true: SimulatedSystem) -> Iterator[Form]:
 def _input_form(
     name: str, column: str, change: Callable[..., Any], first: float, limit: float, *covariates: str, **more: Any
 ) -> Form:
-    """Return the form that replaces a column of the law or formula by `change(column, rows, parameters)`."""
-
-    def act(columns: Mapping[str, FloatArray], rows: SystemTable, v: Numbers) -> dict[str, FloatArray]:
-        return {**columns, column: np.asarray(change(columns[column], rows, v))}
-
+    act = lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
     return Form(name, "input", act, first, limit, covariates, **more)
 
 
 def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
-    """Yield the forms on a column that the law or formula uses."""
     values, (_, spread) = true.table.columns[column], true.deviation(column)
     low, high = float(values.min()), float(values.max())
     span, n_values = high - low, len(np.unique(values))
@@ -414,12 +365,6 @@ def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
         seen = seen or (column, "level")
         return _input_form(f"{name}:{column}", column, change, first, limit, *seen, **more)
 
-    def narrowed(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        return np.asarray(np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0))
-
-    def with_runout(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
-        return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
-
     def wave(rng: np.random.Generator) -> dict[str, float]:
         period = span / draw_log_uniform(rng, 1.5, min(n_values / 6, 25))
         return {"period": period, "phase": float(rng.uniform(0, 2 * np.pi))}
@@ -429,12 +374,14 @@ def _forms_of_input(true: SimulatedSystem, column: str) -> Iterator[Form]:
     ceiling = _bounded_by(high, -1.0)
     yield form("input_saturation", lambda c, rows, v: np.minimum(c, v["level"]), 0.05 * span, 0.6 * span, **ceiling)
     if low <= 0.1 * span:
+        narrowed = lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - v["width"], 0.0)
         yield form("dead_zone", narrowed, 0.01 * span, 0.3 * span, **_is("width"))
     moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield form("backlash", behind_gear_play, 0.01 * span, 0.3 * span, "previous", column, **_is("width"))
     if n_values > 20:
-        yield form("periodic_error", with_runout, 0.01 * spread, 0.2 * span, draw=wave, signed=False)
+        runout = lambda c, rows, v: c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"])
+        yield form("periodic_error", runout, 0.01 * spread, 0.2 * span, draw=wave, signed=False)
     if true.table.time is not None:
         gap = true.table.median_gap
         yield form("input_delay", _late, 0.5 * gap, 6 * gap, "previous", column, **_is("tau_s"), late=column)
@@ -456,7 +403,6 @@ def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray
 
 
 def _forms_of_parameters(true: SimulatedSystem, modulations: Mapping[str, Form]) -> Iterator[Form]:
-    """Yield the forms by which each parameter may vary: in a step, a drift, from run to run, with a column."""
     for name, values in true.parameters.items():
         of_run = name in true.kind.per_run
         if of_run and true.kind.law is not None:
@@ -473,35 +419,35 @@ def _rate_form(
     **more: Any,
 ) -> Form:  # fmt: skip
     """Return the form of a term a push(states, now, parameters) in the rate of a state; `size`: push's magnitude."""
-    first = 0.01 * true.rms_rate(state) / size
-    return Form(
-        name, "rate", lambda s, now, v: v["a"] * push(s, now, v), first, 300 * first, seen, target=state, **more
-    )
+    first, act = 0.01 * true.rms_rate(state) / size, lambda s, now, v: v["a"] * push(s, now, v)
+    return Form(name, "rate", act, first, 300 * first, seen, target=state, **more)
 
 
 def _forms_of_rate(true: SimulatedSystem, state: str, wave: Form) -> Iterator[Form]:
     """Yield the terms that may be missing from the rate of a state, dry friction and an upper bound included."""
     speed, values = true.rms_rate(state), true.states[state]
+    high, span, size = float(values.max()), float(np.ptp(values)), float(np.abs(values).max())
+    own = f"state:{state}", "time"
 
     def term(name: str, of: str, change: Callable[[Any], Any], size: float, *seen: str, **more: Any) -> Form:
-        """Return a term that is a function `change` of the state `of`."""
-        return _rate_form(true, name, state, lambda s, now, v: change(s[of]), size, *seen, **more)
+        return _rate_form(true, f"{name}:{state}", state, lambda s, now, v: change(s[of]), size, *seen, **more)
 
-    size, own = float(np.abs(values).max()), (f"state:{state}", "time")
-    yield term(f"damping:{state}", state, lambda r: -r, size, *own, signed=False)
-    yield term(f"drag:{state}", state, lambda r: -np.abs(r) * r, size**2, *own, signed=False)
-    yield term(f"forcing:{state}", state, lambda r: 1.0 + 0.0 * r, 1.0, "time", *own)
+    def falling(power: int) -> Callable[[Any], Any]:
+        return lambda r: -(r**power)
+
+    yield term("damping", state, lambda r: -r, size, *own, signed=False)
+    yield term("drag", state, lambda r: -np.abs(r) * r, size**2, *own, signed=False)
+    yield term("forcing", state, lambda r: 1.0 + 0.0 * r, 1.0, "time", *own)
     for other, there in true.states.items():
         most, seen = float(np.abs(there).max()), (f"state:{other}", "time")
-        yield term(f"cubic:{state}:{other}", other, lambda r: -(r**3), most**3, *seen)
-        yield term(f"quadratic:{state}:{other}", other, lambda r: -(r**2), most**2, *seen)
-        if other != state:
-            yield term(f"coupling:{state}:{other}", other, lambda r: -r, most, *seen)
-    act = lambda s, now, v: wave.act(now, v)  # noqa: E731
+        for name, power in (("cubic", 3), ("quadratic", 2), ("coupling", 1)):
+            if power > 1 or other != state:
+                form = term(name, other, falling(power), most**power, *seen)
+                yield replace(form, name=f"{name}:{state}:{other}")
+    act = lambda s, now, v: wave.act(now, v)
     yield _modulated(wave, f"periodic_forcing:{state}", "rate", 0.02 * speed, limit=100, act=act, target=state)
     held = partial(Form, side="rate", act=lambda s, now, v: 0.0, covariates=(f"state:{state}", "level"), target=state)
     yield held(f"friction:{state}", first=0.02 * speed, limit=2 * speed, sticks=True, signed=False)
-    high, span = float(values.max()), float(np.ptp(values))
     yield held(f"limit:{state}", first=0.05 * span, limit=0.6 * span, stops=True, **_bounded_by(high, -1.0))
 
 
@@ -518,9 +464,7 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
     (middle, spread), (middle_of_other, spread_of_other) = true.deviation(one), true.deviation(other)
     low, high = float(true.readings.min()), float(true.readings.max())
     at = float(np.quantile(true.table.columns[one], rng.uniform(0.55, 0.8)))
-
-    def adds(name: str, addition: Callable[..., Any], *covariates: str, **more: Any) -> Form:
-        return _added_form(true, f"strange_{name}", addition, *covariates, outside=True, **more)
+    adds = partial(_added_form, true, outside=True)
 
     def memory(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         """Saturate with the sum of the column's absolute deviations since the start of the run."""
@@ -537,10 +481,10 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
         factors = rows.columns[one] - middle, rows.columns[other] - middle_of_other
         return factors[0] * factors[1] / (spread * spread_of_other)
 
-    yield adds(f"product:{one}:{other}", product, one, other, "time", "run")
-    yield adds(f"switch:{one}", lambda y, rows, v: 1.0 * (rows.columns[one] > at), one, "time", "run")
-    yield adds(f"memory:{one}", memory, "time", "run", one)
-    yield adds(f"fading_bend:{one}", fading_bend, one, "level")
+    yield adds(f"strange_product:{one}:{other}", product, one, other, "time", "run")
+    yield adds(f"strange_switch:{one}", lambda y, rows, v: 1.0 * (rows.columns[one] > at), one, "time", "run")
+    yield adds(f"strange_memory:{one}", memory, "time", "run", one)
+    yield adds(f"strange_fading_bend:{one}", fading_bend, one, "level")
     if true.table.time is not None:
         timed, duration = ("time", str(true.table.time)), true.table.duration
         hz = draw_log_uniform(rng, 4 / duration, 0.06 / true.table.median_gap)
@@ -554,29 +498,20 @@ def forms_out_of_vocabulary(true: SimulatedSystem, rng: np.random.Generator) -> 
             z = rows.time_since_start / longest
             return np.exp(-z / 0.05) - 1.5 * np.exp(-z / 0.35)
 
-        square = partial(adds, "square_wave", lambda y, rows, v: 1.0 * ((hz * rows.t) % 1.0 < 0.3))
-        yield square(*timed, draw=lambda rng: {"hz": hz})
-        yield adds("chirp", chirp, *timed)
+        square = lambda y, rows, v: 1.0 * ((hz * rows.t) % 1.0 < 0.3)
+        yield adds("strange_square_wave", square, *timed, draw=lambda rng: {"hz": hz})
+        yield adds("strange_chirp", chirp, *timed)
         if true.kind.run is not None:
-            yield adds("two_settlings", two_settlings, "time", "run", timed[1])
+            yield adds("strange_two_settlings", two_settlings, "time", "run", timed[1])
     if true.states:
         state = str(rng.choice(list(true.states)))
         values, own = true.states[state], (f"state:{state}", "level", "time")
         most, sprung = float(np.abs(values).max()), float(np.quantile(values, 0.6))
-
-        def pushes(name: str, push: Callable[..., Any], size: float, *seen: str, **more: Any) -> Form:
-            return _rate_form(true, f"strange_{name}", state, push, size, *seen, outside=True, **more)
-
-        def spring(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
-            return -np.maximum(s[state] - sprung, 0.0)
-
-        def leak(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
-            return -np.expm1(np.clip(s[state] / (0.3 * most), -30, 12))
-
-        def pull(s: dict[str, FloatArray], now: Instants, v: Numbers) -> FloatArray:
-            return np.asarray(-(now.u[one] - middle) / spread * s[state] ** 2 / most**2)
-
-        yield pushes(f"one_sided_spring:{state}", spring, float(np.ptp(values)), *own)
-        yield pushes(f"leak:{state}", leak, 20.0, *own)
+        pushes = partial(_rate_form, true, outside=True)
+        spring = lambda s, now, v: -np.maximum(s[state] - sprung, 0.0)
+        leak = lambda s, now, v: -np.expm1(np.clip(s[state] / (0.3 * most), -30, 12))
+        pull = lambda s, now, v: -(now.u[one] - middle) / spread * s[state] ** 2 / most**2
+        yield pushes(f"strange_one_sided_spring:{state}", state, spring, float(np.ptp(values)), *own)
+        yield pushes(f"strange_leak:{state}", state, leak, 20.0, *own)
         seen = (one, f"state:{state}", "time", "run", "level")
-        yield pushes(f"column_times_state:{state}:{one}", pull, 1.0, *seen, uses=(one,))
+        yield pushes(f"strange_column_times_state:{state}:{one}", state, pull, 1.0, *seen, uses=(one,))

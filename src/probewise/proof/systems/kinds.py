@@ -99,27 +99,25 @@ class SystemKind:
     What the simulator file states is taken from its `text`, which is as a user would provide it; `{noise}` stands for
     its line on noise: names of the predicted column (`reading`), of those of `time` and runs, if any, of parameters,
     and which have a value in each run; its `law`, whose states and rates the file defines unless it integrates by
-    itself, or its `formula`. True parameters are drawn from the
-    ranges `shared` and, in each run, `of_run`. `design` draws the times of a run, from 0, and its columns, from (rng,
-    n_rows, regime): the regime is 1, or larger for a run with inputs beyond the others' range. `decimals` are those of
-    designed columns and time, `drives` the columns that the law uses, `sd` that of a reading's white noise. Irrelevant
-    columns are `logged`: a random walk about a middle, scaled, plus noise of an sd in each row; then come the decimals,
-    and what shifts the middle in the last held-out run, if anything does. `stated_law` is the law of a file that
-    integrates by itself; `n_runs` are not held out.
+    itself, or its `formula`.
     """
 
     name: str
     text: str
-    shared: Mapping[str, Range]
-    design: Callable[[np.random.Generator, int, float], tuple[FloatArray, Columns]]
-    decimals: Mapping[str, int]
-    drives: tuple[str, ...]
-    sd: float
-    of_run: Mapping[str, Range] = field(default_factory=dict)
-    stated_law: Law | None = None
+    shared: Mapping[str, Range]  # true parameters
+    gap: float  # mean time between rows
+    # Columns from (rng, times of a run from 0, regime): 1, or larger for a run with inputs beyond the others' range.
+    design: Callable[[np.random.Generator, FloatArray, float], Columns]
+    decimals: Mapping[str, int]  # of time and of the designed columns, which the law or formula uses
+    sd: float  # of a reading's white noise
+    of_run: Mapping[str, Range] = field(default_factory=dict)  # true parameters with a value in each run
+    stated_law: Law | None = None  # of a file that integrates by itself
     restarts_time: bool = False
+    stretched: float = 1.0  # factor on the gap in a run beyond the others' range
+    # Irrelevant columns: a random walk about a middle, scaled, plus noise of an sd in each row; then come the decimals,
+    # and what shifts the middle in the last held-out run, if anything does.
     logged: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    n_runs: int = 5
+    n_runs: int = 5  # that are not held out
     reading_decimals: int = 4
 
     reading: str = field(init=False)
@@ -127,7 +125,6 @@ class SystemKind:
     run: str | None = field(init=False)
     per_run: tuple[str, ...] = field(init=False)
     parameters: tuple[str, ...] = field(init=False)
-    defines_states: bool = field(init=False)
     law: Law | None = field(init=False)
     formula: Callable[[Values, Values], Any] = field(init=False)  # of parameters and columns; None beside states
 
@@ -139,11 +136,14 @@ class SystemKind:
             first = next(iter(start))
             read = file.get("observe", lambda s, p, u: s[first])
             law = Law(start, file["rates"], read, linear=file.get("hold") == "linear")
-        stated = {name: file.get(name) for name in ("reading", "time", "run")}
-        stated |= {name: tuple(file.get(name, ())) for name in ("per_run", "parameters")}
-        stated |= {"defines_states": "rates" in file, "law": law, "formula": file.get("simulate")}
-        for name, value in stated.items():
-            object.__setattr__(self, name, value)
+        vars(self).update({name: file.get(name) for name in ("reading", "time", "run")})
+        vars(self).update({name: tuple(file.get(name, ())) for name in ("per_run", "parameters")})
+        vars(self).update(law=law, formula=file.get("simulate"))
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Columns that the law or formula uses, except time."""
+        return tuple(name for name in self.decimals if name != self.time)
 
     @property
     def column_decimals(self) -> dict[str, int]:
@@ -155,18 +155,13 @@ class SystemKind:
 _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 
-def irregular_times(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
-    """Draw n times from 0, whose gaps lie between 0.6 and 1.4 times `gap`, (n,)."""
-    return np.concatenate([[0.0], np.cumsum(gap * rng.uniform(0.6, 1.4, n - 1))])
-
-
-def random_steps(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
-    """Return random levels, none twice in succession, each held for 0.5 to 2 times `length` rows, (n,)."""
+def random_steps(rng: np.random.Generator, t: FloatArray, levels: FloatArray, length: int) -> FloatArray:
+    """Return random levels, none twice in succession, each held for 0.5 to 2 times `length` rows, shape of `t`."""
     out: list[float] = []
-    while len(out) < n:
+    while len(out) < len(t):
         choices = [level for level in levels if not out or level != out[-1]]
         out += [float(rng.choice(choices))] * int(rng.integers(max(length // 2, 2), 2 * length))
-    return np.array(out[:n])
+    return np.array(out[: len(t)])
 
 
 def random_waves(rng: np.random.Generator, t: FloatArray, size: float, fastest: float) -> FloatArray:
@@ -176,10 +171,10 @@ def random_waves(rng: np.random.Generator, t: FloatArray, size: float, fastest: 
     return np.asarray(size * waves.sum(axis=0) / np.sqrt(2.0))
 
 
-def sweep_there_and_back(rng: np.random.Generator, n: int, low: float, high: float) -> FloatArray:
-    """Return a rising and then a falling sweep between `low` and `high` in random steps, (n,)."""
-    up = n // 2
-    first, second = np.sort(rng.uniform(0, 1, up)), np.sort(rng.uniform(0, 1, n - up))[::-1]
+def sweep_there_and_back(rng: np.random.Generator, t: FloatArray, low: float, high: float) -> FloatArray:
+    """Return a rising and then a falling sweep between `low` and `high` in random steps, shape of `t`."""
+    up = len(t) // 2
+    first, second = np.sort(rng.uniform(0, 1, up)), np.sort(rng.uniform(0, 1, len(t) - up))[::-1]
     return np.asarray(low + (high - low) * np.concatenate([first, second]))
 
 
@@ -192,12 +187,16 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
     clock = 0.0
     for k in range(n_runs):
         n = int(each * rng.uniform(0.8, 1.2))
-        regime = 1.5 if k == n_runs - 1 else 1.0
-        t, own = kind.design(rng, n, regime)
+        regime, stretched = (1.5, kind.stretched) if k == n_runs - 1 else (1.0, 1.0)
+        t = np.concatenate([[0.0], np.cumsum(kind.gap * stretched * rng.uniform(0.6, 1.4, n - 1))])
+        whole = kind.design(rng, t, regime)
         if not kind.restarts_time:
             t = t + clock
             clock = float(t[-1]) + _PAUSE * float(t[-1] - t[0]) * rng.uniform(0.5, 1.5) + float(t[1] - t[0])
-        whole = {**own, **_irrelevant_columns(kind, n, regime, rng)}
+        for name, (middle, wander, jitter, _, *beyond) in kind.logged.items():
+            walk = np.cumsum(rng.standard_normal(n)) / np.sqrt(n) + rng.standard_normal()
+            shifted = middle + sum(beyond) * (regime > 1)
+            whole[name] = shifted + wander * walk + jitter * rng.standard_normal(n)
         if kind.time is not None:
             whole[kind.time] = t
         for name, values in whole.items():
@@ -205,18 +204,6 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
         run.append(np.full(n, k))
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
     return SystemTable(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
-
-
-def _irrelevant_columns(kind: SystemKind, n: int, regime: float, rng: np.random.Generator) -> Columns:
-    out = {}
-    for name, (middle, wander, jitter, _, *beyond) in kind.logged.items():
-        walk = np.cumsum(rng.standard_normal(n)) / np.sqrt(n) + rng.standard_normal()
-        shifted = middle + sum(beyond) * (regime > 1)
-        out[name] = shifted + wander * walk + jitter * rng.standard_normal(n)
-    return out
-
-
-Rng = np.random.Generator
 
 
 BATH = SystemKind(
@@ -236,21 +223,13 @@ def simulate(p, data):
 """,
     shared={"tau_s": (18, 45), "scale": ("normal", 1.0, 0.01)},
     of_run={"start_c": ("normal", 21, 2)},
-    design=lambda rng, n, regime: (
-        t := irregular_times(rng, n, 4.0),
-        {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))},
-    ),
+    gap=4.0,
+    design=lambda rng, t, regime: {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))},
     decimals={"t_s": 2, "bath_c": 2},
-    drives=("bath_c",),
     sd=0.05,
     restarts_time=True,
     logged={"room_c": (21.5, 0.8, 0.03, 2, 4.0), "stir_rpm": (300, 15, 3, 0), "rh_pct": (45, 3, 0.3, 1)},
 )
-
-
-def _cup_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    t = irregular_times(rng, n, 1.3)
-    return t, {"room_c": rng.uniform(18, 24) * (1.25 if regime > 1 else 1.0) + 0.5 * np.sin(t / rng.uniform(10, 25))}
 
 
 CUP = SystemKind(
@@ -271,9 +250,11 @@ def simulate(p, data):
 """,
     shared={"tau_min": (25, 60)},
     of_run={"hot_c": ("normal", 76, 6)},
-    design=_cup_design,
+    gap=1.3,
+    design=lambda rng, t, regime: {
+        "room_c": rng.uniform(18, 24) * (1.25 if regime > 1 else 1.0) + 0.5 * np.sin(t / rng.uniform(10, 25))
+    },
     decimals={"t_min": 2, "room_c": 2},
-    drives=("room_c",),
     sd=0.12,
     restarts_time=True,
     logged={"rh_pct": (50, 4, 0.4, 1), "fill_ml": (240, 6, 0.4, 1), "baro_hpa": (1012, 2, 0.1, 1)},
@@ -294,12 +275,9 @@ def simulate(p, data):
     return p["dark_mv"] + p["power"] / (data["dist_mm"] + p["behind_mm"]) ** 2
 """,
     shared={"dark_mv": ("normal", 0, 2), "power": (2e5, 5e5), "behind_mm": (8, 20)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 1.0),
-        {"dist_mm": sweep_there_and_back(rng, n, 20.0, 90.0 * regime)},
-    ),
+    gap=1.0,
+    design=lambda rng, t, regime: {"dist_mm": sweep_there_and_back(rng, t, 20.0, 90.0 * regime)},
     decimals={"dist_mm": 2},
-    drives=("dist_mm",),
     sd=0.4,
     logged={"board_c": (27, 1.5, 0.05, 2, 6.0), "rail_v": (5.0, 0.01, 0.002, 4), "rh_pct": (42, 3, 0.3, 1)},
     reading_decimals=3,
@@ -319,12 +297,11 @@ def simulate(p, data):
     return p["zero_kpa"] + p["k"] * data["flow_lpm"] ** 2
 """,
     shared={"zero_kpa": ("normal", 0, 0.2), "k": (0.08, 0.2)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 6.0),
-        {"flow_lpm": random_steps(rng, n, np.linspace(0.5, 12.0 * regime, 11), 4) * rng.uniform(0.97, 1.03, n)},
-    ),
+    gap=6.0,
+    design=lambda rng, t, regime: {
+        "flow_lpm": random_steps(rng, t, np.linspace(0.5, 12.0 * regime, 11), 4) * rng.uniform(0.97, 1.03, len(t))
+    },
     decimals={"t_s": 1, "flow_lpm": 3},
-    drives=("flow_lpm",),
     sd=0.03,
     logged={"water_c": (18, 1.5, 0.05, 2, 8.0), "pump_v": (24, 0.1, 0.02, 3), "baro_hpa": (1009, 2, 0.1, 1)},
     n_runs=4,
@@ -344,23 +321,19 @@ def simulate(p, data):
     return p["radius_mm"] / (2 * (index - 1))
 """,
     shared={"radius_mm": ("normal", 100, 0.5), "b_um2": (0.003, 0.008)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 9.0),
-        {"nm": sweep_there_and_back(rng, n, *((440, 640) if regime == 1 else (400, 700)))},
-    ),
+    gap=9.0,
+    design=lambda rng, t, regime: {"nm": sweep_there_and_back(rng, t, *((440, 640) if regime == 1 else (400, 700)))},
     decimals={"t_s": 1, "nm": 1},
-    drives=("nm",),
     sd=0.01,
     logged={"glass_c": (22, 1.2, 0.03, 2, 7.0), "lamp_w": (40, 0.3, 0.05, 2), "baro_hpa": (1015, 2, 0.1, 1)},
     n_runs=3,
 )
 
 
-def _ph_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+def _ph_design(rng: np.random.Generator, t: FloatArray, regime: float) -> Columns:
     levels = np.linspace(4, 9, 8) if regime == 1 else np.linspace(2.5, 11, 8)
-    t = irregular_times(rng, n, 15.0)
     warm = rng.uniform(18, 32) + (12 if regime > 1 else 0) + 1.5 * np.sin(t / rng.uniform(80, 300))
-    return t, {"buffer_ph": random_steps(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
+    return {"buffer_ph": random_steps(rng, t, levels, 5) + 0.02 * rng.standard_normal(len(t)), "probe_c": warm}
 
 
 PH = SystemKind(
@@ -376,9 +349,9 @@ def simulate(p, data):
     return p["e0_mv"] - p["slope_mv"] * kelvin / 298.15 * (data["buffer_ph"] - 7)
 """,
     shared={"e0_mv": ("normal", 0, 12), "slope_mv": (56, 60)},
+    gap=15.0,
     design=_ph_design,
     decimals={"t_s": 1, "buffer_ph": 3, "probe_c": 2},
-    drives=("buffer_ph", "probe_c"),
     sd=0.5,
     logged={"salt_g_l": (3.0, 0.15, 0.02, 3), "rh_pct": (48, 3, 0.3, 1)},
     n_runs=4,
@@ -414,12 +387,9 @@ def simulate(p, data):
 """,
     shared={"cm_per_v": (5, 10), "tau_s": (35, 90)},
     of_run={"start_cm": (5, 30)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 5.0),
-        {"valve_v": random_steps(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)},
-    ),
+    gap=5.0,
+    design=lambda rng, t, regime: {"valve_v": random_steps(rng, t, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)},
     decimals={"t_s": 2, "valve_v": 2},
-    drives=("valve_v",),
     sd=0.04,
     stated_law=Law(
         {"level": "start_cm"},
@@ -448,12 +418,9 @@ def observe(s, p, u):
     return s["second"]
 """,
     shared={"gain": ("normal", 1.0, 0.03), "tau1_s": (0.003, 0.006), "tau2_s": (0.010, 0.018)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 0.002),
-        {"in_v": random_steps(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)},
-    ),
+    gap=0.002,
+    design=lambda rng, t, regime: {"in_v": random_steps(rng, t, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)},
     decimals={"t_s": 6, "in_v": 3},
-    drives=("in_v",),
     sd=0.004,
     logged={"board_c": (30, 1.5, 0.04, 2, 8.0), "rail_v": (12.0, 0.02, 0.004, 3)},
     n_runs=4,
@@ -480,12 +447,9 @@ def observe(s, p, u):
 """,
     shared={"k_n_m": (25, 70), "c_kg_s": (0.4, 1.2)},
     of_run={"x0_m": ("normal", 0, 0.03)},
-    design=lambda rng, n, regime: (
-        t := irregular_times(rng, n, 0.05),
-        {"force_n": random_waves(rng, t, 0.8 * regime, 2.5)},
-    ),
+    gap=0.05,
+    design=lambda rng, t, regime: {"force_n": random_waves(rng, t, 0.8 * regime, 2.5)},
     decimals={"t_s": 4, "force_n": 4},
-    drives=("force_n",),
     sd=0.15,
     logged={"air_c": (22, 0.8, 0.03, 2, 5.0), "mains_v": (230, 1.0, 0.3, 1)},
     n_runs=4,
@@ -507,12 +471,9 @@ def rates(s, p, u):
     return {"angle": s["speed"], "speed": (p["deg_s_v"] * u["volts"] - s["speed"]) / p["tau_s"]}
 """,
     shared={"deg_s_v": (30, 70), "tau_s": (0.08, 0.2)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 0.03),
-        {"volts": random_steps(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)},
-    ),
+    gap=0.03,
+    design=lambda rng, t, regime: {"volts": random_steps(rng, t, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)},
     decimals={"t_s": 4, "volts": 2},
-    drives=("volts",),
     sd=0.8,
     logged={"case_c": (33, 2.5, 0.05, 2, 10.0), "bus_v": (9.0, 0.05, 0.01, 3), "load_g": (120, 6, 0.5, 1)},
     reading_decimals=3,
@@ -538,9 +499,10 @@ def observe(s, p, u):
 """,
     shared={"k1_per_s": (0.018, 0.03), "k2_per_s": (0.004, 0.008)},
     of_run={"dose": (0.7, 2.0)},
-    design=lambda rng, n, regime: (irregular_times(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}),
+    gap=9.0,
+    stretched=1.4,
+    design=lambda rng, t, regime: {},
     decimals={"t_s": 1},
-    drives=(),
     sd=0.003,
     restarts_time=True,
     logged={"jacket_c": (30, 0.7, 0.04, 2, 4.0), "stir_rpm": (500, 12, 4, 0), "lamp_a": (0.8, 0.01, 0.001, 4)},
@@ -563,12 +525,9 @@ def rates(s, p, u):
     return {"prey": born - caught, "hunters": 0.3 * caught - p["die_per_d"] * s["hunters"]}
 """,
     shared={"grow_per_d": (0.5, 0.9), "eat": (0.06, 0.1), "die_per_d": (0.4, 0.7)},
-    design=lambda rng, n, regime: (
-        irregular_times(rng, n, 0.5),
-        {"feed": random_steps(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)},
-    ),
+    gap=0.5,
+    design=lambda rng, t, regime: {"feed": random_steps(rng, t, np.array([0.6, 1.0, 1.4]) * regime, 15)},
     decimals={"t_d": 3, "feed": 2},
-    drives=("feed",),
     sd=0.3,
     logged={"room_c": (21, 0.8, 0.04, 2, 5.0), "oxygen_mg_l": (7.5, 0.3, 0.05, 2), "light_lx": (400, 15, 4, 0)},
     n_runs=4,

@@ -77,11 +77,9 @@ class _Integration:
         self.hard = [(e.form, float(e.values["a" if e.form.sticks else "level"])) for e in hard]
 
     def solve(self) -> dict[str, FloatArray]:
-        """Return every state by name at every row, (n_points,)."""
         first = self.rows[0]
-        starts = [self.parameters[each] if isinstance(each, str) else each for each in self.law.start.values()]
-        each_run = (np.asarray(each)[first] if np.ndim(each) else each for each in starts)
-        s = np.array([np.broadcast_to(each, len(first)) for each in each_run])
+        starts = (self.parameters[each] if isinstance(each, str) else each for each in self.law.start.values())
+        s = np.array([np.broadcast_to(np.asarray(v)[first] if np.ndim(v) else v, len(first)) for v in starts])
         for form, level in self.hard:
             if form.stops:
                 k = self.names.index(form.target)
@@ -117,8 +115,16 @@ class _Integration:
             u: dict[str, Any] = {name: low + share * rise for name, (low, rise) in ends.items()}
             u[cast(str, self.table.time)] = self.time[here] + share * (self.time[there] - self.time[here])
             t = printed[here] + share * (printed[there] - printed[here])
-            for name, tau in self.delays.items():
-                u[name] = self._delayed_column(name, t - tau, run)
+            for name, tau in self.delays.items():  # constant before a run
+                column, u[name] = self.columns[name], np.empty(len(run))
+                for j, number in enumerate(run):
+                    own = np.flatnonzero(self.table.run == number)
+                    t_own, then = printed[own], t[j] - tau
+                    if self.law.linear:
+                        u[name][j] = np.interp(then, t_own, column[own])
+                    else:
+                        last = max(int(np.searchsorted(t_own, then + 1e-12, side="right")) - 1, 0)
+                        u[name][j] = column[own[last]]
             now = Instants(t, t - printed[first], u, run, np.zeros(1))
             p = dict(base)
             for form, numbers in varying:
@@ -127,19 +133,7 @@ class _Integration:
 
         return at
 
-    def _delayed_column(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
-        """Return a column at times `t` of these runs, held or linear as the law says; constant before a run."""
-        column, out = self.columns[name], np.empty(len(run))
-        for j, number in enumerate(run):
-            own = np.flatnonzero(self.table.run == number)
-            if self.law.linear:
-                out[j] = np.interp(t[j], self.table.t[own], column[own])
-            else:
-                out[j] = column[own[max(int(np.searchsorted(self.table.t[own], t[j] + 1e-12, side="right")) - 1, 0)]]
-        return out
-
     def _rates(self, s: FloatArray, p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
-        """Return the rate of each state by name, with the effects on rates except dry friction and bounds."""
         by_name = dict(zip(self.names, s, strict=True))
         out = self.law.rates(by_name, p, now.u)
         for e in self.effects:
@@ -159,7 +153,6 @@ class _Integration:
         return ((a, b) for a, b in pairwise([0.0, *inside.tolist(), 1.0]) if b - a > _CLOSE)
 
     def _solved(self, slope: Callable[..., Any], begin: float, end: float, s: FloatArray, events: Any = None) -> Any:
-        """Return SciPy's solution of the slope of the states between two shares of a gap."""
         n_calls = 0
 
         def counted(share: float, y: FloatArray) -> Any:
@@ -176,7 +169,6 @@ class _Integration:
         return solved
 
     def _through_gap(self, s: FloatArray, k: int) -> FloatArray:
-        """Integrate states, (n_states, n_runs), from position k of all runs to the next position."""
         gap, at = self.time[self.rows[k + 1]] - self.time[self.rows[k]], self._inputs_in_gap(k)
         intervals = list(self._intervals(k))
 
@@ -196,11 +188,16 @@ class _Integration:
         gap, at = self.time[there] - self.time[here], self._inputs_in_gap(k, slice(j, j + 1))
         place = [self.names.index(form.target) for form, _ in self.hard]
 
+        def mode_of(form: Form, size: float, value: float, rate: float) -> int:
+            """Return the direction of motion, 0 if it sticks; of a bound, 1 if the state is free, 0 if it is kept."""
+            if form.stops:
+                return 0 if value >= size and rate > 0 else 1
+            return int(np.sign(value)) if value != 0 else int(np.sign(rate)) * (abs(rate) > size)
+
         def free_rates(share: float, y: FloatArray) -> dict[str, float]:
             return {name: float(np.ravel(v)[0]) for name, v in self._rates(y, *at(share)).items()}
 
         def end_of_mode(form: Form, size: float, mode: int, i: int) -> Any:
-            """Return SciPy's event: coming to rest, breaking loose, reaching or leaving a bound."""
 
             def rate(x: float, y: FloatArray) -> float:
                 return free_rates(x, y)[form.target]
@@ -220,7 +217,7 @@ class _Integration:
             for _ in range(_MOST_EVENTS):
                 rates = free_rates(share, s)
                 modes = [
-                    forced.get(m, _mode(form, size, s[i], rates[form.target]))
+                    forced.get(m, mode_of(form, size, s[i], rates[form.target]))
                     for m, ((form, size), i) in enumerate(zip(self.hard, place, strict=True))
                 ]
 
@@ -245,10 +242,3 @@ class _Integration:
             else:
                 raise NotConvergedError(f"the law of the {self.kind.name} sticks and slips without end")
         return s
-
-
-def _mode(form: Form, size: float, value: float, rate: float) -> int:
-    """Return the mode: for friction, the direction of motion, 0 if it sticks; for a bound, 1 if free, 0 if held."""
-    if form.stops:
-        return 0 if value >= size and rate > 0 else 1
-    return int(np.sign(value)) if value != 0 else int(np.sign(rate)) * (abs(rate) > size)

@@ -47,15 +47,18 @@ _OUTLYING = 5.0  # medians of the residual's size
 def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
     """Return the cubic in the time since the row before of each gap, highest power first, (4, n_samples, n - 1).
 
-    They are splines through values (n_samples, n); of rows at the same time the last counts.
+    They are splines through values (n_samples, n); of rows at the same time the last counts. They are NaN where a
+    sample has a value that is not finite.
     """
     from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
 
     out, passes = np.zeros((4, len(values), len(time) - 1)), np.diff(time) > 0
     out[3] = values[:, :-1]
     if passes.any():
-        last = np.append(passes, True)
-        out[:, :, passes] = CubicSpline(time[last], values[:, last], axis=1).c.transpose(0, 2, 1)
+        last, finite = np.append(passes, True), np.asarray(np.isfinite(values).all(axis=1))
+        smooth = np.where(finite[:, None], values, 0.0)  # SciPy refuses other numbers, though of one sample alone
+        out[:, :, passes] = CubicSpline(time[last], smooth[:, last], axis=1).c.transpose(0, 2, 1)
+        out[:, ~finite] = np.nan
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any, ParamSpec, TypeAlias, TypeVar
 
@@ -127,3 +127,12 @@ def nearly_equal(first: FloatArray, second: FloatArray) -> bool:
     return bool(
         np.allclose(first[there], second[there], rtol=_SAME, atol=_SAME * float(np.abs(second[there]).max(initial=0.0)))
     )
+
+
+def data_frame(columns: Mapping[str, Any]) -> Any:
+    """Return columns by name as a pandas DataFrame; ParameterError without pandas."""
+    try:
+        import pandas  # type: ignore[import-untyped,import-not-found,unused-ignore]  # where it is there
+    except ImportError as error:
+        raise ParameterError("to_frame", "no pandas", "an environment with it: pip install pandas") from error
+    return pandas.DataFrame(dict(columns))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -91,14 +90,3 @@ class Reported(ShowsItself):
             If a figure could not be drawn; everything else is complete.
         """
         return Path(importlib.import_module("probewise.report.saving").save(self, folder, seed=seed))
-
-
-def data_frame(columns: Mapping[str, Any]) -> Any:
-    """Return columns by name as a pandas DataFrame; ParameterError without pandas."""
-    from probewise.errors import ParameterError
-
-    try:
-        pandas = importlib.import_module("pandas")
-    except ImportError as error:
-        raise ParameterError("to_frame", "no pandas", "an environment with it: pip install pandas") from error
-    return pandas.DataFrame(dict(columns))

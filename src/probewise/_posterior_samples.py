@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, read_only_floats, require_finite
-from probewise._display import ShowsItself, data_frame
+from probewise._arrays import BoolArray, FloatArray, data_frame, read_only_floats, require_finite
+from probewise._display import ShowsItself
 from probewise._kinds import checked_texts
 from probewise.errors import ShapeError, require
 

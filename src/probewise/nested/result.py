@@ -18,8 +18,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray, frozen_int, own_arithmetic, read_only_floats
-from probewise._display import ShowsItself, data_frame
+from probewise._arrays import FloatArray, IntArray, data_frame, frozen_int, own_arithmetic, read_only_floats
+from probewise._display import ShowsItself
 from probewise._kinds import checked_number, checked_path, checked_whole, require_rng
 from probewise._version import __version__
 from probewise._writing import write_bytes_atomically

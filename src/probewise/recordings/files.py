@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray, read_only_floats, require_finite
-from probewise._display import ShowsItself, data_frame
+from probewise._arrays import FloatArray, data_frame, read_only_floats, require_finite
+from probewise._display import ShowsItself
 from probewise._kinds import checked_path
 from probewise._writing import is_device_or_pipe, write_bytes_atomically, write_text_atomically
 from probewise.errors import FileError, ParameterError, ShapeError, require, shortened, shown
@@ -269,13 +269,6 @@ def write_plan(plan: Plan, path: PathLike) -> None:
     _write_with_json(plan, checked_path("path", path), plan_columns(plan))
 
 
-def plan_values(plan: Plan) -> dict[str, Sequence[str] | list[float]]:
-    """Return the columns of a plan's CSV file as numbers, names as texts; ParameterError as `plan_columns`."""
-    cells = plan_columns(plan)
-    names = ("scan", "pattern")
-    return {name: own if name in names else [float(cell or "nan") for cell in own] for name, own in cells.items()}
-
-
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     """Format the rows of a plan as cells by column of its CSV file, in full precision; ParameterError if it cannot."""
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
@@ -498,9 +491,9 @@ class Prediction(ShowsItself):
         return len(self.plan)
 
     def to_frame(self) -> Any:
-        """Return a pandas DataFrame with the columns of the prediction's CSV file, a row per reading."""
+        """Return a pandas DataFrame: the plan's columns, `mean`, `sd` and `log_density`; a row per reading."""
         predicted = {name: getattr(self, name) for name in ("mean", "sd", "log_density")}
-        return data_frame({**plan_values(self.plan), **predicted})
+        return data_frame({**self.plan.columns, **predicted})
 
     def summary(self) -> str:
         """Summarise: number of predictions; for recorded readings, chi-square and log density per reading."""

@@ -14,13 +14,14 @@ from probewise._arrays import (
     BoolArray,
     FloatArray,
     IntArray,
+    data_frame,
     floats,
     frozen_int,
     read_only_floats,
     require_finite,
     rounding_error,
 )
-from probewise._display import ShowsItself, data_frame
+from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, checked_whole, require_kind, warn_of_likely_degrees
 from probewise._words import unit_after_number
 from probewise.errors import ParameterError, ShapeError, require
@@ -261,6 +262,14 @@ class Plan:
         out.flags.writeable = False
         return out
 
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The rows as columns by name, as `from_table` takes them: names of scans and patterns, numbers, covariates."""
+        named = {"scan": (self.scan, self.scan_names), "pattern": (self.pattern, self.pattern_names)}
+        out: dict[str, Any] = {name: [names[k] for k in rows] for name, (rows, names) in named.items()}
+        out |= {name: getattr(self, name) for name in ("x_mm", "y_mm", "orientation_rad", "time_s")}
+        return out | dict(self.covariates)
+
     def rows_by_scan(self) -> list[IntArray]:
         """Return a list of each scan's row numbers, in the order they were taken."""
         ends = np.cumsum(np.bincount(self.scan, minlength=len(self.scan_names)))
@@ -314,10 +323,8 @@ class Recording(ShowsItself):
         require_plan(self.plan)
 
     def to_frame(self) -> Any:
-        """Return a pandas DataFrame with the columns of the recording's CSV file, a row per reading."""
-        from probewise.recordings.files import plan_values
-
-        return data_frame({**plan_values(self.plan), "reading": self.readings})
+        """Return a pandas DataFrame with the columns that `from_table` takes, a row per reading."""
+        return data_frame({**self.plan.columns, "reading": self.readings})
 
     @property
     def relative_sd(self) -> FloatArray:

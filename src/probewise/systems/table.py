@@ -16,8 +16,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, floats, read_only_floats, rounding_error
-from probewise._display import data_frame
+from probewise._arrays import BoolArray, FloatArray, IntArray, data_frame, floats, read_only_floats, rounding_error
 from probewise._kinds import checked_path, require_kind
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording

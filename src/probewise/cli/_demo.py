@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,12 +32,12 @@ from probewise.experiment import (
 from probewise.inquiry import ReadingEntropy
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped
-from probewise.report import demo as report
-from probewise.report import diagnosis as diagnosis_report
-from probewise.report.plots.canvas import axes_of_frame, png
 from probewise.scene import Circle, Field, outlines
 from probewise.world import saturation
 from probewise.world.shipped import true_world as world_behind
+
+if TYPE_CHECKING:
+    from probewise.report.demo import RobotSearch
 
 DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
 _MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
@@ -54,6 +54,9 @@ def run_demo(
     drawings: Drawings, drawings_of_diagnosis: Drawings, *, seed: int, full: bool, progress: Progress
 ) -> tuple[str, ...]:
     """Calibrate, search and diagnose, write all files, and return the lines to print."""
+    from probewise.report import demo as report  # here, as the processes that search import this file and draw nothing
+    from probewise.report import diagnosis as diagnosis_report
+
     started, out = time.monotonic(), drawings.out
     drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     truth, doing = tuple(drawn_truth.tolist()), "calibrating, searching and diagnosing"
@@ -68,7 +71,7 @@ def run_demo(
         def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
             return pool.submit(_search, sensor, truth, seed, stream, max_readings=max_readings, **options)
 
-        doubting = {name: seek(7, MAX_READINGS_DOUBT, trust=trust, saturating=True) for name, trust in _TRUSTS.items()}
+        doubting = {name: seek(7, MAX_READINGS_DOUBT, trust=trust, saturates_at=report.SATURATION) for name, trust in _TRUSTS.items()}
         starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
         searching = {name: seek(2, model=model, on_circle=False) for model, name in _MODELS.items()}
         parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
@@ -134,15 +137,19 @@ def run_demo(
 
 def _searches_with_true_circle(
     sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
-) -> list[report.RobotSearch]:
+) -> list[RobotSearch]:
     """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
+    from probewise.report.demo import RobotSearch
+
     means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
     outline_mm = outlines(_CIRCLE.region(np.array([truth])))[0]
     levels = (means["I_min"], means["I_max"])
-    return [report.RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
+    return [RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
 
 
-def _frame_png(search: report.RobotSearch, step: Step) -> bytes:
+def _frame_png(search: RobotSearch, step: Step) -> bytes:
+    from probewise.report.plots.canvas import axes_of_frame, png
+
     title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
     ax = axes_of_frame((6.6, 3.45), (0.7, 0.55, 0.9, 0.3))
     return png(search.draw_view(step.number, title=title, ax=ax), dpi=90, tight=False)
@@ -156,17 +163,17 @@ def _search(
     *,
     max_readings: int,
     on_circle: bool = True,
-    saturating: bool = False,
+    saturates_at: float | None = None,
     **options: Any,
 ) -> Exploration:
     """Search for the circle with a simulated arm and a model by the `options` of `experiment_for`.
 
-    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. With `saturating` the
-    sensor saturates, which its model leaves out.
+    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. The sensor saturates
+    at the reading `saturates_at`, which its model leaves out; None: nowhere.
     """
     field, world = Field(), world_behind("paper")
-    if saturating:
-        world = replace(world, concealed=(saturation(report.SATURATION),))
+    if saturates_at is not None:
+        world = replace(world, concealed=(saturation(saturates_at),))
     experiment = experiment_for(sensor, _CIRCLE, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
     with arm_over(world, HiddenShape("circle", _CIRCLE, np.array(truth)).surface, field, seed=seed) as arm:

@@ -6,7 +6,6 @@ import glob
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +34,8 @@ def refuse_journal(path: Path) -> None:
 
 def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
     """Return a journal's readings as a recording by the sensor, and the shape that the run looked for."""
+    from dataclasses import replace  # here, as help needs none, and it is slow to import
+
     from probewise.experiment import read_journal
 
     journal = read_journal(path)
@@ -78,6 +79,8 @@ def _instrumentation_declared_by_run(path: Path, sensor: FittedSensor, settings:
     step, low, high = declared
     if not all(value is None or math.isfinite(value) for value in declared) or (step is not None and step <= 0):
         raise FileError(path, f"unusable options: step {step}, range {low} to {high}", "finite, a step above 0", row=1)
+    from dataclasses import replace
+
     return replace(sensor.instrumentation, step=step, min=low, max=high)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +33,8 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
 @contextlib.contextmanager
 def open_simulator(path: Path, n_workers: int) -> Iterator[Simulator]:
     """Read a simulator; with workers, the calls of its `simulate` are spread over processes."""
+    from dataclasses import replace
+
     from probewise.cli._executor import worker_pool
     from probewise.systems import read_simulator
     from probewise.systems.calls import SpreadCalls

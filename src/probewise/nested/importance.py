@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from scipy.special import expit, logsumexp
+from scipy.special import expit
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, logsumexp
 from probewise.nested.clusters import Clusters, find_disconnected_clusters
 from probewise.nested.problem import Evaluator, Space
 from probewise.nested.result import NestedResult, Samples

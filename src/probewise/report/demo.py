@@ -26,7 +26,7 @@ from probewise.report.exploration import draw_robot_view, errors_text
 from probewise.report.html import Markup, Section, element, figures, fragment, page, paragraph, slideshow, table
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
-from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, lay_out, png
+from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, grid_of_frames, lay_out, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading, hypothesis_probabilities
 from probewise.report.plots.readings import quadrant_patterns, residuals_by_scan, sensor_orientations
 from probewise.report.plots.search import draw_field_legend, information_gained, posterior_widths
@@ -171,8 +171,8 @@ def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -
     """Draw the paper's view after each of `numbers` readings (rows) of each search (columns); return the axes."""
     window = window_around_runs_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
-    size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
-    axes = grid_of_axes(len(numbers), len(searches), size_in=size)
+    size, margins = (5.0, 1.3 + 3.5 * up / across), (0.65, 0.5, 0.85, 0.8)
+    axes = grid_of_frames(len(numbers), len(searches), size_in=size, margins_in=margins)
     for row, n in zip(axes, numbers, strict=True):
         for ax, search in zip(row, searches, strict=True):
             paper_view(search, min(n, search.n), window_mm=window, ax=ax)
@@ -217,7 +217,8 @@ def draw_final_posteriors(searches: Sequence[RobotSearch]) -> AxesGrid:
     ends = np.array([window_around_runs_mm([s.run], s.n) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
-    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.4 + 3.3 * (high - low) / (right - left)))
+    size, margins = (PAGE_IN / 2, 1.3 + 3.2 * (high - low) / (right - left)), (0.65, 1.0, 0.95, 0.3)
+    axes = grid_of_frames(1, 2, size_in=size, margins_in=margins)
     for ax, s in zip(axes[0], searches, strict=True):
         title = f"{s.model} robot, after {count_with_noun(s.n, 'reading')}"
         s.draw_view(s.n, title=title, ax=ax).set(xlim=(left, right), ylim=(low, high))

@@ -92,15 +92,31 @@ def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], *
     )
 
 
+def grid_of_frames(
+    n_rows: int, n_columns: int, *, size_in: tuple[float, float], margins_in: tuple[float, float, float, float]
+) -> AxesGrid:
+    """Return axes, (n_rows, n_columns), each of a part of this size within fixed margins: left, bottom, right, top.
+
+    To measure what the margins must hold would take as long as to draw.
+    """
+    (width, height), (left, bottom, right, top) = size_in, margins_in
+    sheet = Figure((n_columns * width, n_rows * height))
+    places = [(k * width, (n_rows - 1 - row) * height) for row in range(n_rows) for k in range(n_columns)]
+    size = (width - left - right) / (n_columns * width), (height - bottom - top) / (n_rows * height)
+    axes = [
+        sheet.add_axes(((x + left) / (n_columns * width), (y + bottom) / (n_rows * height), *size)) for x, y in places
+    ]
+    return np.array(axes, dtype=np.object_).reshape(n_rows, n_columns)
+
+
 @lru_cache(maxsize=1)
 def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
-    """Return the axes of an animation's frames, the same for each, within fixed margins: left, bottom, right, top.
+    """Return the axes of an animation's frames, the same for each, within fixed margins.
 
     Who draws a frame replaces what was drawn before: new axes, with new ticks, take most of the time of a frame.
     """
-    (width, height), (left, bottom, right, top) = size_in, margins_in
-    within = (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
-    return Figure(size_in).add_axes(within)
+    axes: Axes = grid_of_frames(1, 1, size_in=size_in, margins_in=margins_in)[0, 0]
+    return axes
 
 
 def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
@@ -143,11 +159,11 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
 def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
     """Open a figure and return its axes of these heights, one above the other, (n_axes,); `svg` sets their margins.
 
-    Until then they fill the figure: in smaller axes, tick labels are not longer, so that they need no second layout.
+    Until then they are as high as the figure: in lower axes, tick labels are not longer, and need no second layout.
     """
     sheet = new_figure((width_in, sum(heights_in)))
     axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
-    sheet.subplots_adjust(left=0.0, bottom=0.0, right=1.0, top=1.0, hspace=0.0)
+    sheet.subplots_adjust(bottom=0.0, top=1.0, hspace=0.0)
     return np.asarray(axes[:, 0], dtype=np.object_)
 
 

@@ -71,7 +71,7 @@ def run_demo(
         def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
             return pool.submit(_search, sensor, truth, seed, stream, max_readings=max_readings, **options)
 
-        doubts = {"saturates_at": report.SATURATION, "max_readings": MAX_READINGS_DOUBT}
+        doubts: dict[str, Any] = {"saturates_at": report.SATURATION, "max_readings": MAX_READINGS_DOUBT}
         doubting = {name: seek(7, trust=trust, **doubts) for name, trust in _TRUSTS.items()}
         starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
         searching = {name: seek(2, model=model, on_circle=False) for model, name in _MODELS.items()}

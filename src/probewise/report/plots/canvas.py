@@ -139,7 +139,7 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
     """
     sheet, buffer = figure_of(drawing), io.BytesIO()
     own, own_dpi = sheet.canvas, sheet.dpi
-    agg = FigureCanvasAgg(sheet)  # `savefig` would draw everything twice, and measure it a third time
+    agg: Any = FigureCanvasAgg(sheet)  # `savefig` would draw everything twice, and measure it a third time
     sheet.dpi = dpi
     agg.draw()
     sheet.set_canvas(own)

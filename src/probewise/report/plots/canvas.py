@@ -101,12 +101,16 @@ def grid_of_frames(
     """
     (width, height), (left, bottom, right, top) = size_in, margins_in
     sheet = Figure((n_columns * width, n_rows * height))
-    places = [(k * width, (n_rows - 1 - row) * height) for row in range(n_rows) for k in range(n_columns)]
-    size = (width - left - right) / (n_columns * width), (height - bottom - top) / (n_rows * height)
-    axes = [
-        sheet.add_axes(((x + left) / (n_columns * width), (y + bottom) / (n_rows * height), *size)) for x, y in places
-    ]
-    return np.array(axes, dtype=np.object_).reshape(n_rows, n_columns)
+    axes = sheet.subplots(n_rows, n_columns, squeeze=False)
+    sheet.subplots_adjust(
+        left=left / (n_columns * width),
+        right=1.0 - right / (n_columns * width),
+        bottom=bottom / (n_rows * height),
+        top=1.0 - top / (n_rows * height),
+        wspace=(left + right) / (width - left - right),
+        hspace=(bottom + top) / (height - bottom - top),
+    )
+    return np.asarray(axes, dtype=np.object_)
 
 
 @lru_cache(maxsize=1)

@@ -145,9 +145,11 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
     own, own_dpi = sheet.canvas, sheet.dpi
     agg: Any = FigureCanvasAgg(sheet)  # `savefig` would draw everything twice, and measure it a third time
     sheet.dpi = dpi
-    agg.draw()
-    sheet.set_canvas(own)
-    sheet.dpi = own_dpi
+    try:
+        agg.draw()
+    finally:
+        sheet.set_canvas(own)
+        sheet.dpi = own_dpi
     if sheet in _OPENED:
         plt.close(sheet)
     pixels = np.asarray(agg.buffer_rgba())[..., :3]

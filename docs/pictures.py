@@ -20,8 +20,7 @@ from pathlib import Path
 
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli._options import DEFAULT_SEED
-from probewise.cli.diagnose import generators_of_diagnosis
-from probewise.diagnosis import diagnose_system
+from probewise.diagnosis import diagnose_system, generators_of_diagnosis
 from probewise.report.diagnosis_figures import before_and_after
 from probewise.report.plots import png
 from probewise.report.plots.apparatus import draw_arm_lengths

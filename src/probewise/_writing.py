@@ -11,12 +11,10 @@ import contextlib
 import errno
 import glob
 import itertools
-import json
 import os
 import shutil
 import stat
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from io import FileIO
@@ -163,6 +161,8 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
         here = "this" if nearest == path else nearest
         raise ParameterError("--out", str(path), f"a directory, existing or new; {here} {what}")
     _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
+    import tempfile  # here, as help needs none
+
     try:  # permissions are not enough: /proc and read-only mounts cannot be written to
         os.rmdir(tempfile.mkdtemp(prefix=".probewise-", dir=nearest))
     except OSError as error:
@@ -216,6 +216,8 @@ class StagedFiles:
 
     def write_json(self, name: str, document: object) -> None:
         """Write a document as strict JSON."""
+        import json  # here, as help needs none
+
         self.write(name, json.dumps(document, allow_nan=False, indent=1) + "\n")
 
 

@@ -13,9 +13,9 @@ from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.special import erfc, gammainc, gammaincc, gammainccinv, gammaincinv, logsumexp, ndtr, ndtri
+from scipy.special import erfc, gammainc, gammaincc, gammainccinv, gammaincinv, ndtr, ndtri
 
-from probewise._arrays import FloatArray, floats
+from probewise._arrays import FloatArray, floats, logsumexp
 from probewise._kinds import checked_number, require_kind, require_like
 from probewise.errors import ParameterError, ShapeError, require
 

@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 from heater import FILE, runs
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
 
 from probewise._signals import Stopped
 from probewise._writing import Drawings, NotDrawnError
@@ -74,7 +74,7 @@ def test_a_command_that_cannot_draw_writes_the_rest_says_so_in_a_line_and_exits_
     def fail(*_, **__):
         raise KeyError(0.0)
 
-    monkeypatch.setattr(Figure, "savefig", fail)
+    monkeypatch.setattr(FigureCanvasAgg, "draw", fail)
     monkeypatch.setattr(FigureCanvasSVG, "print_svg", fail)
     monkeypatch.setattr("webbrowser.open", lambda url: None)
     (tmp_path / "heater.py").write_text(FILE)

@@ -78,6 +78,7 @@ def test_the_module_runs_as_the_command_does():
 def test_help_does_not_load_the_numerical_libraries():
     code = (
         "import sys\nfrom probewise.cli import VERBS, main\n"
+        "main(['diagnose', '--help'])\nassert not {'dataclasses', 'tempfile'} & {*sys.modules}\n"
         "for words in [], *([verb] for verb in VERBS):\n"
         "    main([*words, '--help'])\n"
         "sys.exit(any(m in sys.modules for m in ('numpy', 'scipy', 'matplotlib', 'tqdm')))"

@@ -27,6 +27,7 @@ from probewise.inference import GaussianKnown
 from probewise.recordings import Disc, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
+from probewise.report.plots.canvas import axes_of_frame
 from probewise.scene import Circle, HypothesisScene, Rectangle, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
@@ -70,6 +71,14 @@ def frames(run):
         exploration.robot_view_png(step, run.experiment, places[: step.number], levels=(10.0, 60.0), truth_mm=outline)
         for step in run.steps
     ]
+
+
+def test_a_frame_in_the_axes_of_the_one_before_is_the_frame_in_new_axes(run, frames):
+    axes_of_frame.cache_clear()
+    places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in run.readings]
+    outline = outlines(run.experiment.shape.region(TRUTH))[0]
+    last = exploration.robot_view_png(run.last, run.experiment, places, levels=(10.0, 60.0), truth_mm=outline)
+    assert last == frames[-1] != frames[0]
 
 
 def pictures_with_captions(page):

@@ -10,8 +10,7 @@ import pytest
 
 from probewise import experiment
 from probewise.cli import main
-from probewise.cli.diagnose import generators_of_diagnosis
-from probewise.diagnosis import diagnose
+from probewise.diagnosis import diagnose, generators_of_diagnosis
 from probewise.experiment import loop
 from probewise.recordings import read_recording, shipped
 from probewise.report.words import typeset_numbers

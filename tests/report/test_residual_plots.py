@@ -104,6 +104,11 @@ def test_a_diagnosis_needs_no_plotting_library():
     assert not {"matplotlib", "scipy.stats", "scipy.spatial", "scipy.optimize"} & set(loaded)
 
 
+def test_processes_that_search_load_no_plotting_library():
+    asked = "import sys, probewise.cli._demo; sys.exit(' '.join({'matplotlib', 'scipy.stats'} & {*sys.modules}) or 0)"
+    assert subprocess.run([sys.executable, "-c", asked], check=False).returncode == 0
+
+
 def test_a_covariate_of_few_values_has_points_with_bars_and_no_line():
     """Neighbours of equal size would give several means at one value: a saw-tooth."""
     voltage, noise = np.repeat([3.0, 5.0, 12.0], 60), np.random.default_rng(2).standard_normal(180)

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, logsumexp
 from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested import Weighted

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,10 +18,9 @@ from probewise._words import count_with_noun
 from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
-from probewise.cli import diagnose as diagnose_verb
 from probewise.cli._common import progress_of, say
 from probewise.cli._executor import worker_pool
-from probewise.diagnosis import Diagnosis
+from probewise.diagnosis import Diagnosis, generators_of_diagnosis
 from probewise.experiment import (
     Exploration,
     HiddenShape,
@@ -35,12 +34,12 @@ from probewise.experiment import (
 from probewise.inquiry import ReadingEntropy
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped
-from probewise.report import demo as report
-from probewise.report import diagnosis as diagnosis_report
-from probewise.report.plots.canvas import axes_of_frame, png
 from probewise.scene import Circle, Field, outlines
 from probewise.world import saturation
 from probewise.world.shipped import true_world as world_behind
+
+if TYPE_CHECKING:
+    from probewise.report.demo import RobotSearch
 
 DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
 _MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
@@ -69,6 +68,9 @@ def run_demo(
     drawings: Drawings, drawings_of_diagnosis: Drawings, *, seed: int, full: bool, progress: Progress
 ) -> tuple[str, ...]:
     """Calibrate, search and diagnose, write all files, and return the lines to print."""
+    from probewise.report import demo as report  # here, as the processes that search import this file and draw nothing
+    from probewise.report.saving import of_diagnosis
+
     started, out = time.monotonic(), drawings.out
     drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     truth, doing = tuple(drawn_truth.tolist()), "calibrating, searching and diagnosing"
@@ -83,7 +85,8 @@ def run_demo(
         def seek(stream: int, max_readings: int = MAX_READINGS, **options: Any) -> Any:
             return pool.submit(_search, sensor, truth, seed, stream, max_readings=max_readings, **options)
 
-        doubting = {name: seek(7, MAX_READINGS_DOUBT, trust=trust, saturating=True) for name, trust in _TRUSTS.items()}
+        doubts: dict[str, Any] = {"saturates_at": report.SATURATION, "max_readings": MAX_READINGS_DOUBT}
+        doubting = {name: seek(7, trust=trust, **doubts) for name, trust in _TRUSTS.items()}
         starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
         searching = {name: seek(2, model=model, on_circle=False) for model, name in _MODELS.items()}
         parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
@@ -101,14 +104,13 @@ def run_demo(
     geometry = read_geometry(shipped_geometry_path())
     of_searches = (searches, started_alike, doubted)
     found = report.DemoRun(calibration, recording, prediction, *of_searches, diagnosis, geometry, concealed, seed)
-    figures, figures_of_diagnosis = report.figure_drawers(found), diagnosis_report.figure_drawers(diagnosis)
+    figures, made = report.figure_drawers(found), of_diagnosis(diagnosis, seed=seed, source="concealed.csv")
     seconds = time.monotonic() - started
-    of_diagnosis = (f"{DIAGNOSIS}/{name}" for name in (*figures_of_diagnosis, PAGE))
+    of_diagnosis = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
     with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
         write_sensor(sensor, stage / "sensor.json")
         (stage / DIAGNOSIS).mkdir()
-        *_, files_rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_files(diagnosis, StagedFiles(stage / DIAGNOSIS), rng=files_rng)
+        made.files(StagedFiles(stage / DIAGNOSIS))
         answers = report.main_findings_by_key(found)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
 
@@ -122,11 +124,7 @@ def run_demo(
                 frames[-1].append(drawings.draw(name, partial(_frame_png, search, step)))
         return report.page_html(found, drawn, frames=frames, seconds=seconds)
 
-    drawings_of_diagnosis.write_report(
-        figures_of_diagnosis,
-        lambda drawn: diagnosis_report.page_html(diagnosis, drawn, source="concealed.csv", seed=seed),
-        progress=progress,
-    )
+    drawings_of_diagnosis.write_report(made.drawers, made.page, progress=progress)
     drawings.write_report(figures, page, progress=progress)
     return (
         *report.search_comparison_lines(searches),
@@ -140,14 +138,18 @@ def run_demo(
 
 def _searches_with_true_circle(
     sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
-) -> list[report.RobotSearch]:
+) -> list[RobotSearch]:
     """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
+    from probewise.report.demo import RobotSearch
+
     means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
     outline_mm = outlines(_CIRCLE.region(np.array([truth])))[0]
-    return [report.RobotSearch(name, run, known, outline_mm, (means["I_min"], means["I_max"])) for name, run in runs]
+    return [RobotSearch(name, run, known, outline_mm, (means["I_min"], means["I_max"])) for name, run in runs]
 
 
-def _frame_png(search: report.RobotSearch, step: Step) -> bytes:
+def _frame_png(search: RobotSearch, step: Step) -> bytes:
+    from probewise.report.plots.canvas import axes_of_frame, png
+
     title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
     ax = axes_of_frame((6.6, 3.45), (0.7, 0.55, 0.9, 0.3))
     return png(search.draw_view(step.number, title=title, ax=ax), dpi=90, tight=False)
@@ -161,17 +163,17 @@ def _search(
     *,
     max_readings: int,
     on_circle: bool = True,
-    saturating: bool = False,
+    saturates_at: float | None = None,
     **options: Any,
 ) -> Exploration:
     """Search for the circle with a simulated arm and a model by the `options` of `experiment_for`.
 
-    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. With `saturating` the
-    sensor saturates, which its model leaves out.
+    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. The sensor saturates
+    at the reading `saturates_at`, which its model leaves out; None: nowhere.
     """
     field, world = Field(), world_behind("paper")
-    if saturating:
-        world = replace(world, concealed=(saturation(report.SATURATION),))
+    if saturates_at is not None:
+        world = replace(world, concealed=(saturation(saturates_at),))
     experiment = experiment_for(sensor, _CIRCLE, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
     with arm_over(world, HiddenShape("circle", _CIRCLE, np.array(truth)).surface, field, seed=seed) as arm:
@@ -186,4 +188,4 @@ def _search(
 
 def diagnose_shipped_recording(seed: int) -> Diagnosis:
     """Diagnose the second recording, with the same result as `probewise diagnose`."""
-    return engine.diagnose(read_recording(shipped("concealed")), rng=diagnose_verb.generators_of_diagnosis(seed)[0])
+    return engine.diagnose(read_recording(shipped("concealed")), rng=generators_of_diagnosis(seed)[0])

@@ -49,7 +49,7 @@ _INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simul
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
-    from probewise.report.saving import generators_of_diagnosis, of_diagnosis
+    from probewise.report.saving import of_diagnosis
 
     if arguments.each:
         return _diagnose_each(arguments)
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise CommandError("--workers and --scheduler are for --each, which diagnoses several recordings one by one")
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     source = ", ".join(path.name for path in arguments.recordings)
-    rng, nested_rng, _ = generators_of_diagnosis(arguments.seed)
+    rng, nested_rng, _ = engine.generators_of_diagnosis(arguments.seed)
     audited: Callable[[], PlanAudit | None] = lambda: None  # noqa: E731
     with contextlib.ExitStack() as stack:
         simulator = stack.enter_context(open_simulator(arguments)) if of_simulator else None

@@ -30,6 +30,7 @@ from probewise.diagnosis.diagnosis import (
     diagnose,
     diagnosis_json,
     diagnosis_schema,
+    generators_of_diagnosis,
     model_with,
 )
 from probewise.diagnosis.findings import EffectFound, Formula, NoiseFound, ParameterFound, Remainder
@@ -89,6 +90,7 @@ __all__ = [
     "diagnosis_schema",
     "fit_json",
     "fit_simulator",
+    "generators_of_diagnosis",
     "join",
     "model_with",
     "notes_on_calls",

@@ -414,6 +414,11 @@ Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]
 """Function that recomputes the evidence of a search; returns it with better probabilities, and both evidences."""
 
 
+def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
+    """Return the generators of a command's diagnosis, of its nested sampling, and of the samples in its files."""
+    return np.random.default_rng(seed).spawn(3)
+
+
 @own_arithmetic
 def diagnose(
     recordings: Recording | Sequence[Recording],

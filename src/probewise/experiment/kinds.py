@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, IntArray, read_only_floats
+from probewise._arrays import FloatArray, IntArray, logsumexp, read_only_floats
 from probewise.effects import Estimated
 from probewise.experiment.rivals import DescribedEffect, SensorModelRival, powers_of_s
 from probewise.inference.problem import Likelihood, SensorProblem, checked_log_prob

@@ -13,9 +13,8 @@ from functools import lru_cache, partial
 from typing import Self
 
 import numpy as np
-from scipy.special import logsumexp
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray, FloatArray, logsumexp
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.noise import SD_FACTORS, correlated_noise, lattice_step, outliers, signal_dependent_noise
 from probewise.effects.noise_distribution import log_gaussian_density, log_rounding_cell_density

@@ -454,9 +454,9 @@ class TabulatedChain:
         seen = (level - table.dark) / (table.bright - table.dark)
         if cards := cards_of(self.chain):
             seen = mean_albedo_with_cards(seen, cards, footprint_share_by_card(self.chain, poses, plan))
-        return self.chain.readings_from_simulated_view(
-            View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan
-        )
+        edged = any(effect.stage == Stage.SEEN for effect in self.chain.effects)  # others need no regions from here on
+        view = View(np.asarray(seen), poses, self.chain.scene.regions(disc) if edged else {})
+        return self.chain.readings_from_simulated_view(view, theta, plan)
 
 
 def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast:

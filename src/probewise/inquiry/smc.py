@@ -19,9 +19,8 @@ from functools import cache
 from typing import Any, Protocol, Self
 
 import numpy as np
-from scipy.special import logsumexp
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
+from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int, logsumexp
 from probewise.errors import ParameterError
 from probewise.nested import (
     LIVE_PER_PARAM,

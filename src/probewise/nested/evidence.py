@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import kolmogorov, logsumexp
+from scipy.special import kolmogorov
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray, logsumexp
 from probewise.nested.weights import weighted_quantiles
 
 DOUBTFUL_P_VALUE = 1e-4

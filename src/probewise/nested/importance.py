@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.special import expit, logsumexp
+from scipy.special import expit
 
-from probewise._arrays import FloatArray, own_arithmetic
+from probewise._arrays import FloatArray, logsumexp, own_arithmetic
 from probewise._kinds import checked_whole, require_callable, require_rng
 from probewise.errors import require
 from probewise.nested.check import check_and_repeat

@@ -555,10 +555,9 @@ def _accept_in_turn(
     """
     n_steps, n_chains = log_odds.shape
     log_target = np.where(possible, log_target, -np.inf).reshape(n_steps, n_chains)
-    now, index, n_accepted = log_now.copy(), np.full(n_chains, -1), 0
-    for k in range(n_steps):
-        accept = log_odds[k] < log_target[k] - now
-        now[accept] = log_target[k][accept]
-        index[accept] = k * n_chains + np.flatnonzero(accept)
-        n_accepted += int(accept.sum())
-    return index, n_accepted
+    now, last, n_accepted = log_now, np.full(n_chains, -1), 0
+    for k, target in enumerate(log_target):
+        accept = log_odds[k] < target - now
+        now, last = np.where(accept, target, now), np.where(accept, k, last)
+        n_accepted += int(np.count_nonzero(accept))
+    return np.where(last < 0, -1, last * n_chains + np.arange(n_chains)), n_accepted

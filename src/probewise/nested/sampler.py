@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.special import logsumexp
 
-from probewise._arrays import own_arithmetic
+from probewise._arrays import logsumexp, own_arithmetic
 from probewise._kinds import (
     checked_finite_number,
     checked_number,

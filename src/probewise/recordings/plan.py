@@ -118,7 +118,7 @@ class Plan:
         object.__setattr__(self, "sessions", sessions)
         for name in ("scan_names", "pattern_names"):
             names: object = getattr(self, name)
-            if isinstance(names, str) or not all(isinstance(n, str) for n in getattr(self, name)):
+            if isinstance(names, str) or not all(issubclass(kind, str) for kind in {*map(type, getattr(self, name))}):
                 raise ParameterError(name, names, "a tuple of texts")
         require_kind("patterns", self.patterns, Mapping, "patterns by name: {'edge': HalfPlane(...)}")
         require_patterns(self.patterns)
@@ -289,7 +289,7 @@ class Plan:
             self,
             **taken,
             scan=np.searchsorted(kept, self.scan[rows]),
-            scan_names=tuple(self.scan_names[k] for k in kept),
+            scan_names=tuple(map(self.scan_names.__getitem__, kept.tolist())),  # of a grid's designs, thousands
             covariates={name: values[rows] for name, values in self.covariates.items()},
             sessions=tuple(self.sessions[k] for k in kept) if self.sessions else (),
         )

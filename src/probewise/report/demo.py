@@ -22,14 +22,14 @@ from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.diagnosis_figures import before_and_after
-from probewise.report.exploration import draw_robot_view, errors_text
+from probewise.report.exploration import draw_robot_view, draw_widths_and_information, errors_text
 from probewise.report.html import Markup, Section, element, figures, fragment, page, paragraph, slideshow, table
 from probewise.report.pictures import join_side_by_side
 from probewise.report.plots.apparatus import arm_and_sensor
-from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_axes, lay_out, png
+from probewise.report.plots.canvas import PAGE_IN, AxesGrid, grid_of_frames, lay_out, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading, hypothesis_probabilities
 from probewise.report.plots.readings import quadrant_patterns, residuals_by_scan, sensor_orientations
-from probewise.report.plots.search import draw_field_legend, information_gained, posterior_widths
+from probewise.report.plots.search import draw_field_legend
 from probewise.report.words import number_text, typeset_numbers
 from probewise.scene import outlines
 
@@ -157,22 +157,12 @@ def _aligned_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _draw_widths_and_information(searches: Sequence[RobotSearch]) -> AxesGrid:
-    """Draw the widest posterior sd, and the information, after each reading of each search; return the axes, (1, 2)."""
-    steps = {f"{s.model} model": s.run.steps for s in searches}
-    axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
-    posterior_widths({n: np.array([s.largest_sd_mm for s in each]) for n, each in steps.items()}, ax=axes[0, 0])
-    information_gained({n: np.array([s.bits for s in each]) for n, each in steps.items()}, ax=axes[0, 1])
-    axes[0, 1].set_ylim(top=1.3 * axes[0, 1].get_ylim()[1])  # room for the legend above the lines
-    return axes
-
-
 def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
     """Draw the paper's view after each of `numbers` readings (rows) of each search (columns); return the axes."""
     window = window_around_runs_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
-    size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
-    axes = grid_of_axes(len(numbers), len(searches), size_in=size)
+    size, margins = (5.0, 1.3 + 3.5 * up / across), (0.65, 0.5, 0.85, 0.8)
+    axes = grid_of_frames(len(numbers), len(searches), size_in=size, margins_in=margins)
     for row, n in zip(axes, numbers, strict=True):
         for ax, search in zip(row, searches, strict=True):
             paper_view(search, min(n, search.n), window_mm=window, ax=ax)
@@ -217,7 +207,8 @@ def draw_final_posteriors(searches: Sequence[RobotSearch]) -> AxesGrid:
     ends = np.array([window_around_runs_mm([s.run], s.n) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
-    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.4 + 3.3 * (high - low) / (right - left)))
+    size, margins = (PAGE_IN / 2, 1.3 + 3.2 * (high - low) / (right - left)), (0.65, 1.0, 0.95, 0.3)
+    axes = grid_of_frames(1, 2, size_in=size, margins_in=margins)
     for ax, s in zip(axes[0], searches, strict=True):
         title = f"{s.model} robot, after {count_with_noun(s.n, 'reading')}"
         s.draw_view(s.n, title=title, ax=ax).set(xlim=(left, right), ylim=(low, high))
@@ -299,7 +290,7 @@ def figure_drawers(run: DemoRun) -> dict[str, Callable[[], bytes]]:
         "quadrants.png": lambda: quadrant_patterns(recording),
         "first_three.png": lambda: _draw_paper_views(started_alike, n_first),
         "equal_readings.png": lambda: _draw_paper_views(started_alike, [started_alike[-1].n]),
-        "progress.png": lambda: _draw_widths_and_information(run.searches),
+        "progress.png": lambda: draw_widths_and_information({f"{s.model} model": s.run.steps for s in run.searches}),
         "explanations.png": lambda: hypothesis_probabilities(names, [h.probability for h in diagnosis.hypotheses]),
         "scans.png": lambda: residuals_by_scan(diagnosis.recording, before, after),
         "before_after.png": lambda: lay_out(before_and_after(diagnosis)),

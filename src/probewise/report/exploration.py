@@ -23,7 +23,7 @@ from probewise.experiment import (
 from probewise.experiment.result import OFF_MM, stop_reason_with_checks
 from probewise.inquiry import UtilityMap
 from probewise.report import html
-from probewise.report.plots.canvas import axes_of_frame, grid_of_axes, png
+from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
@@ -169,6 +169,15 @@ def _fault_section(steps: Sequence[Step], trust: float, draw: html.Draw) -> html
     return html.Section("What the sensor model leaves out", (doubted.sentence, shown, listed))
 
 
+def draw_widths_and_information(runs: Mapping[str, Sequence[Step]], *, target_mm: float = 4.0) -> AxesGrid:
+    """Draw the widest posterior sd, and the information, after each step of each run by name; return axes, (1, 2)."""
+    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 3.6))
+    widths = {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()}
+    posterior_widths(widths, target_mm=target_mm, ax=axes[0, 0])
+    information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()}, ax=axes[0, 1])
+    return axes
+
+
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
     step, truth = run.last, dict(truth)
@@ -269,18 +278,13 @@ def page_html(
             for name, (mean, sd) in last.sensor.items()
         ]
         shape.append(html.table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."))
-    widths = {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()}
-    bits = {name: np.array([s.bits for s in steps]) for name, steps in runs.items()}
     more = "" if trust == 1 else " Information about what the sensor model leaves out is included."
     arm = "" if run.arm_error is None else " The arm's own error, which the result above counts, is not in it."
     how_fast = (
         html.figure(
-            draw("widths", lambda: png(posterior_widths(widths, target_mm=run.experiment.stop_sd_mm))),
-            f"Widest posterior sd of a length after each reading; dashed: the target precision.{arm}",
-        ),
-        html.figure(
-            draw("information", lambda: png(information_gained(bits))),
-            f"Information about the shape: prior minus posterior differential entropy.{more}",
+            draw("progress", lambda: png(draw_widths_and_information(runs, target_mm=run.experiment.stop_sd_mm))),
+            f"Left: widest posterior sd of a length after each reading; dashed: the target precision.{arm} Right: "
+            f"information about the shape, prior minus posterior differential entropy.{more}",
         ),
         steps_table(run, unit),
     )

@@ -34,7 +34,7 @@ def _paste_side_by_side(left: bytes, right: bytes) -> bytes:
     out = io.BytesIO()
     # An octree keeps rare colours: the median cut turned the green place of the next reading blue.
     few = sheet.quantize(_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    few.save(out, "PNG", optimize=True)
+    few.save(out, "PNG")
     return out.getvalue()
 
 

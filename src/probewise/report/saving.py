@@ -22,6 +22,7 @@ from probewise.diagnosis import (
     calibrated_of,
     diagnosis_json,
     fit_json,
+    generators_of_diagnosis,
     join,
     repaired_of,
 )
@@ -94,11 +95,6 @@ def of_diagnosis(
         ("witness_*.svg", "gain.svg", *(("next.csv",) if of_simulator else (NEXT_PLAN, "next_plan.json"))),
         main="diagnosis.json",
     )
-
-
-def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
-    """Return the generators of a diagnosis, of its nested sampling, and of the samples in its files."""
-    return np.random.default_rng(seed).spawn(3)
 
 
 def _write_files_of_light_sensor(value: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:

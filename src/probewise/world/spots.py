@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise.errors import ParameterError, ShapeError, require
@@ -184,6 +183,8 @@ def ring_spot(
 
 def blurred(spot: Spot, sd_mm: float) -> Spot:
     """Return a footprint convolved with a round Gaussian of sd `sd_mm`; larger pixels are divided first."""
+    from scipy.ndimage import gaussian_filter  # here, as few worlds need it
+
     # A Gaussian sampled more coarsely than its sd is too narrow: refine the pixels first.
     cuts = math.ceil(spot.pixel_mm / sd_mm)
     pixel_mm = spot.pixel_mm / cuts

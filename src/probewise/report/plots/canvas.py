@@ -11,6 +11,7 @@ import math
 import re
 import textwrap
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, TypeAlias, cast
 from weakref import WeakSet
 
@@ -18,6 +19,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap
@@ -26,6 +28,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, ScalarFormatter
 from numpy.typing import NDArray
+from PIL import Image
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
@@ -42,10 +45,12 @@ BAND: dict[str, Any] = {"color": GREY, "alpha": 0.3, "linewidth": 0}
 """Style of a band of chance, or of errors."""
 FILLED: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
 """Style of the area below a curve."""
-TITLE: dict[str, Any] = {"fontsize": "medium", "loc": "left"}
+TITLE: dict[str, Any] = {"fontsize": "medium", "loc": "left", "y": 1.0}
+"""Style of a title. Without `y`, each drawing measures the tick labels of both axes, to place the title above them."""
 
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
+_MARGIN_IN = 0.1  # about a cropped picture, as matplotlib leaves it
 _EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
 _LEAST_IN_FULL = 1e-5  # of an axis' length: shorter ones have labels with a power of ten
 
@@ -87,11 +92,35 @@ def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], *
     )
 
 
-def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
-    """Open a figure with one pair of axes within fixed margins, left, bottom, right, top: faster than to find them."""
+def grid_of_frames(
+    n_rows: int, n_columns: int, *, size_in: tuple[float, float], margins_in: tuple[float, float, float, float]
+) -> AxesGrid:
+    """Return axes, (n_rows, n_columns), each of a part of this size within fixed margins: left, bottom, right, top.
+
+    To measure what the margins must hold would take as long as to draw.
+    """
     (width, height), (left, bottom, right, top) = size_in, margins_in
-    within = (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
-    return new_figure(size_in).add_axes(within)
+    sheet = Figure((n_columns * width, n_rows * height))
+    axes = sheet.subplots(n_rows, n_columns, squeeze=False)
+    sheet.subplots_adjust(
+        left=left / (n_columns * width),
+        right=1.0 - right / (n_columns * width),
+        bottom=bottom / (n_rows * height),
+        top=1.0 - top / (n_rows * height),
+        wspace=(left + right) / (width - left - right),
+        hspace=(bottom + top) / (height - bottom - top),
+    )
+    return np.asarray(axes, dtype=np.object_)
+
+
+@lru_cache(maxsize=1)
+def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
+    """Return the axes of an animation's frames, the same for each, within fixed margins.
+
+    Who draws a frame replaces what was drawn before: new axes, with new ticks, take most of the time of a frame.
+    """
+    axes: Axes = grid_of_frames(1, 1, size_in=size_in, margins_in=margins_in)[0, 0]
+    return axes
 
 
 def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
@@ -113,16 +142,34 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
     `tight` crops empty margins. Without it, figures of equal size give PNGs of equal size, as an animation needs.
     """
     sheet, buffer = figure_of(drawing), io.BytesIO()
-    sheet.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight" if tight else None)
+    own, own_dpi = sheet.canvas, sheet.dpi
+    agg: Any = FigureCanvasAgg(sheet)  # `savefig` would draw everything twice, and measure it a third time
+    sheet.dpi = dpi
+    try:
+        agg.draw()
+    finally:
+        sheet.set_canvas(own)
+        sheet.dpi = own_dpi
     if sheet in _OPENED:
         plt.close(sheet)
+    pixels = np.asarray(agg.buffer_rgba())[..., :3]
+    if tight:
+        margin = round(_MARGIN_IN * dpi)
+        rows, columns = (np.flatnonzero((pixels != pixels[0, 0]).any(axis=axis)) for axis in ((1, 2), (0, 2)))
+        within = (slice(max(at[0] - margin, 0), at[-1] + margin + 1) for at in (rows, columns) if at.size)
+        pixels = pixels[tuple(within)]
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", dpi=(dpi, dpi))
     return buffer.getvalue()
 
 
 def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
-    """Open a figure and return its axes of these heights, one above the other, (n_axes,); `svg` sets their margins."""
+    """Open a figure and return its axes of these heights, one above the other, (n_axes,); `svg` sets their margins.
+
+    Until then they are as high as the figure: in lower axes, tick labels are not longer, and need no second layout.
+    """
     sheet = new_figure((width_in, sum(heights_in)))
     axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
+    sheet.subplots_adjust(bottom=0.0, top=1.0, hspace=0.0)
     return np.asarray(axes[:, 0], dtype=np.object_)
 
 
@@ -134,11 +181,7 @@ def axes_or_panel(ax: Axes | None, *, height_in: float = 2.7) -> Axes:
 
 def lay_out(drawing: Axes | AxesGrid) -> Axes | AxesGrid:
     """Give a stack of axes margins for its labels; return the drawing."""
-    sheet = figure_of(drawing)
-    labels = _tick_labels(sheet)
-    sheet.tight_layout(pad=0.4, h_pad=0.9)
-    if _tick_labels(sheet) != labels:  # finer ticks of axes that have grown have longer labels
-        sheet.tight_layout(pad=0.4, h_pad=0.9)
+    figure_of(drawing).tight_layout(pad=0.4, h_pad=0.9)
     return drawing
 
 
@@ -154,10 +197,6 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
         plt.close(sheet)
     text = buffer.getvalue()
     return text[text.index(b"<svg") :]
-
-
-def _tick_labels(sheet: Figure) -> list[str]:
-    return [label.get_text() for ax in sheet.axes for label in (*ax.get_xticklabels(), *ax.get_yticklabels())]
 
 
 def legend_above(ax: Axes, *, title: str = "") -> int:
@@ -217,8 +256,11 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
     """Draw one legend for all axes of a figure with constrained layout, below them, with text of the colour `ink`."""
     every: list[Axes] = list(axes.flat) if isinstance(axes, np.ndarray) else [axes]
     handles = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    sheet = figure_of(every[0])
+    for earlier in [*sheet.legends]:
+        earlier.remove()
     if handles:
-        figure_of(every[0]).legend(
+        sheet.legend(
             list(handles.values()),
             list(handles),
             loc="outside lower center",
@@ -270,8 +312,9 @@ def paint_out_of_reach(ax: Axes) -> None:
 
 
 def add_colour_bar(ax: Axes, image: ScalarMappable, label: str) -> Axes:
-    """Add a colour bar beside axes, of the same height, and return its axes."""
-    ax.figure.colorbar(image, cax=ax.inset_axes((1.015, 0.0, 0.022, 1.0)))
+    """Add a colour bar beside axes, of the same height, or label the one there anew; return its axes."""
+    if not ax.child_axes:
+        ax.figure.colorbar(image, cax=ax.inset_axes((1.015, 0.0, 0.022, 1.0)))
     bar = cast(Axes, ax.child_axes[-1])
     bar.set_ylabel("\n".join(textwrap.wrap(label, 32)), fontsize=SMALL_PT)
     bar.tick_params(labelsize=SMALL_PT)

@@ -61,13 +61,19 @@ def playing_field(
         Whether to add the paper's coordinates, LEGO distance units, at the top.
     """
     ax = canvas.axes_or_new(ax, size_in=(8.2, 5.2))
-    if np.isnan(utility).any():
-        canvas.paint_out_of_reach(ax)
     top = float(np.nanmax(utility))
     if top <= _NOTHING:
         top = 1.0  # a scale of nothing would have a power of ten
-    image = canvas.draw_map(ax, utility, x_mm, y_mm, cmap=canvas.COPPER, vmin=0.0, vmax=top)
-    canvas.add_colour_bar(ax, image, utility_label)
+    for earlier in (*ax.collections, *ax.lines, *ax.patches):  # of a frame before; its map and colour bar are kept
+        earlier.remove()
+    if ax.images:
+        ax.images[0].set_data(np.ma.masked_invalid(utility))
+        ax.images[0].set_clim(0.0, top)
+    else:
+        canvas.draw_map(ax, utility, x_mm, y_mm, cmap=canvas.COPPER, vmin=0.0, vmax=top)
+    canvas.add_colour_bar(ax, ax.images[0], utility_label)
+    if np.isnan(utility).any():
+        canvas.paint_out_of_reach(ax)
     if len(outlines_mm):
         ax.add_collection(LineCollection(list(outlines_mm), colors=_OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
         ax.plot([], [], color=_OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
@@ -95,7 +101,7 @@ def playing_field(
             "label": "next place",
         }
         ax.scatter(*next_mm, s=52, marker="s", **style)
-    left, right, low, high = image.get_extent()
+    left, right, low, high = ax.images[0].get_extent()
     ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     if lego_scale:
         lego = ax.secondary_xaxis(
@@ -104,7 +110,7 @@ def playing_field(
         lego.set_xlabel("LEGO distance units (8 mm)", fontsize=canvas.SMALL_PT)
         lego.tick_params(labelsize=canvas.SMALL_PT)
     if title:
-        ax.set_title(title, **canvas.TITLE)
+        ax.set_title(title, **canvas.TITLE | ({"y": None} if lego_scale else {}))  # above the scale
     return ax
 
 

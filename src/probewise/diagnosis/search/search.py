@@ -427,11 +427,12 @@ def _proposals_to_refit(
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     """Store in the state the log evidence of pairs of the best effects, by templates about a null."""
+    banks = state.template_banks(null)
+    templates = {name: [bank[k] for k in at] for bank in banks for name, at in bank.indices_by_label.items()}
     for noise, evidence in null.leading_noises():
         singles = state.log_bayes_factors_by_effect(null, evidence.likeliest_law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:_PAIRED]
-        templates = {name: state.refits.templates.templates_of(null.found, state.effects[name]) for name in ranked}
         about = Linearised.of(null.found, evidence.likeliest_law)
         pairs = log_bayes_factors_of_pairs(about, templates, {name: singles[name] for name in ranked})
         state.about_null |= {(pair, noise): evidence.log_z + value for pair, value in pairs.items()}

@@ -19,7 +19,7 @@ from probewise.diagnosis.locate import Covariate, places_of_effect, significant_
 from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
 from probewise.diagnosis.sensors import default_sensor, sensor_from_samples, theta_to_natural, with_free_form
-from probewise.diagnosis.templates import EffectTemplates, TemplateBank, log_bayes_factors_of_pairs, templates_of_effect
+from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_of_pairs, templates_of_effect
 from probewise.diagnosis.verdict import Hypothesis, Judged, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
@@ -198,13 +198,10 @@ def _problem_and_templates():
 
 def test_a_pair_weighs_as_one_template_of_all_its_columns():
     problem, _, templates = _problem_and_templates()
-    one, first = (VOCABULARY["backlash"](),), np.zeros(1, dtype=np.int64)
-    banks = {name: EffectTemplates((t,), (t[:1],), one, first) for name, t in zip("abcd", templates, strict=True)}
-    singles = {
-        name: TemplateBank.of(own.columns, [name]).log_bayes_factors(problem)[:, 0] for name, own in banks.items()
-    }
+    banks = {name: [template] for name, template in zip("abcd", templates, strict=True)}
+    singles = {name: TemplateBank.of(own, [name]).log_bayes_factors(problem)[:, 0] for name, own in banks.items()}
     for (a, b), found in log_bayes_factors_of_pairs(problem, banks, singles).items():
-        both = np.hstack([banks[a].columns[0], banks[b].columns[0]])
+        both = np.hstack([banks[a][0], banks[b][0]])
         assert found == pytest.approx(TemplateBank.of([both], ["both"]).log_bayes_factors(problem)[0, 0])
 
 

@@ -28,7 +28,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.diagnosis.evidence import NoiseEvidence
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, with_prior
+from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, fit, with_prior
 from probewise.diagnosis.linear_posterior import (
     TangentModel,
     draws_of_linear_amplitudes,
@@ -302,6 +302,8 @@ def draw_by_importance(
             return draws, True
         before = now
         progress("sampling the posterior", note=f"{draws.n_eff:.0f} effective draws")
+        if share > _UNIFORM:  # more draws of so good a proposal are better than other kernels
+            continue
         along = not k and sensor.predicts_in_bulk and not sensor.predicts_dearly
         anchors = rng.permutation(ridge.follow(fits, rng=rng)) if along else z[:0]
         if len(anchors) > n_params:
@@ -687,7 +689,9 @@ def posterior_draws(
         cheap = tangent if tangent.is_finite else None
     if cheap is not None:
         stand_in = replace(problem, model=cast(Model, cheap))
-        modes = [found, *modes_of_opposite_sign(cheap, found, recording, law)]
+        # A fit is under the noise that suits it best, which may be another: proposals from there would be far off.
+        best = fit(model, recording, found.z, law) if cheap is model else found
+        modes = [best, *modes_of_opposite_sign(cheap, best, recording, law)]
         draws, _ = draw_by_importance(stand_in, modes, law, sizes=_SIZES_HERE, rng=rng, progress=progress)
         if draws.n_eff >= _LEAST_SHARE * n_samples:
             if cheap is model:

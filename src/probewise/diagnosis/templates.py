@@ -358,18 +358,19 @@ def log_bayes_factors_by_label(problem: Linearised, bank: TemplateBank) -> dict[
 
 
 def log_bayes_factors_of_pairs(
-    problem: Linearised, templates: Mapping[str, EffectTemplates], singles: Mapping[str, FloatArray]
+    problem: Linearised, templates: Mapping[str, Sequence[FloatArray]], singles: Mapping[str, FloatArray]
 ) -> dict[Names, float]:
     """Return the log Bayes factor of each pair of effects, by their sorted names.
 
-    It is the sum of both effects' own (`singles`), corrected by the joint score of the best two entries of each bank.
+    It is the sum of both effects' own (`singles`, one by template), corrected by the joint score of the best two
+    templates of each.
     """
-    pairs = list(combinations(sorted(templates), 2))
+    pairs = list(combinations(sorted(singles), 2))
     if not pairs:
         return {}
     best = {name: np.argsort(-scores)[:_BEST_ENTRIES].tolist() for name, scores in singles.items()}
-    entries = [(name, i) for name in templates for i in best[name]]
-    columns = [templates[name].columns[i] for name, i in entries]
+    entries = [(name, i) for name in singles for i in best[name]]
+    columns = [templates[name][i] for name, i in entries]
     widths = np.array([c.shape[1] for c in columns])
     projected = scale_and_project(problem, columns)
     products, along = projected.T @ projected, projected.T @ problem.residual[:, None]

@@ -162,8 +162,8 @@ def of_investigation(
         write_recording(join([each.recording for each in value.rounds]), stage / "recording.csv")
 
     page = partial(investigation.page_html, value, source=source, seed=seed, concealed=concealed)
-    figures = {**last.drawers, "by_round.png": partial(investigation.probabilities_png, value)}
-    return last._replace(files=write_files, drawers=figures, page=page)
+    by_round = {"by_round.png": partial(investigation.probabilities_png, value)}
+    return last._replace(files=write_files, drawers={**last.drawers, **by_round}, page=page)
 
 
 @output_of.register

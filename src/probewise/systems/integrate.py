@@ -292,7 +292,7 @@ def _solve_all_steps(
     """Solve for the states at the end of every step, each sample from the `nearest`, (n_samples,), of those known.
 
     With the solution come up to eight converged samples that are far from the trajectories they began from, each with
-    its last Jacobian, as of `jacobian_bands`, where one was computed.
+    its last Jacobian, as of `jacobian_bands_and_residuals`, where one was computed.
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(law_and_inputs, steps, guess.copy())
@@ -306,7 +306,7 @@ def _solve_all_steps(
             own = nearest[samples] == number
             if not known[number].bands:
                 at = known[number].states[:, None]
-                known[number].bands.append(search.jacobian_bands(samples[own][:1], at)[0])
+                known[number].bands.extend(search.jacobian_bands_and_residuals(samples[own][:1], at)[0])
             correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
         search.apply_correction(samples, correction)
         far = ~(search.change < _FAR)
@@ -323,8 +323,8 @@ def _solve_all_steps(
         samples = np.flatnonzero(search.active)
         if not samples.size:
             break
-        bands = search.jacobian_bands(samples, search.states[:, samples])
-        correction = _solved_corrections(np.concatenate(bands), search.step_residuals(samples), shared=False)
+        bands, missed = search.jacobian_bands_and_residuals(samples, search.states[:, samples])
+        correction = _solved_corrections(np.concatenate(bands), missed, shared=False)
         last |= dict(zip(samples.tolist(), bands, strict=True))
         search.apply_correction(samples, correction)
     far = search.done & (_largest_relative_change(search.states - guess, guess) > _FAR)
@@ -371,24 +371,29 @@ class _NewtonState:
         states = self.states[:, samples]
         return self.states_at_step_ends(samples, states) - states[:, :, 1:]
 
-    def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
-        """Return samples' Jacobians of the equations of all steps, as bands, (n_unknowns, 2 n_states) each.
+    def jacobian_bands_and_residuals(
+        self, samples: IntArray, states: FloatArray
+    ) -> tuple[list[FloatArray], FloatArray]:
+        """Return samples' Jacobians of the equations of all steps, and the residuals as of `step_residuals`.
 
-        They are those at states (n_states, n, n_steps + 1, n_runs). Column k holds the k-th subdiagonal; the diagonal
-        is 1 throughout, and column 0 is not used. Unknowns are ordered by run, then by step, then by state.
+        They are those at states (n_states, n, n_steps + 1, n_runs). A Jacobian is its bands, (n_unknowns, 2 n_states):
+        column k holds the k-th subdiagonal; the diagonal is 1 throughout, and column 0 is not used. Unknowns are
+        ordered by run, then by step, then by state.
         """
-        at_end = self.states_at_step_ends(samples, states)
-        n_states, n, n_steps, n_runs = at_end.shape
-        out = np.zeros((n, n_runs, n_steps, n_states, 2 * n_states))
-        for j, values in enumerate(states):
-            nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
-            before = values.copy()
-            values += nudge
-            slopes = (self.states_at_step_ends(samples, states) - at_end) / nudge
-            values[:] = before
+        n_states, n, _, n_runs = states.shape
+        nudge = _NUDGE * np.maximum(np.abs(states).max(axis=(2, 3), keepdims=True), 1e-300)
+        # As given, and with each state nudged in turn: one evaluation of all takes a third of the time.
+        every = np.repeat(states[:, None], n_states + 1, axis=1)
+        for j in range(n_states):
+            every[j, j + 1] += nudge[j]
+        ends = self.states_at_step_ends(np.tile(samples, n_states + 1), every.reshape(n_states, -1, *states.shape[2:]))
+        at_end, *nudged = ends.reshape(n_states, n_states + 1, n, -1, n_runs).swapaxes(0, 1)
+        out = np.zeros((n, n_runs, at_end.shape[2], n_states, 2 * n_states))
+        for j, end in enumerate(nudged):
+            slopes = (end - at_end) / nudge[j]
             for i in range(n_states):
                 out[:, :, :-1, j, n_states + i - j] = -slopes[i, :, 1:].transpose(0, 2, 1)
-        return list(out.reshape(n, -1, 2 * n_states))
+        return list(out.reshape(n, -1, 2 * n_states)), at_end - states[:, :, 1:]
 
     def apply_correction(self, samples: IntArray, correction: FloatArray) -> None:
         """Add a correction (n_states, n, n_steps, n_runs) to samples' states, and mark those that have converged."""

@@ -60,9 +60,9 @@ from probewise.sensor import Stage
 ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
-# Nats behind the best refit of a law: a fit that stays so far behind is given up. Where an effect gains hundreds of
-# nats, others gain some of them slowly, and most steps of a search were theirs.
-_HOPELESS = 40.0
+# Nats behind the best refit: a fit so far behind is weighed once, and one of a law that stays there is given up. Where
+# an effect gains hundreds of nats, others gain some of them slowly, and most steps of a search were theirs.
+FAR_BEHIND = 40.0
 _FEW_VARIANTS = 2  # of an effect, which are all refitted: screening is no judge of a bound
 _VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
 _MOST_FAULTS = 3  # of the noise at once
@@ -370,15 +370,15 @@ _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicate
 class Refits:
     """The refits of one recording, each made once; a second search of the recording reuses them.
 
-    `sensor` is the given null, if any; `templates` caches the templates of effects about fits; `known` are refits with
-    one more effect, by the candidate, the effect, and the nats against it; `scored` log Bayes factors of the templates
-    of a bank, by label.
+    `sensor` is the given null, if any; `templates` caches the templates of effects about fits; `known` are candidates
+    with their refits with one more effect, by the candidate's form and names, the effect, and the nats against it;
+    `scored` log Bayes factors of the templates of a bank, by label.
     """
 
     sensor: Null | None
     noises: NoiseModels
     templates: TemplateCache
-    known: dict[tuple[WeighedFit, Effect, float], Extended] = field(default_factory=dict, repr=False)
+    known: dict[tuple[int, Names, Effect, float], tuple[WeighedFit, Extended]] = field(default_factory=dict, repr=False)
     scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
 
     def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: TemplateBank) -> dict[str, FloatArray]:
@@ -415,7 +415,8 @@ class Refits:
             for _ in range(2):
                 plain = self.noises.evidence_by_noise(found)
                 best = self.noises.likeliest_law(plain)
-                if best.is_practically_equal(law):
+                leads = max((candidate.log_z for _, (candidate, _) in self.known.values()), default=-math.inf)
+                if best.is_practically_equal(law) or max(e.log_z for e in plain.values()) < leads - FAR_BEHIND:
                     break
                 law = best
                 found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
@@ -427,13 +428,14 @@ class Refits:
     def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
         """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
         recording, hopeless = self.noises.recording, math.inf
+        if model.sensor.predicts_dearly and self.known:
+            hopeless = min(candidate.found.objective for _, (candidate, _) in self.known.values()) + FAR_BEHIND
         found, start = None, starts[0]
         if len(starts) > 1:
-            found = min(fit_each_start(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
+            fits = fit_each_start(model, recording, list(starts), law, max_steps=5, hopeless_above=hopeless)
+            found = min(fits, key=lambda f: f.objective)
             start = found.z
         if found is None or not found.settled:
-            if model.sensor.predicts_dearly and self.known:
-                hopeless = min(candidate.found.objective for candidate, _ in self.known.values()) + _HOPELESS
             found = fit(model, recording, start, law, max_steps=max_steps, hopeless_above=hopeless)
         if not np.isfinite(found.objective):
             text = "the model predicts readings that are not finite; check the model and its prior"
@@ -450,15 +452,16 @@ class Refits:
     def refit_with_effect(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
 
-        A refit made before is returned as it was.
+        A refit made before is returned as it was, also that of a fit of the same effects that is as good to three nats.
 
         Returns the fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats;
         and the effect's log Bayes factor by screening, by noise model.
         """
-        key = parent, effect, against
-        if key not in self.known:
-            self.known[key] = self._refit_with_likely_variants(parent, effect, against)
-        return self.known[key]
+        key = parent.n_gaussians, parent.names, effect, against
+        before = self.known.get(key)
+        if before is None or parent.log_z > before[0].log_z + ALIASED_NATS:
+            self.known[key] = before = parent, self._refit_with_likely_variants(parent, effect, against)
+        return before[1]
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: Effect, against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)

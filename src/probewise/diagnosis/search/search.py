@@ -28,6 +28,7 @@ from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.hypotheses import (
     ALIASED_NATS,
     EXTENDED_WITHIN,
+    FAR_BEHIND,
     SAME_MODE,
     WITH_MEMORY,
     Evidences,
@@ -72,6 +73,9 @@ from probewise.progress import Progress, silent
 # Nats behind the best so far: screening errs by as much near a fit that one effect distorts. Within three, single
 # effects that screening did not favour were lost.
 _REFITTED_WITHIN = 6.0
+# Share of the largest gain that an effect must promise to be refitted where it is 40 nats behind: refits of a pendulum
+# gain up to 1.6 times what screening sees, and what was left out is screened again beside the leader.
+_OUTDONE = 0.5
 _SINGLES = 6  # effects that are refitted alone; a bound on cost
 _HIDDEN = 3  # effects that noise with memory may hide, refitted beside these; a bound on cost
 _BEAM = 8  # combinations that are refitted at each size above one
@@ -398,6 +402,8 @@ def select_forward(state: SearchState, *, depth: int) -> None:
         refitted = []
         for k, proposal in enumerate(asked):
             state.progress(f"refitting effects, {size} at a time", k, len(asked))
+            if size == 1 and _is_outdone(state, null, proposal):
+                continue
             refitted.append(state.refit_with_effect(proposal.parent, proposal.added))
         if size == 2:
             refitted += _refit_leading_pairs(state)
@@ -418,7 +424,7 @@ def _proposals_to_refit(
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
-        alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
+        alone = _single_effects_to_refit(state, null, proposals)
         return [*alone, *_proposals_under_simplest_noise(state, null)]
     best = _largest_scores_about_null(state) if size == 2 else {}
     scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
@@ -429,11 +435,12 @@ def _proposals_to_refit(
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     """Store in the state the log evidence of pairs of the best effects, by templates about a null."""
+    banks = state.template_banks(null)
+    templates = {name: [bank[k] for k in at] for bank in banks for name, at in bank.indices_by_label.items()}
     for noise, evidence in null.leading_noises():
         singles = state.log_bayes_factors_by_effect(null, evidence.likeliest_law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:_PAIRED]
-        templates = {name: state.refits.templates.templates_of(null.found, state.effects[name]) for name in ranked}
         about = Linearised.of(null.found, evidence.likeliest_law)
         pairs = log_bayes_factors_of_pairs(about, templates, {name: singles[name] for name in ranked})
         state.about_null |= {(pair, noise): evidence.log_z + value for pair, value in pairs.items()}
@@ -486,11 +493,21 @@ def promising_combinations(
     ]
 
 
-def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
+def _is_outdone(state: SearchState, null: WeighedFit, proposal: Proposal) -> bool:
+    """Return whether screening sees an effect gain half of what another has gained at most, and 40 nats less."""
+    least = state.log_posterior(null)
+    best = max(map(state.log_posterior, state.candidates.values())) - least
+    gain = proposal.score + state.prior.log_prior_on_mean((proposal.added,)) - least
+    return gain < min(_OUTDONE * best, best - FAR_BEHIND)
+
+
+def _single_effects_to_refit(
+    state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]
+) -> list[Proposal]:
     """Choose the effects to refit alone: the leader, those not far behind, and those that screening cannot judge.
 
     Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
-    null absorbs nearly completely to first order, nor one of two copies of an effect. Each is a tuple of one name.
+    null absorbs nearly completely to first order, nor one of two copies of an effect. Their score is infinite.
     """
     scores = {names: proposal.score for names, proposal in proposals.items()}
     ranked = sorted(scores, key=lambda names: -(scores[names] + state.prior.log_prior_on_mean(names)))
@@ -502,14 +519,16 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     twice = {name for name in state.effects if name + AGAIN in state.effects}
     always = state.tried_always | faint | twice
     chosen = promising_combinations(state, scores, width=_SINGLES, behind=_REFITTED_WITHIN)
-    return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
+    wanted = dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)])
+    return [proposals[n]._replace(score=math.inf) if n[0] in always else proposals[n] for n in wanted]
 
 
 def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
     """Propose the effects that lead about the given null refitted under the simplest noise.
 
     Noise with memory absorbs an effect where it leads, and the null that was fitted under it may be far from where the
-    effect acts: beside a random walk, a tank that runs over need not be full. Otherwise there are no proposals.
+    effect acts: beside a random walk, a tank that runs over need not be full. Otherwise there are no proposals. Their
+    score is infinite, as of others that screening about the null cannot judge.
     """
     if state.refits.sensor is None or not state.refits.likeliest_law(null).has_memory:
         return []
@@ -521,7 +540,7 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
         if name_of_first_copy(name) is None
     }
     ranked = sorted(odds, key=lambda name: -odds[name])[:_HIDDEN]
-    return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > 0]
+    return [Proposal(math.inf, plain, name) for name in ranked if odds[name] > 0]
 
 
 def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:

@@ -83,7 +83,8 @@ def test_values_of_one_size_leave_open_what_they_have_in_common(annealed):
     weights /= weights.sum()
     mean = sum(w * m for w, (_, m, _) in zip(weights, each, strict=True))
     spread = sum(w * (c + np.outer(m - mean, m - mean)) for w, (_, m, c) in zip(weights, each, strict=True))
-    np.testing.assert_allclose(samples.mean(axis=0), mean, atol=0.2 * np.sqrt(spread[0, 0]))
+    four_errors = 4 / np.sqrt(250)  # sds, of the least effective number of draws
+    np.testing.assert_allclose(samples.mean(axis=0), mean, atol=four_errors * np.sqrt(spread[0, 0]))
     common = np.sqrt(spread.mean())
     assert common > 4 * SD / np.sqrt(N)  # far more than the readings would leave open without the values
     assert samples.mean(axis=1).std() == pytest.approx(common, rel=0.2)

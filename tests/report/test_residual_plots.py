@@ -105,7 +105,7 @@ def test_a_diagnosis_needs_no_plotting_library():
 
 
 def test_processes_that_search_load_no_plotting_library():
-    asked = "import sys, probewise.cli._demo; sys.exit(' '.join({'matplotlib', 'scipy.stats'} & {*sys.modules}) or 0)"
+    asked = "import sys, probewise.cli.demo; sys.exit(' '.join({'matplotlib', 'scipy.stats'} & {*sys.modules}) or 0)"
     assert subprocess.run([sys.executable, "-c", asked], check=False).returncode == 0
 
 

@@ -106,8 +106,8 @@ def run_demo(
     found = report.DemoRun(calibration, recording, prediction, *of_searches, diagnosis, geometry, concealed, seed)
     figures, made = report.figure_drawers(found), of_diagnosis(diagnosis, seed=seed, source="concealed.csv")
     seconds = time.monotonic() - started
-    of_diagnosis = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
-    with staged_output(out, outdated=(*figures, PAGE, *of_diagnosis)) as stage:
+    in_its_folder = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
+    with staged_output(out, outdated=(*figures, PAGE, *in_its_folder)) as stage:
         write_sensor(sensor, stage / "sensor.json")
         (stage / DIAGNOSIS).mkdir()
         made.files(StagedFiles(stage / DIAGNOSIS))

@@ -302,7 +302,7 @@ def draw_by_importance(
             return draws, True
         before = now
         progress("sampling the posterior", note=f"{draws.n_eff:.0f} effective draws")
-        if share > _UNIFORM:  # more draws of so good a proposal are better than other kernels
+        if k and share > _UNIFORM:  # more draws of so good a proposal are better than other kernels
             continue
         along = not k and sensor.predicts_in_bulk and not sensor.predicts_dearly
         anchors = rng.permutation(ridge.follow(fits, rng=rng)) if along else z[:0]
@@ -611,7 +611,7 @@ def surrogate_log_density(
 _N_WALKERS = 250
 _MOVES = 6  # of each walker after a step of beta
 # Of adaptive importance sampling where it costs little: draws of a round, kernels, rounds, and enough effective draws.
-_SIZES_HERE = 1000, 60, 8, 250.0
+_SIZES_HERE = 1000, 60, 20, 250.0
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20

@@ -302,7 +302,7 @@ def draw_by_importance(
             return draws, True
         before = now
         progress("sampling the posterior", note=f"{draws.n_eff:.0f} effective draws")
-        if k and share > _UNIFORM:  # more draws of so good a proposal are better than other kernels
+        if share > _UNIFORM:  # more draws of so good a proposal are better than other kernels
             continue
         along = not k and sensor.predicts_in_bulk and not sensor.predicts_dearly
         anchors = rng.permutation(ridge.follow(fits, rng=rng)) if along else z[:0]

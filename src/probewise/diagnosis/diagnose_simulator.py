@@ -234,8 +234,11 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
 
-    def fit_and_diagnose(simulator: Simulator, *, stiff: bool = False) -> Diagnosis:
+    def fit_and_diagnose(
+        simulator: Simulator, *, stiff: bool = False, sought: frozenset[str] | None = None
+    ) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, stiff=stiff)
+        prepared = replace(prepared, sought=sought)
         told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
         searched = None
         if prepared.has_too_little_data:  # the verdict is that they cannot tell, whatever a search would find
@@ -250,7 +253,9 @@ def diagnose_system(
     step, stiff = needed
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff)
+    # Finer steps cost more, and move evidences by a few nats: a second search of everything is not needed.
+    sought = frozenset(n for h in diagnosis.hypotheses if h.probability > _SOUGHT_AGAIN for n in h.effects)
+    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)), stiff=stiff, sought=sought)
 
 
 def prepare_system(
@@ -373,6 +378,7 @@ def _notes_on_integration(done: Integrations, most: int, *, sets_step: bool) -> 
         yield f"rates raised an error for {done.n_failed:,} parameter vectors, which count as impossible"
 
 
+_SOUGHT_AGAIN = 1e-4  # probability of a hypothesis, nine nats behind, whose effects are searched again with finer steps
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 
 

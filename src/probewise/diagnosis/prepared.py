@@ -229,7 +229,8 @@ class Prepared:
 
     `recording`: the readings used; `effects`: effects that could act in them, by name; `null`: the null model; None:
     calibrated from the recording; `apparatus`: the apparatus that took the readings; `everything`: all readings; the
-    same as `recording` if all are used.
+    same as `recording` if all are used; `sought`: names of the effects on the mean that a search tries, without a limit
+    on its cost; None: all, within the budget of the apparatus.
     """
 
     recording: Recording
@@ -237,6 +238,7 @@ class Prepared:
     null: Null | None
     apparatus: Apparatus
     everything: Recording
+    sought: frozenset[str] | None = None
 
     @property
     def is_thinned(self) -> bool:

@@ -778,8 +778,12 @@ def search(
     if max_order is None:
         max_order = 1 if len(prepared.usable_rows) < _FEW_READINGS else MAX_ORDER
     prior = prior or apparatus.prior_odds(effects)
-    on_mean = {name: effect for name, effect in effects.items() if name not in prepared.noise_effect_names}
-    on_noise = {name: cast(NoiseEffect, effect) for name, effect in effects.items() if name not in on_mean}
+    on_noise = {name: cast(NoiseEffect, effects[name]) for name in effects if name in prepared.noise_effect_names}
+    on_mean = {
+        name: effect
+        for name, effect in effects.items()
+        if name not in on_noise and (prepared.sought is None or name in prepared.sought or is_out_of_vocabulary(name))
+    }
     if after is None:
         sd_prior = getattr(prepared.null, "sd_prior", None) if noise_sd.name in on_noise else None
         models = NoiseModels(recording, on_noise, prior, noise_sd_about_given_null(prepared), sd_prior)
@@ -792,7 +796,7 @@ def search(
     spent = apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
-        return apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
+        return prepared.sought is None and apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
     state = SearchState(on_mean, prior, refits, always, progress, share_is_spent)
     if after is None:
@@ -915,9 +919,11 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
     """
     prepared, apparatus = searched.prepared, searched.prepared.apparatus
-    if not needs_more_than_memoryless_noise(searched) or apparatus.is_refit_budget_spent():
+    few = prepared.sought
+    if not needs_more_than_memoryless_noise(searched) or (few is None and apparatus.is_refit_budget_spent()):
         return searched
     proposals = apparatus.proposed_formulas()
+    proposals = proposals if few is None else {name: proposals[name] for name in proposals if name in few}
     if not proposals:
         return searched
     progress("weighing formulas")
@@ -933,7 +939,7 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
         return searched
     more = replace(prepared, effects={**prepared.effects, **kept})
     again = search(more, prior=prior, after=searched, progress=progress)
-    return searched if apparatus.is_refit_budget_spent() else again
+    return searched if few is None and apparatus.is_refit_budget_spent() else again
 
 
 def needs_more_than_memoryless_noise(searched: Searched) -> bool:

@@ -457,11 +457,15 @@ class Refits:
         Returns the fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats;
         and the effect's log Bayes factor by screening, by noise model.
         """
-        key = parent.n_gaussians, parent.names, effect, against
-        before = self.known.get(key)
-        if before is None or parent.log_z > before[0].log_z + ALIASED_NATS:
-            self.known[key] = before = parent, self._refit_with_likely_variants(parent, effect, against)
-        return before[1]
+        if (before := self.earlier_refit(parent, effect, against)) is None:
+            before = self._refit_with_likely_variants(parent, effect, against)
+            self.known[parent.n_gaussians, parent.names, effect, against] = parent, before
+        return before
+
+    def earlier_refit(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended | None:
+        """Return a refit made before, as of `refit_with_effect`; None if there is none."""
+        before = self.known.get((parent.n_gaussians, parent.names, effect, against))
+        return None if before is None or parent.log_z > before[0].log_z + ALIASED_NATS else before[1]
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: Effect, against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)

@@ -206,12 +206,14 @@ class SearchState:
     def refit_with_effect(self, parent: WeighedFit, added: str) -> WeighedFit | None:
         """Refit a candidate with one more effect; store the fit if the effect is significant.
 
-        Otherwise the combination is recorded as undetected. Nothing is refitted once the share of the budget is spent.
+        Otherwise the combination is recorded as undetected. Once the share of the budget is spent, only refits that an
+        earlier search has made count.
 
         Returns the best candidate of the resulting combination, possibly an earlier one; None if there is none.
         """
         against, names = self.penalty_of_extending(parent), tuple(sorted((*parent.names, added)))
-        if self.share_is_spent(self.share):
+        is_made = self.refits.earlier_refit(parent, self.effects[added], against) is not None
+        if not is_made and self.share_is_spent(self.share):
             return self.best_candidate(names)
         try:
             candidate, scores = self.refits.refit_with_effect(parent, self.effects[added], against)

@@ -199,6 +199,8 @@ def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise
     """Where nine readings of ten say the same, what rounding leaves follows the place, and was taken for physics."""
     found = diagnose(rounded(noise_sd, 1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("noise", ("quantisation",))
+    assert "0.0 nats" not in found.summary()
+    assert "all readings are multiples of one step" in found.to_html()
     assert found.p_value > 0.01  # one test; 0.09 and more in twenty others
     sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
     assert sigma == pytest.approx(noise_sd, rel=0.5)

@@ -56,7 +56,7 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
         ("fit.json", "investigate --plan paper"),
         ("diagnosis.json", "calibrate data.csv"),
         ("diagnosis.json", "audit data.csv"),
-        ("fit.json", "explore"),
+        *(("fit.json", words) for words in ("explore", "demo", "study", "challenge", "diagnose data.csv --each")),
         ("result.json", "fit data.csv --simulator heater.py"),
     ],
 )

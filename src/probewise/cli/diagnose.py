@@ -133,7 +133,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     """
     from probewise.report import each as report
 
-    out = checked_output_directory(arguments.out)
+    out = checked_output_directory(arguments.out, main="table.csv")
     files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
     for name in files:
         checked_output_directory(out / name, main="diagnosis.json")

@@ -108,7 +108,7 @@ def checked_path(name: str, value: object, allowed: str = "the name of a file: a
     """Return the name of a file, a text or Path, as a Path; raise ParameterError for anything else."""
     if isinstance(value, os.PathLike) or (isinstance(value, str) and value):
         named = os.fspath(value)
-        if isinstance(named, str):
+        if isinstance(named, str) and "\0" not in named:
             return Path(named)
     raise ParameterError(name, value, allowed)
 

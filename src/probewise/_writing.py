@@ -29,7 +29,9 @@ PAGE = "report.html"
 _STAGED, _COMPLETE = ".writing", ".complete"
 _OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
 _MOST_FAILED = 3  # drawings that a message names
-_MAIN_FILES = {"diagnosis.json": "a diagnosis", "fit.json": "a fit", "audit.json": "an audit"}
+_MAIN_FILES = {
+    "diagnosis.json": "a diagnosis", "fit.json": "a fit", "audit.json": "an audit", "result.json": "a search"
+}  # fmt: skip
 _WRITABLE = "a file in an existing, writable folder, on a disk with room"
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 _NO_LOCKS = "flock not supported"  # newer versions of the library warn so, and make a file that a killed process leaves
@@ -272,8 +274,12 @@ def _complete(out: Path, stage: StagedFiles, inputs: set[str], outdated: Sequenc
         stage.write(name, path.read_bytes())
         shutil.copystat(path, stage / name)
     for path in itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated):
-        if os.path.realpath(path) not in inputs and path.name not in names and not path.is_dir():
-            (stage / (path.name + _OUTDATED)).touch()
+        name = path.relative_to(out).as_posix()
+        if os.path.realpath(path) not in inputs and name not in names and not path.is_dir():
+            _require_ordinary(path.parents[: name.count("/")])
+            mark = stage / (name + _OUTDATED)
+            mark.parent.mkdir(exist_ok=True)
+            mark.touch()
 
 
 def _move_into_place(out: Path) -> None:

@@ -51,3 +51,23 @@ def test_rows_are_sorted_by_what_ails_most_devices():
     ]
     assert [row.device for row in each.in_order(rows)] == ["worse", "bad", "lagging", "clean one"]
     assert each.columns_of(rows)["probability"] == ["", "", "0.9", ""]
+
+
+def test_no_file_of_a_person_is_lost_in_the_folder_of_a_recording(tmp_path, capsys):
+    law, out = tmp_path / "line.py", tmp_path / "out"
+    law.write_text(LINE)
+    (out / "a").mkdir(parents=True)
+    kept = {"mine.svg": "mine", "next_week.csv": "mine", "next.csv": "x,y\n0.5,1.9\n"}
+    for name, text in kept.items():
+        (out / "a" / name).write_text(text)
+    given = ["--simulator", str(law), "--each", "--out", str(out)]
+    assert main(["diagnose", write_line(tmp_path / "a.csv", jump=0.8), *given]) == 0
+    kept["next_kept.csv"] = kept.pop("next.csv")
+    assert {name: (out / "a" / name).read_text() for name in kept} == kept
+    assert "next_kept.csv" in capsys.readouterr().out
+    (out / "b").mkdir()
+    (out / "b" / "fit.json").touch()
+    for name, said in (("...csv", "another name"), ("..csv", "another name"), ("b.csv", "holds a fit")):
+        assert main(["diagnose", write_line(tmp_path / name), *given]) == 2
+        assert said in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "line.py", "a.csv", "b.csv", "..csv", "...csv"}

@@ -20,11 +20,14 @@ from probewise.recordings import read_recording, write_recording, write_text_ato
 
 
 def test_what_an_earlier_run_left_behind_goes_and_what_is_not_ours_stays(tmp_path):
-    for name in ("witness_time.svg", "witness_level.svg", "notes.txt"):
+    (tmp_path / "frames").mkdir()
+    for name in ("witness_time.svg", "witness_level.svg", "notes.txt", "007.png", "frames/007.png"):
         (tmp_path / name).write_text("old")
-    with staged_output(tmp_path, outdated=("witness_*.svg",)) as stage:
+    with staged_output(tmp_path, outdated=("witness_*.svg", "frames/*.png")) as stage:
         (stage / "witness_level.svg").write_text("new")
-    assert contents(tmp_path) == {"witness_level.svg": "new", "notes.txt": "old"}
+    assert not any((tmp_path / "frames").iterdir())
+    (tmp_path / "frames").rmdir()
+    assert contents(tmp_path) == {"witness_level.svg": "new", "notes.txt": "old", "007.png": "old"}
 
 
 def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_path):
@@ -53,13 +56,17 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
         ("fit.json", "investigate --plan paper"),
         ("diagnosis.json", "calibrate data.csv"),
         ("diagnosis.json", "audit data.csv"),
+        *(("fit.json", words) for words in ("explore", "demo", "study", "challenge", "diagnose data.csv --each")),
+        ("result.json", "fit data.csv --simulator heater.py"),
     ],
 )
 def test_results_of_two_verbs_do_not_mix_in_one_folder(held, words, tmp_path, capsys):
     (tmp_path / held).write_text("{}")
     assert main([*words.split(), "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert f"--out is '{tmp_path}'; allowed: another folder: this one holds a {held[:-5]} ({held})" in said
+    assert f"--out is '{tmp_path}'; allowed: another folder: this one holds a {held[:-5]} ({held})" in said.replace(
+        "a search", "a result"
+    )
     assert [path.name for path in tmp_path.iterdir()] == [held]
 
 

@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.noise import NoiseLaw, NoiseModel, RoundedNormal, rough_sd
+from probewise.diagnosis.noise import NoiseLaw, NoiseModel, RoundedNormal, SdPrior, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.search.search import noise_sd_about_given_null
@@ -40,11 +40,11 @@ def as_declared(recording: Recording) -> Recording:
     return dataclasses.replace(recording, plan=dataclasses.replace(recording.plan, instrumentation=instrumentation))
 
 
-def noises(recording: Recording) -> NoiseModels:
+def noises(recording: Recording, **more: SdPrior) -> NoiseModels:
     extent = Extent.of(recording)
     built = {name: kind.for_extent(extent) for name, kind in VOCABULARY.items() if kind.stage is Stage.NOISE}
     effects = {name: effect for name, effect in built.items() if effect is not None}
-    return NoiseModels(recording, effects, PriorOdds.for_effects(effects))
+    return NoiseModels(recording, effects, PriorOdds.for_effects(effects), **more)
 
 
 def log_cells(residuals: np.ndarray, sd: np.ndarray) -> np.ndarray:
@@ -181,12 +181,26 @@ def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     assert logsumexp(each + nodes.log_weights) == pytest.approx(wanted, abs=0.1)
 
 
+@pytest.mark.parametrize("declared", [True, False])
+def test_rounding_alone_is_no_other_noise_than_at_the_calibration(declared):
+    """The readings of the calibration may have been rounded as coarsely, or not: variances add."""
+    recording = as_declared(rounded(0.7, 1)) if declared else rounded(0.7, 1)
+    prior = noises(recording, sd_prior=SdPrior(np.log(0.7), 0.05)).sd_prior
+    sds = np.array([0.7, 1.0, np.hypot(0.7, STEP / np.sqrt(12)), 0.4, 2.0])
+    same, changed = dataclasses.replace(prior, log_changed=0.0).log_odds(np.stack([np.log(sds), np.full(5, 1 / 800)]))
+    np.testing.assert_allclose(same[:3], same[0])
+    assert (same[:3] > changed[:3]).all()
+    assert (same[3:] < changed[3:]).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("noise_sd", [0.7])
 def test_coarse_rounding_is_all_that_is_found_in_coarsely_rounded_readings(noise_sd):
     """Where nine readings of ten say the same, what rounding leaves follows the place, and was taken for physics."""
     found = diagnose(rounded(noise_sd, 1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("noise", ("quantisation",))
+    assert "0.0 nats" not in found.summary()
+    assert "all readings are multiples of one step" in found.to_html()
     assert found.p_value > 0.01  # one test; 0.09 and more in twenty others
     sigma = np.sqrt(np.mean(found.repaired.noise_sd**2))
     assert sigma == pytest.approx(noise_sd, rel=0.5)

@@ -121,6 +121,13 @@ def test_a_clock_that_passes_midnight_goes_on(tmp_path):
     assert "t counted in min from 23:59:57, past midnight" in read.notes[0]
 
 
+@pytest.mark.parametrize(("last", "noted"), [("2026-11-30", True), ("2026-11-28", False)])
+def test_a_clock_beside_dates_of_other_days_is_noted(tmp_path, last, noted):
+    path = put(tmp_path, f"day,t,y\n2026-11-27,23:59:57,1\n2026-11-28,00:00:00,2\n{last},00:00:03.5,3\n")
+    read = read_run_table(path, time="t", run=None)
+    assert ("day has other days than t" in read.notes[0]) == noted
+
+
 REFUSED = {
     "decimal commas between commas": (
         table("{t},{c}"),

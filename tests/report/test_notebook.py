@@ -82,6 +82,9 @@ def test_a_result_is_saved_as_its_command_saves_it(verb, tmp_path):
     assert {path.name for path in out.iterdir()} == set(files)
     for name in set(files) - {"report.html", "fit.json", "fitted.json"}:  # these name the source
         assert (out / name).read_bytes() == files[name], name
+    for folder, seed in (("a\0b", 1), ("saved", -1), ("saved", "1")):
+        with pytest.raises(ParameterError, match=r"folder is|seed is"):
+            found.save(folder, seed=seed)
     assert "data:image/" in found.to_html()
     assert all(isinstance(ax, Axes | None) for ax in np.ravel(found.plot()))
 

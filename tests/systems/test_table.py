@@ -57,7 +57,16 @@ def test_names_of_runs_are_texts(given, names):
 def test_names_of_runs_that_were_read_as_numbers_with_a_fraction_are_noted(given):
     """1.10 was 1.1 before it came here."""
     assert "of which 1.10 is 1.1" in RunTable({"run": given, "x": np.zeros(3)}, run="run").notes[0]
-    assert not RunTable({"run": [1.0, 2.0, np.nan], "x": np.zeros(3)}, run="run").notes
+    assert not RunTable({"run": [1.0, 2.0, 3.0], "x": np.zeros(3)}, run="run").notes
+
+
+def test_rows_without_a_run_and_dates_without_marks_are_noted_once():
+    """A spreadsheet leaves a repeated name out; 20260131 is followed by 20260201, 70 later."""
+    for times, n_notes in (([20260131, 20260201], 2), ([20260131235958.0, 20260131235959.5], 2), ([0, 1], 1)):
+        table = RunTable({"run": ["a", ""], "t": times}, run="run", time="t").take(np.arange(2))
+        assert len(table.notes) == n_notes
+        assert "fill it in" in table.notes[0]
+    assert not RunTable({"run": ["", ""], "t": [20261301, 20261302]}, run="run", time="t").notes
 
 
 def test_a_simulator_gets_names_of_runs_as_numbers_only_if_they_are_different_numbers():

@@ -54,7 +54,7 @@ _CIRCLE = Circle(radius_mm=(50.0, 150.0), inside=True)
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo, print its summary, and return the exit status."""
-    out = checked_output_directory(arguments.out)
+    out = checked_output_directory(arguments.out, main="answers.json")
     drawings = (Drawings(out), Drawings(out / DIAGNOSIS))
     with progress_of(arguments) as progress:
         lines = run_demo(*drawings, seed=arguments.seed, full=arguments.full, progress=progress)

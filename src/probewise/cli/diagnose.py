@@ -20,7 +20,7 @@ from probewise import diagnosis as engine
 from probewise._signals import reporting_what_is_kept
 from probewise._tasks import results_as_tasks_end
 from probewise._version import __version__
-from probewise._writing import Drawings, Output, checked_output_directory, staged_output
+from probewise._writing import PAGE, Drawings, Output, checked_output_directory, staged_output
 from probewise.calibration import read_sensor
 from probewise.cli._common import CommandError, error_in_one_line, finish, message_to_resume, progress_of
 from probewise.cli._executor import open_executor
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from probewise.scene import Shape
 
 _INPUTS = "inputs.sha256"  # of the recording, its description, sensor and simulator, and the options
+_OF_ALL = ("table.csv", "counts.svg", PAGE)
+_OUTDATED = ("witness_*.svg", "gain.svg", "next.csv", NEXT_PLAN, "next_plan.json")  # not in every diagnosis
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -131,8 +133,10 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     """
     from probewise.report import each as report
 
-    out = checked_output_directory(arguments.out)
+    out = checked_output_directory(arguments.out, main="table.csv")
     files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
+    for name in files:
+        checked_output_directory(out / name, main="diagnosis.json")
     fingerprints = {name: _fingerprint(arguments, file) for name, file in files.items()}
 
     def is_done(name: str) -> bool:
@@ -140,11 +144,12 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
             return (out / name / _INPUTS).read_text() == fingerprints[name]
         return False
 
-    given = ((name, getattr(arguments, name)) for name in ("sensor", "simulator"))
+    given = [(name, getattr(arguments, name)) for name in ("sensor", "simulator")]
     options = [word for name, path in given if path is not None for word in (f"--{name}", str(path.absolute()))]
     options += ["--seed", str(arguments.seed), *(["--thorough"] if arguments.thorough else [])]
     words = {name: [str(file.absolute()), *options] for name, file in files.items() if not is_done(name)}
-    n_before, refused = len(files) - len(words), dict[str, str]()
+    read = [*arguments.recordings, *(path for _, path in given if path is not None)]
+    n_before, refused, notes = len(files) - len(words), dict[str, str](), list[str]()
 
     def kept() -> str:
         return message_to_resume(out, sum(map(is_done, files)), "recording", arguments, of=len(files))
@@ -159,9 +164,14 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
         for done, (name, (message, results)) in enumerate(ended, start=n_before + 1):
             if results:
                 results[_INPUTS] = fingerprints[name].encode()
-                with staged_output(out / name, outdated=("*.svg", "next*.csv", "next*.json")) as stage:
+                advised, column = NEXT_PLAN, "reading"
+                if "repaired.json" in results:
+                    advised, column = "next.csv", json.loads(results["repaired.json"])["simulator"]["reading"]
+                inputs = inputs_and_filled_in_plan(read, out / name / advised, column)
+                with staged_output(out / name, inputs=inputs, outdated=_OUTDATED) as stage:
                     for file, content in results.items():
                         stage.write(file, content)
+                notes += [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
             if message:
                 refused[name] = message
             progress("diagnosing", done, len(files), name)
@@ -176,7 +186,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
         partial(report.page_html, rows, seed=arguments.seed),
     )
     drawings.write_results(made, inputs=arguments.recordings)
-    return finish(arguments, drawings, report.summary(rows), f"seed {arguments.seed}; written to {out}")
+    return finish(arguments, drawings, *notes, report.summary(rows), f"seed {arguments.seed}; written to {out}")
 
 
 def _device_names(files: Sequence[Path]) -> list[str]:
@@ -188,6 +198,8 @@ def _device_names(files: Sequence[Path]) -> list[str]:
     ]
     twice = next((name for name in names if names.count(name) > 1), None)
     require(twice is None, "recordings", twice, "files of different names, which name their folders")
+    taken = next((name for name in names if name in (".", "..", *_OF_ALL)), None)
+    require(taken is None, "recordings", taken, "another name of that file, which names its folder")
     return names
 
 

@@ -41,7 +41,8 @@ _SHIPPED = "shipped_sensor.json"
 
 def run(arguments: argparse.Namespace) -> int:
     """Let the robot search; keep a journal and a picture of every step; write the report; return the exit status."""
-    out = checked_output_directory(arguments.out, "journal.jsonl", "live.html", "frames")
+    main = "" if arguments.resume else "result.json"  # a run goes on where it is, whatever was written beside it
+    out = checked_output_directory(arguments.out, "journal.jsonl", "live.html", "frames", main=main)
     search = Search(arguments)
     journal = out / "journal.jsonl"
     if arguments.resume and not journal.exists():

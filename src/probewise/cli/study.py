@@ -20,7 +20,7 @@ _OF_CONCEALED = ("clean", "seed", "size", "varied")
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
-    checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl")
+    checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl", main="table.csv")
     command = _command_line(arguments)
     if arguments.concealed:
         _require_none(arguments, (*_FACTORS, "quoted", "beside_paper"), "--concealed")

@@ -322,7 +322,7 @@ class Diagnosis(Judged, Reported):
             rms = f"{gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
             gained = f"log evidence {gain.log_evidence:+.1f} nats, {tested}, rms of the residuals {rms}"
             lines.append(f"{self.after_in_words}: {gained}")
-        elif self.verdict == "noise":
+        elif self.verdict == "noise" and gain.log_evidence >= 0.05:  # rounding beyond doubt is in both models
             lines.append(f"repaired noise model: log evidence {gain.log_evidence:+.1f} nats")
         if self.by_rows:
             lines.append(f"the unknown effect is corrected in these readings only: {self.not_in_model}")

@@ -698,10 +698,14 @@ class SdPrior:
     prior (`SD_FACTORS`), also beyond its bounds: such an sd is not the calibration's either. `log_same`, `log_changed`
     are their log prior odds. By those of a diagnosis, noise that has not changed is called changed in one of 200,000
     recordings of 408 readings, and in one of 2,000 of 24, if the calibration had as many.
+
+    `rounding` is the sd of the rounding to a coarse step, 0 if there is none. The calibration's readings may have been
+    rounded as coarsely or not at all: an sd is as at the calibration with that rounding, without it and in between.
     """
 
     log_sd: float
     spread: float
+    rounding: float = 0.0
     log_same: float = 0.0
     log_changed: float = -math.inf
 
@@ -712,7 +716,8 @@ class SdPrior:
         1931).
         """
         log_sd, variance = peak
-        ratio = np.exp(log_sd - self.log_sd)
+        highest = 0.5 * np.logaddexp(2 * self.log_sd, 2 * math.log(self.rounding)) if self.rounding else self.log_sd
+        ratio = np.exp(log_sd - np.clip(log_sd, self.log_sd, highest))
         variance = (variance + ratio * self.spread**2) / 1.5**2  # of the root; of the prior's, between both sds
         same = -0.5 * (np.cbrt(ratio**2) - 1) ** 2 / variance - 0.5 * np.log(variance) - math.log(1.5) - _LOG_ROOT_2_PI
         changed = SD_FACTORS.log_prob(np.ones_like(same))  # of its log, which is as dense everywhere as the factor at 1

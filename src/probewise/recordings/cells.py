@@ -209,6 +209,29 @@ def require_unit_of_time(name: str, unit: str, wanted: str) -> None:
         raise UnclearCellError(0, f'times in {wanted}, or time_unit = "{unit}"', name=name)
 
 
+def are_other_days(days: Sequence[str], clocks: Sequence[str]) -> bool:
+    """Return whether cells are dates alone, not all the same, that change where clocks in the same rows do not."""
+    if not (looks_like_time(days[0]) and _CLOCK_ALONE.fullmatch(clocks[0])):
+        return False
+    dates = [match for cell in days if (match := _YEAR_FIRST.fullmatch(cell) or _YEAR_LAST.fullmatch(cell))]
+    hours = [match for cell in clocks if (match := _CLOCK_ALONE.fullmatch(cell)) and match["second"]]
+    if (
+        len(set(days)) == 1
+        or len(dates) < len(days)
+        or len(hours) < len(clocks)
+        or any(match["hour"] for match in dates)
+    ):
+        return False
+    try:
+        seconds = [
+            _seconds_of_dates([match.groupdict() for match in dates])[0],
+            _seconds_of_clocks([match.groupdict() for match in hours])[0],
+        ]
+    except UnclearCellError:  # a date that can be read in two ways
+        return False
+    return bool((np.diff(seconds[0] // _DAY) != np.diff(seconds[1] // _DAY)).any())
+
+
 def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[ArrayLike, str]:
     """Convert dates, clocks and time differences (NumPy's, Python's, texts) to the time since the first, in `unit`.
 

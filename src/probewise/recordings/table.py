@@ -22,6 +22,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings.cells import (
     MISSING,
     UnclearCellError,
+    are_other_days,
     first_cell_without_number,
     is_missing,
     looks_like_number,
@@ -331,6 +332,9 @@ def _with_plain_numbers(
             columns[time] = list(map(number_text, times[0].tolist()))
             odd.pop(time, None)
             notes.append(times[1])
+            if others := [name for name in columns if name != time and are_other_days(columns[name], cells)]:
+                cure = "of a time of day, write date and clock into one column, 2026-11-28 12:30:00"
+                notes.append(f"{others[0]} has other days than {time}, which passes midnight where it falls: {cure}")
         elif time in odd:
             require_unit_of_time(time, unit_of_cells(odd[time]), time_unit)
         usual = [name for name in columns if name not in odd and name not in names and name != time]

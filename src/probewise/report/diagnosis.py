@@ -206,7 +206,10 @@ def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
         often = "less than 1 recording in a million looks"
     often = f"with nothing missing, {often} as odd as this ({p_in_words(p_value)})"
     if diagnosis.verdict == "noise":
-        gained = f"its log evidence over white noise is {diagnosis.improvement.log_evidence:.0f} nats"
+        log_evidence = diagnosis.improvement.log_evidence
+        gained = f"its log evidence over white noise is {log_evidence:.0f} nats"
+        if log_evidence < 0.5:  # what is beyond doubt is in both models
+            gained = "all readings are multiples of one step"
         mean = "nothing significant" if p_value >= ALARM else "nothing that any effect explains better"
         said = f"For the noise model, hardly: {gained}. The mean shows {mean}: {often}."
     elif diagnosis.verdict == "unknown" and p_value > _CHANCE:

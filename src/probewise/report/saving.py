@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from probewise._kinds import checked_path
+from probewise._kinds import checked_path, checked_whole
 from probewise._writing import Drawings, Output, StagedFiles, checked_output_directory
 from probewise.calibration import Calibration, predict, write_sensor
 from probewise.diagnosis import (
@@ -47,17 +47,21 @@ def output_of(value: object, *, seed: int | None = None) -> Output:
 
 def page_of(value: object, *, seed: int | None) -> str:
     """Return the page of a result, with its figures inside."""
-    made = output_of(value, seed=seed)
+    made = output_of(value, seed=_checked_seed(seed))
     return made.page({name: draw() for name, draw in made.drawers.items()})
 
 
 def save(value: object, folder: str | Path, *, seed: int | None) -> Path:
     """Write a result into a folder, made if missing, and return it; errors as of `probewise._display.Reported.save`."""
-    made, out = output_of(value, seed=seed), Path(checked_path("folder", folder))
+    made, out = output_of(value, seed=_checked_seed(seed)), checked_path("folder", folder)
     drawings = Drawings(checked_output_directory(out, main=made.main))
     drawings.write_results(made)
     drawings.raise_if_any_failed()
     return out
+
+
+def _checked_seed(seed: int | None) -> int | None:
+    return None if seed is None else checked_whole("seed", seed, least=0, most=None)
 
 
 @output_of.register
@@ -184,4 +188,4 @@ def _of_exploration(value: Exploration, *, seed: int | None = None) -> Output:
         return exploration.page_html(value, [drawn[name] for name in frames], seed=seed, model=model, truth=known)
 
     animation = {"run.gif": lambda: animated_gif([draw() for draw in frames.values()])}
-    return Output(write_files, frames | animation, page, ("frames/*.png",), main="result.json")
+    return Output(write_files, frames | animation, page, ("frames/[0-9][0-9][0-9].png",), main="result.json")

@@ -84,6 +84,12 @@ class RunTable:
             columns[name] = _checked_column(name, values, are_names=name == self.run)
             if name == self.run and any(isinstance(v, float) and v % 1 > 0 for v in np.asarray(given).tolist()):
                 notes += [f"column {name} names runs by numbers, of which 1.10 is 1.1; read it as text if they are two"]
+            if name == self.run and 0 < np.count_nonzero(columns[name] == "") < len(columns[name]):
+                cure = "where an empty cell repeats the one above, fill it in"
+                notes += [f"the rows without a name in column {name} are taken for one run; {cure}"]
+            if name == self.time and name != self.run and _are_dates_without_marks(columns[name]):
+                cure = "write 2026-11-28 for 20261128"
+                notes += [f"column {name} is taken as plain numbers, though all look like dates: {cure}"]
         require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
         for name, values in columns.items():
@@ -91,7 +97,7 @@ class RunTable:
                 raise ShapeError(f"column {name!r} has shape {values.shape}; allowed: ({n_points},), as the others")
         require(n_points > 0, "table", "without a row", "one row or more")
         object.__setattr__(self, "columns", columns)
-        object.__setattr__(self, "notes", tuple(notes))
+        object.__setattr__(self, "notes", tuple(dict.fromkeys(notes)))
         for what, column in (("time", self.time), ("run", self.run)):
             require(column is None or column in columns, what, column, f"a column of the table: {', '.join(columns)}")
         if self.time is not None:
@@ -293,6 +299,15 @@ def column_error(
     if k is None:
         return ParameterError(column, "texts, all of them numbers", f"numbers: {allowed}")
     return ParameterError(f"{column} in row {k + first}", str(cells[k]), allowed)
+
+
+def _are_dates_without_marks(values: NDArray[Any]) -> bool:
+    """Return whether a column of numbers, not all the same, looks like 20261128, or 20261128235959 with a clock."""
+    if values.dtype != np.float64 or not np.isfinite(values).all() or not values.size or not np.ptp(values):
+        return False
+    dates = np.floor(values / 1e6 if values.min() > 1e13 else values)
+    year, month, day = dates // 10_000, dates // 100 % 100, dates % 100
+    return bool(((year > 1899) & (year < 2101) & (month > 0) & (month < 13) & (day > 0) & (day < 32)).all())
 
 
 def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:

@@ -251,8 +251,11 @@ class NoiseModels:
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         sd = min(rough_sd(self.recording) or math.inf, self.sd_about_fit)
         known = {name: effect.known for name, effect in self.effects.items() if effect.known is not None}
-        if quantisation.name in self.effects and ROUNDING_SEEN_ABOVE * sd < self._step:
+        is_rounding_seen = ROUNDING_SEEN_ABOVE * sd < self._step
+        if is_rounding_seen and quantisation.name in self.effects:
             known.setdefault(quantisation.name, np.array([self._step]))
+        if is_rounding_seen and self.sd_prior is not None:
+            self.sd_prior = replace(self.sd_prior, rounding=self._step / math.sqrt(12))
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in known.items()}
         self._hidden = sd < HIDDEN * self._step
         self.certain = tuple(sorted(known))

@@ -271,11 +271,12 @@ def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, qu
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     out = tmp_path / "out"
     try:
-        assert main(command(sensor_file, out)) == 2
+        assert main(command(sensor_file, out)) == 1
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     said = capsys.readouterr().err
     assert f"{out / 'run.gif'}: cannot be written (File too large)" in said
-    assert "keeps 1 reading; go on with: " in said
+    assert f"the results are in {out}, without figures and report" in said
+    assert (out / "result.json").exists()
     assert not (out / "report.html").exists()
     assert len([json.loads(line) for line in (out / "journal.jsonl").read_text().splitlines()]) == 2

@@ -9,7 +9,7 @@ from probewise.cli._common import finish, progress_of, say
 from probewise.cli._inputs import inputs_and_filled_in_plan, open_simulator, read_or_shipped_plan, refuse_journal
 from probewise.cli._options import refuse_options
 from probewise.diagnosis import CURE_PLAN
-from probewise.report.saving import of_audit
+from probewise.report.audit import output_of
 from probewise.systems import read_table_for
 
 
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
             audit = diagnosis.audit_plan(plan, sensor=sensor, progress=progress)
         if drawings is not None:
             inputs = inputs_and_filled_in_plan([arguments.plan], drawings.out / CURE_PLAN)
-            made = of_audit(audit, source=arguments.plan.name)
+            made = output_of(audit, source=arguments.plan.name)
             drawings.write_results(made, inputs=inputs, progress=progress)
     say(arguments, audit.summary(), *(f"note: {note}" for note in getattr(audit.plan, "notes", ())))
     return 0 if drawings is None else finish(arguments, drawings, *drawings.notes, f"written to {drawings.out}")

@@ -12,7 +12,7 @@ from probewise.cli._inputs import refuse_journal, tables_and_descriptions
 from probewise.errors import ParameterError
 from probewise.nested import LIVE_PER_PARAM, least_live
 from probewise.recordings import read_recording
-from probewise.report.saving import output_of
+from probewise.report.calibration import output_of
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -69,7 +69,7 @@ def run_demo(
 ) -> tuple[str, ...]:
     """Calibrate, search and diagnose, write all files, and return the lines to print."""
     from probewise.report import demo as report  # here, as the processes that search import this file and draw nothing
-    from probewise.report.saving import of_diagnosis
+    from probewise.report.diagnosis import output_of
 
     started, out = time.monotonic(), drawings.out
     drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
@@ -104,7 +104,7 @@ def run_demo(
     geometry = read_geometry(shipped_geometry_path())
     of_searches = (searches, started_alike, doubted)
     found = report.DemoRun(calibration, recording, prediction, *of_searches, diagnosis, geometry, concealed, seed)
-    figures, made = report.figure_drawers(found), of_diagnosis(diagnosis, seed=seed, source="concealed.csv")
+    figures, made = report.figure_drawers(found), output_of(diagnosis, seed=seed, source="concealed.csv")
     seconds = time.monotonic() - started
     in_its_folder = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
     with staged_output(out, outdated=(*figures, PAGE, *in_its_folder)) as stage:

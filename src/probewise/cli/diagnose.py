@@ -51,7 +51,7 @@ _OUTDATED = ("witness_*.svg", "gain.svg", "next.csv", NEXT_PLAN, "next_plan.json
 
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose; write diagnosis.json, both models, the next plan, report and figures; return the exit status."""
-    from probewise.report.saving import of_diagnosis
+    from probewise.report.diagnosis import output_of
 
     if arguments.each:
         return _diagnose_each(arguments)
@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
             notes = joined.notes
             read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
             advised, column = NEXT_PLAN, "reading"
-        made = of_diagnosis(diagnosis, seed=arguments.seed, source=source, audited=audited)
+        made = output_of(diagnosis, seed=arguments.seed, source=source, audited=audited)
         inputs = inputs_and_filled_in_plan(read, drawings.out / advised, column)
         drawings.write_results(made, inputs=inputs, progress=progress)
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"

@@ -8,7 +8,7 @@ from probewise._writing import Drawings, checked_output_directory
 from probewise.cli._common import CommandError, finish, progress_of
 from probewise.cli._inputs import open_simulator, read_joined_table
 from probewise.diagnosis import fit_simulator
-from probewise.report.saving import output_of
+from probewise.report.fit import output_of
 
 
 def run(arguments: argparse.Namespace) -> int:

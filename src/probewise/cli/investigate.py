@@ -31,7 +31,7 @@ from probewise.investigation import (
     parse_concealed,
 )
 from probewise.recordings import Plan, Recording, fingerprint
-from probewise.report.saving import of_investigation
+from probewise.report.investigation import output_of
 from probewise.world import World
 from probewise.world.shipped import CANDIDATES, true_world
 
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     concealed = None if world is None else tuple(effect.name for effect in world.concealed)
 
     files_rng = np.random.default_rng(files_seed)
-    made = of_investigation(found, seed=arguments.seed, rng=files_rng, source=arguments.arm, concealed=concealed)
+    made = output_of(found, seed=arguments.seed, rng=files_rng, source=arguments.arm, concealed=concealed)
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
         drawings.write_results(made, inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN), progress=progress)
     known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]

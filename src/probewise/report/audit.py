@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 from probewise._words import count_with_noun, unit_after_number
-from probewise.diagnosis import EffectAudit, PlanAudit
+from probewise._writing import Output, StagedFiles
+from probewise.diagnosis import CURE_PLAN, EffectAudit, PlanAudit, audit_json
 from probewise.diagnosis.advice import LAMBDA
 from probewise.diagnosis.apparatus import ENOUGH_NATS
 from probewise.diagnosis.audit import ALIAS
 from probewise.effects import spoken_name
+from probewise.recordings import write_plan
 from probewise.report.html import Markup, Section, figure, page, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.probabilities import audit_matrix
@@ -170,3 +174,16 @@ def _unit_in_words(unit: str) -> str:
         return unit_after_number(unit)
     own = "" if upper == "1" else unit_after_number(upper)
     return f"{own} per {lower}".strip() if lower else own
+
+
+def output_of(value: PlanAudit, *, seed: int | None = None, source: str = "the plan") -> Output:
+    """Return the files of an audit, which has no seed: audit.json and the plan that would help; figure and page."""
+
+    def write_files(stage: StagedFiles) -> None:
+        stage.write_json("audit.json", audit_json(value))
+        if value.cure_plan is not None:
+            write_plan(value.cure_plan, stage / CURE_PLAN)
+
+    outdated = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
+    page = partial(page_html, value, source=source)
+    return Output(write_files, figure_drawers(value), page, outdated, main="audit.json")

@@ -9,7 +9,8 @@ from pathlib import PurePath
 import numpy as np
 
 from probewise._words import count_with_noun, unit_after_number
-from probewise.calibration import Calibration, FittedSensor
+from probewise._writing import Output
+from probewise.calibration import Calibration, FittedSensor, predict, write_sensor
 from probewise.recordings import Prediction, Recording
 from probewise.report.html import Markup, Section, figures, notes_in_words, page, seed_fact, table
 from probewise.report.plots.canvas import AxesGrid, png
@@ -175,4 +176,15 @@ def page_html(
         answer=summary_sentence(calibration.sensor),
         key_figure=figures(drawn, _CAPTIONS)["ssf.png"],
         sections=sections(calibration.sensor, recording, prediction, drawn, seed=seed),
+    )
+
+
+def output_of(value: Calibration, *, seed: int | None = None) -> Output:
+    """Return what is written of a calibration: sensor.json, figures, page; `seed` is stated if known."""
+    prediction = predict(value.sensor, value.recording)
+    return Output(
+        lambda stage: write_sensor(value.sensor, stage / "sensor.json"),
+        figure_drawers(value, value.recording, prediction),
+        lambda drawn: page_html(value, value.recording, prediction, drawn, seed=seed),
+        main="sensor.json",
     )

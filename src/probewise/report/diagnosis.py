@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Literal, cast
 
 import numpy as np
 
 from probewise._words import count_with_noun, unit_after_number, value_with_sd
+from probewise._writing import Output, StagedFiles
+from probewise.calibration import write_sensor
 from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
+    NEXT_PLAN,
     TO_SEPARATE,
     Alias,
     Diagnosis,
@@ -20,8 +24,12 @@ from probewise.diagnosis import (
     ParameterFound,
     Place,
     PlanAudit,
+    calibrated_of,
+    diagnosis_json,
+    generators_of_diagnosis,
     notes_on_calls,
     p_in_words,
+    repaired_of,
 )
 from probewise.diagnosis.locate import figure_name_of
 from probewise.diagnosis.prepared import rows_to_diagnose
@@ -34,6 +42,7 @@ from probewise.diagnosis.words import (
     parameter_in_words,
 )
 from probewise.effects import name_without_copy_suffix
+from probewise.recordings import write_plan
 from probewise.report import html
 from probewise.report.audit import audit_table
 from probewise.report.covariates import (
@@ -52,8 +61,9 @@ from probewise.report.words import (
     rounded_count_text,
     typeset_numbers,
 )
+from probewise.systems import RunTable, run_table_csv, write_fitted_system
 
-__all__ = ["figure_drawers", "page_html", "sections", "summary_sentence"]
+__all__ = ["figure_drawers", "output_of", "page_html", "sections", "summary_sentence"]
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
@@ -459,3 +469,47 @@ def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> 
     chance = "" if place.p_value < ALARM else ", possibly chance"
     hidden = "" if seen else " No mean leaves the band: residuals that change sign, or only scatter, average to zero."
     return typeset_numbers(f"Significant residuals: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")
+
+
+def output_of(
+    value: Diagnosis,
+    *,
+    seed: int | None = None,
+    rng: np.random.Generator | None = None,
+    source: str = "",
+    audited: Callable[[], PlanAudit | None] = lambda: None,
+) -> Output:
+    """Return the files of a diagnosis: diagnosis.json, both models, the next readings; its figures and page.
+
+    `rng` draws the samples in the sensors' files (default: by the seed); `source` names the recordings (default: the
+    recording's own name); `audited` makes the audit of the plan, or None.
+    """
+    source = source or value.recording.source or "the readings"
+    of_simulator = isinstance(value.recording.plan, RunTable)
+    rng = rng or generators_of_diagnosis(html.DEFAULT_SEED if seed is None else seed)[2]
+    return Output(
+        partial(_write_files_of_simulator if of_simulator else partial(_write_files_of_light_sensor, rng=rng), value),
+        figure_drawers(value),
+        lambda drawn: page_html(value, drawn, source=source, seed=seed, audit=audited()),
+        ("witness_*.svg", "gain.svg", *(("next.csv",) if of_simulator else (NEXT_PLAN, "next_plan.json"))),
+        main="diagnosis.json",
+    )
+
+
+def _write_files_of_light_sensor(value: Diagnosis, stage: StagedFiles, *, rng: np.random.Generator) -> None:
+    """Write diagnosis.json, both sensor models and the next plan."""
+    stage.write_json("diagnosis.json", diagnosis_json(value))
+    write_sensor(value.repaired.fitted_sensor(value.recording, rng=rng), stage / "sensor.json")
+    write_sensor(value.null.fitted_sensor(value.recording, rng=rng), stage / "calibrated.json")
+    if value.next_measurement is not None:
+        write_plan(value.next_measurement.plan, stage / NEXT_PLAN)
+
+
+def _write_files_of_simulator(value: Diagnosis, stage: StagedFiles) -> None:
+    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
+    stage.write_json("diagnosis.json", diagnosis_json(value))
+    write_fitted_system(repaired_of(value), stage / "repaired.json")
+    write_fitted_system(calibrated_of(value), stage / "calibrated.json")
+    if value.next_measurement is not None:
+        rows = cast(RunTable, value.next_measurement.plan)
+        stage.write(value.apparatus.words.next_plan, run_table_csv(rows))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise._words import count_with_noun, unit_after_number, unit_of_name
+from probewise._writing import Output, StagedFiles
 from probewise.effects import spoken_name
 from probewise.experiment import (
     CLEAN,
@@ -19,16 +21,21 @@ from probewise.experiment import (
     found_shape,
     left_out_after_step,
     probability_of_length_off,
+    repaired_sensor,
+    result_json,
+    samples_csv,
 )
 from probewise.experiment.result import OFF_MM, stop_reason_with_checks
 from probewise.inquiry import UtilityMap
 from probewise.report import html
+from probewise.report.pictures import animated_gif
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
 from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
 from probewise.scene import outlines, with_angles_near
 from probewise.scene.shapes import shape_and_columns
+from probewise.sensor import Chain
 
 MODEL_NAMES = {"ssf": "SSF"}
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
@@ -333,3 +340,24 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
         "fit of the best hypothesis": fits,
         **html.seed_fact(seed),
     }
+
+
+def output_of(value: Exploration, *, seed: int | None = None) -> Output:
+    """Return what is written of a search: result.json, samples.csv, sensor.json if known, every step, page."""
+    known = None if value.hidden is None else value.hidden.parameters_by_hypothesis_name(value.experiment.names)
+    frame = cache(partial(frame_png, value))  # the animation has them too
+    frames = {f"frames/{k:03d}.png": partial(frame, k) for k in range(1, len(value.steps) + 1)}
+
+    def write_files(stage: StagedFiles) -> None:
+        stage.write("result.json", result_json(value))
+        stage.write("samples.csv", samples_csv(value))
+        if value.sensor is not None:
+            rng = np.random.default_rng(html.DEFAULT_SEED if seed is None else seed)
+            stage.write("sensor.json", repaired_sensor(value.sensor, value.last, rng=rng).to_json())
+
+    def page(drawn: Mapping[str, bytes]) -> str:
+        model = "ssf" if isinstance(value.experiment.model, Chain) else "naive"
+        return page_html(value, [drawn[name] for name in frames], seed=seed, model=model, truth=known)
+
+    animation = {"run.gif": lambda: animated_gif([draw() for draw in frames.values()])}
+    return Output(write_files, frames | animation, page, ("frames/[0-9][0-9][0-9].png",), main="result.json")

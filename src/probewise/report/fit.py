@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -10,12 +11,13 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray, varies
 from probewise._words import unit_after_number
-from probewise.diagnosis import SystemFit
+from probewise._writing import Output, StagedFiles
+from probewise.diagnosis import SystemFit, fit_json
 from probewise.report.html import Section, definition_list, figure, notes_in_words, page, seed_fact, table
 from probewise.report.plots.canvas import svg
 from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
 from probewise.report.words import digits_of_range, typeset_numbers
-from probewise.systems import RunTable
+from probewise.systems import RunTable, samples_csv, write_fitted_system
 
 _MOST_INPUTS = 4
 _POOR = 1.5  # times the declared noise: of 24 readings or more the rms is so large by chance in one fit of 2,000
@@ -90,3 +92,15 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int | None) -
             Section("This run", (definition_list(facts), *notes_in_words(fit.recording.notes))),
         ],
     )
+
+
+def output_of(value: SystemFit, *, seed: int | None = None) -> Output:
+    """Return what is written of a fit: fit.json, fitted.json, samples.csv, figures, page; `seed` is stated if known."""
+
+    def write_files(stage: StagedFiles) -> None:
+        stage.write_json("fit.json", fit_json(value))
+        write_fitted_system(value.fitted, stage / "fitted.json")
+        stage.write("samples.csv", samples_csv(value.fitted))
+
+    page = partial(page_html, value, seed=seed)
+    return Output(write_files, figure_drawers(value), page, main="fit.json")

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
+import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._words import count_with_noun
-from probewise.diagnosis import p_in_words
+from probewise._writing import Output, StagedFiles
+from probewise.diagnosis import join, p_in_words
 from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import spoken_name
 from probewise.investigation import Investigation, Round
+from probewise.recordings import write_recording
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, figure, page, seed_fact, table
@@ -115,3 +119,27 @@ def _round_section(each: Round) -> Section:
     )
     title = _round_title(each)
     return Section(title[:1].upper() + title[1:], said)
+
+
+def output_of(
+    value: Investigation,
+    *,
+    seed: int | None = None,
+    rng: np.random.Generator | None = None,
+    source: str = "the arm",
+    concealed: Sequence[str] | None = None,
+) -> Output:
+    """Return the files of an investigation: those of its last diagnosis, and recording.csv; figures and page.
+
+    `rng` as of a diagnosis; `source` names the arm; `concealed` are the effects of a simulated world, None for any
+    other.
+    """
+    last = diagnosis_report.output_of(value.last.diagnosis, seed=seed, rng=rng)
+
+    def write_files(stage: StagedFiles) -> None:
+        last.files(stage)
+        write_recording(join([each.recording for each in value.rounds]), stage / "recording.csv")
+
+    page = partial(page_html, value, source=source, seed=seed, concealed=concealed)
+    by_round = {"by_round.png": partial(probabilities_png, value)}
+    return last._replace(files=write_files, drawers={**last.drawers, **by_round}, page=page)

@@ -47,7 +47,7 @@ from next_run import calibrated
 from PIL import Image
 
 from probewise import errors
-from probewise._display import ShowsItself
+from probewise._display import Reported, ShowsItself
 from probewise._progress import progress_shown
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main as command_line
@@ -218,7 +218,8 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     """Run a cell's commands; return what failed ("": nothing), and what the result says of the effect."""
     begun_s = time.process_time()
     row: dict[str, Any] = {"kind": "", "failure": ""}
-    said, kinds = io.StringIO(), [kind for kind in ShowsItself.__subclasses__() if "summary" in vars(kind)]
+    said, every = io.StringIO(), [*ShowsItself.__subclasses__(), *Reported.__subclasses__()]
+    kinds = [kind for kind in every if "summary" in vars(kind)]
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
         out = Path(name) / "out"
         summaries = [mock.patch.object(k, "summary", autospec=True, side_effect=k.summary) for k in kinds]

@@ -33,7 +33,7 @@ def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
     needed = summaries(study)[REFERENCE].mean.value
     assert f"{needed:.1f}" in page.split("<figure>")[0]
     assert all(row.name in page for row in ROWS)
-    assert "http" not in page
+    assert "://" not in page
     assert page.count("data:image/png") == 2
 
 

@@ -66,7 +66,7 @@ def test_a_page_needs_nothing_from_outside():
     reader = read(made)
     assert all(address.startswith("data:") for address in reader.addresses)
     assert "5 < 6" in "".join(reader.text)
-    assert "http" not in made
+    assert "://" not in made
     assert 'name="viewport"' in made
 
 

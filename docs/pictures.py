@@ -19,7 +19,6 @@ import tempfile
 from pathlib import Path
 
 from probewise.arm import read_geometry, shipped_geometry_path
-from probewise.cli._options import DEFAULT_SEED
 from probewise.diagnosis import diagnose_system, generators_of_diagnosis
 from probewise.report.diagnosis_figures import before_and_after
 from probewise.report.plots import png
@@ -27,6 +26,7 @@ from probewise.report.plots.apparatus import draw_arm_lengths
 from probewise.report.plots.canvas import figure_of
 from probewise.report.words import typeset_numbers
 from probewise.systems import read_simulator, read_table_for
+from probewise.verbs import DEFAULT_SEED
 
 STATIC = Path(__file__).parent / "_static"
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["audit", "calibrate", "diagnose", "explore", "fit", "predict"]
 
 # Defaults of the command line and of the functions below.
+DEFAULT_SEED = 2013  # year of the paper; printed with every run
 ORDERS = (1, 2, 3, 4)
 N_LIVE = 300
 CalibrationMethod: TypeAlias = Literal["quick", "full", "paper"]

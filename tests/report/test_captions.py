@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from hand_made import hand_made_sensor
@@ -71,6 +72,13 @@ def frames(run):
         exploration.robot_view_png(step, run.experiment, places[: step.number], levels=(10.0, 60.0), truth_mm=outline)
         for step in run.steps
     ]
+
+
+def test_a_plotted_view_is_in_a_figure_of_its_own(run):
+    first, second = run.plot(), run.plot()
+    assert {first.figure.number, second.figure.number} <= {*plt.get_fignums()}
+    assert first.figure is not second.figure
+    plt.close("all")
 
 
 def test_a_frame_in_the_axes_of_the_one_before_is_the_frame_in_new_axes(run, frames):

@@ -86,7 +86,8 @@ def test_a_result_is_saved_as_its_command_saves_it(verb, tmp_path):
         with pytest.raises(ParameterError, match=r"folder is|seed is"):
             found.save(folder, seed=seed)
     assert "data:image/" in found.to_html()
-    assert all(isinstance(ax, Axes | None) for ax in np.ravel(found.plot()))
+    drawn = [*np.ravel(found.plot()), *np.ravel(found.recording.plot() if verb == "fit" else [])]
+    assert all(isinstance(ax, Axes | None) for ax in drawn)
 
 
 def test_tables_come_out_as_data_frames(monkeypatch):

@@ -34,8 +34,9 @@ from probewise.arm import (
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._common import CommandError, print_result, print_warning, say, write_to_terminal
-from probewise.cli._options import ARMS, DEFAULT_SEED, SCENE, parse_finite_numbers, refuse_options
+from probewise.cli._options import ARMS, SCENE, parse_finite_numbers, refuse_options
 from probewise.errors import ParameterError, did_you_mean, require
+from probewise.verbs import DEFAULT_SEED
 
 if TYPE_CHECKING:
     from probewise.world import Surface, World

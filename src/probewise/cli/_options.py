@@ -15,9 +15,19 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from probewise.errors import ParameterError, did_you_mean, printable, require, shortened, shown
-from probewise.verbs import CALIBRATION, MAX_READINGS, METHOD, MODEL, N_LIVE, ORDERS, SHAPE, SHAPES, UTILITY
+from probewise.verbs import (
+    CALIBRATION,
+    DEFAULT_SEED,
+    MAX_READINGS,
+    METHOD,
+    MODEL,
+    N_LIVE,
+    ORDERS,
+    SHAPE,
+    SHAPES,
+    UTILITY,
+)
 
-DEFAULT_SEED = 2013  # year of the paper; printed with every run
 MOST = 100_000
 """Largest count that an option takes unless it says otherwise: of more readings, runs or live points the time, days at
 least, and the memory have no bound."""

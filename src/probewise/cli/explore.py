@@ -18,13 +18,13 @@ import numpy as np
 from probewise import experiment as experiments
 from probewise._arrays import FloatArray
 from probewise._signals import reporting_what_is_kept
-from probewise._writing import Drawings, Output, StagedFiles, checked_output_directory
+from probewise._writing import Drawings, checked_output_directory
 from probewise.arm import Geometry, Instrument, OwnInstrument, Reading
 from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
 from probewise.cli._common import finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descriptions
-from probewise.cli._options import DEFAULT_SEED, parse_numbers
+from probewise.cli._options import parse_numbers
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.experiment import Experiment, Exploration, HiddenShape, Model, Step, read_journal
@@ -34,7 +34,7 @@ from probewise.recordings import read_recording, shipped, write_bytes_atomically
 from probewise.report import exploration as report
 from probewise.report.pictures import animated_gif
 from probewise.scene import SHAPES, Card, Field
-from probewise.verbs import calibrate, naive_levels
+from probewise.verbs import DEFAULT_SEED, calibrate, naive_levels
 
 _SHIPPED = "shipped_sensor.json"
 
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
             search.draw_and_write(step, shadow)
             if step.replayed:
                 progress("going through the journal", step.number, n_before)
-    result = Exploration(search.experiment, tuple(steps))
+    result = Exploration(search.experiment, tuple(steps), sensor=search.sensor)
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
         search.write_results(result, progress=progress)
     lines = search.closing_lines(result, journal)
@@ -261,17 +261,8 @@ class Search:
         return report.robot_views_by_model_png(titled, readings, levels=levels, truth_mm=self.truth_mm)
 
     def write_results(self, result: Exploration, *, progress: Progress) -> None:
-        """Write result.json, posterior samples and sensor.json, then animation and report.
-
-        The sensor is the one given, with the effect that the run found in it, if any; not what --learn-sensor learnt.
-        """
+        """Write the files of a search, then animation and report; each step's picture is there already."""
         seed = self.arguments.seed
-
-        def write_files(stage: StagedFiles) -> None:
-            stage.write("result.json", experiments.result_json(result))
-            stage.write("samples.csv", experiments.samples_csv(result))
-            rng = np.random.default_rng(seed)
-            stage.write("sensor.json", experiments.repaired_sensor(self.sensor, result.last, rng=rng).to_json())
 
         def page(_: Mapping[str, bytes]) -> str:
             return report.page_html(
@@ -286,7 +277,8 @@ class Search:
             )
 
         animation = {"run.gif": lambda: animated_gif([frame for frame in self.frames if frame])}
-        self.drawings.write_results(Output(write_files, animation, page), inputs=self.files, progress=progress)
+        made = report.output_of(result, seed=seed)._replace(drawers=animation, page=page, outdated=())
+        self.drawings.write_results(made, inputs=self.files, progress=progress)
 
     def closing_lines(self, result: Exploration, journal: Path) -> Iterator[str]:
         """Yield the closing lines: the shape, what its sds leave out, probable sensor faults, and errors if known."""

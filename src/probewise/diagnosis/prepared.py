@@ -245,6 +245,10 @@ class Prepared:
         """Whether only some readings are used."""
         return self.everything is not self.recording
 
+    def is_refit_budget_spent(self, share: float = 1.0) -> bool:
+        """Return whether this share of the apparatus' budget is spent; a search of few effects has no limit."""
+        return self.sought is None and self.apparatus.is_refit_budget_spent(share)
+
     @cached_property
     def usable_rows(self) -> IntArray:
         """Rows with a usable reading, (n_usable,)."""

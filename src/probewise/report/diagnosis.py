@@ -62,6 +62,7 @@ from probewise.report.words import (
     typeset_numbers,
 )
 from probewise.systems import RunTable, run_table_csv, write_fitted_system
+from probewise.verbs import DEFAULT_SEED
 
 __all__ = ["figure_drawers", "output_of", "page_html", "sections", "summary_sentence"]
 
@@ -486,7 +487,7 @@ def output_of(
     """
     source = source or value.recording.source or "the readings"
     of_simulator = isinstance(value.recording.plan, RunTable)
-    rng = rng or generators_of_diagnosis(html.DEFAULT_SEED if seed is None else seed)[2]
+    rng = rng or generators_of_diagnosis(DEFAULT_SEED if seed is None else seed)[2]
     return Output(
         partial(_write_files_of_simulator if of_simulator else partial(_write_files_of_light_sensor, rng=rng), value),
         figure_drawers(value),

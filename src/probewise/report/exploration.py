@@ -36,6 +36,7 @@ from probewise.report.words import interval_text, number_text, probability_text,
 from probewise.scene import outlines, with_angles_near
 from probewise.scene.shapes import shape_and_columns
 from probewise.sensor import Chain
+from probewise.verbs import DEFAULT_SEED
 
 MODEL_NAMES = {"ssf": "SSF"}
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
@@ -89,22 +90,17 @@ def robot_view_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
-    drawn = _view_in_frame(step, experiment, readings, levels=levels, truth_mm=truth_mm)
-    return png(drawn, dpi=90, tight=False)
-
-
-def _view_in_frame(
-    step: Step, experiment: Experiment, readings: Sequence[tuple[float, float, float]], **at: Any
-) -> Axes:
     ax = axes_of_frame((8.4, 4.7), (0.75, 1.1, 1.15, 0.35))
-    draw_robot_view(step, experiment, readings, ax=ax, **at)
+    draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
-    return ax
+    return png(ax, dpi=90, tight=False)
 
 
 def draw_last_view(run: Exploration) -> Axes:
-    """Draw the robot's view at the end of a run, with its legend; return the axes."""
-    return _view_in_frame(run.last, run.experiment, **_seen(run))
+    """Draw the robot's view at the end of a run, with its legend, in a figure of its own; return the axes."""
+    ax = draw_robot_view(run.last, run.experiment, **_seen(run))
+    draw_field_legend(ax)
+    return ax
 
 
 def frame_png(run: Exploration, number: int) -> bytes:
@@ -343,7 +339,10 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
 
 
 def output_of(value: Exploration, *, seed: int | None = None) -> Output:
-    """Return what is written of a search: result.json, samples.csv, sensor.json if known, every step, page."""
+    """Return what is written of a search: result.json, samples.csv, sensor.json if known, every step, page.
+
+    The sensor is the run's, with the effect that was found in it, if any; not what was learnt along.
+    """
     known = None if value.hidden is None else value.hidden.parameters_by_hypothesis_name(value.experiment.names)
     frame = cache(partial(frame_png, value))  # the animation has them too
     frames = {f"frames/{k:03d}.png": partial(frame, k) for k in range(1, len(value.steps) + 1)}
@@ -352,12 +351,14 @@ def output_of(value: Exploration, *, seed: int | None = None) -> Output:
         stage.write("result.json", result_json(value))
         stage.write("samples.csv", samples_csv(value))
         if value.sensor is not None:
-            rng = np.random.default_rng(html.DEFAULT_SEED if seed is None else seed)
+            rng = np.random.default_rng(DEFAULT_SEED if seed is None else seed)
             stage.write("sensor.json", repaired_sensor(value.sensor, value.last, rng=rng).to_json())
 
     def page(drawn: Mapping[str, bytes]) -> str:
         model = "ssf" if isinstance(value.experiment.model, Chain) else "naive"
-        return page_html(value, [drawn[name] for name in frames], seed=seed, model=model, truth=known)
+        unit = "LEGO" if value.sensor is None else value.sensor.instrumentation.unit
+        shown = [drawn[name] for name in frames]
+        return page_html(value, shown, seed=seed, model=model, truth=known, unit=unit)
 
     animation = {"run.gif": lambda: animated_gif([draw() for draw in frames.values()])}
     return Output(write_files, frames | animation, page, ("frames/[0-9][0-9][0-9].png",), main="result.json")

@@ -96,9 +96,6 @@ Draw: TypeAlias = Callable[[str, Callable[[], bytes]], bytes]
 """Takes a figure's name and what draws it, and returns the figure; b"" if it could not be drawn."""
 
 
-DEFAULT_SEED = 2013  # of samples in files, if a result's own is not given; that of the command line
-
-
 def seed_fact(seed: int | None) -> dict[str, str]:
     """Return the seed of a run as a row of its facts; none if it is not known."""
     return {} if seed is None else {"seed": str(seed)}

@@ -27,7 +27,7 @@ from probewise.report.plots.canvas import AxesGrid, lay_out, png
 from probewise.report.plots.nested import corner_plot
 from probewise.report.plots.probabilities import hypothesis_probabilities
 from probewise.report.plots.readings import predicted_and_recorded_by_scan, readings_by_orientation
-from probewise.report.plots.residuals import recorded_against_predicted
+from probewise.report.plots.residuals import readings_in_order, recorded_against_predicted
 from probewise.report.plots.search import posterior_widths
 from probewise.report.plots.ssf import spatial_sensitivity
 from probewise.report.words import value_with_error, words_without_unit
@@ -66,6 +66,7 @@ _DRAWINGS: dict[type, Callable[[Any], Axes | AxesGrid]] = {
     FittedSensor: lambda value: spatial_sensitivity(value.field),
     Calibration: calibration.draw_ssf_by_n_gaussians,
     Recording: readings_by_orientation,
+    RunRecording: readings_in_order,
     Prediction: lambda value: predicted_and_recorded_by_scan(
         Recording(value.plan, value.readings), value.mean, value.sd
     ),

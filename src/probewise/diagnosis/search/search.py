@@ -798,7 +798,7 @@ def search(
     spent = apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
-        return prepared.sought is None and apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
+        return prepared.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
     state = SearchState(on_mean, prior, refits, always, progress, share_is_spent)
     if after is None:
@@ -921,11 +921,11 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
     """
     prepared, apparatus = searched.prepared, searched.prepared.apparatus
-    few = prepared.sought
-    if not needs_more_than_memoryless_noise(searched) or (few is None and apparatus.is_refit_budget_spent()):
+    if not needs_more_than_memoryless_noise(searched) or prepared.is_refit_budget_spent():
         return searched
     proposals = apparatus.proposed_formulas()
-    proposals = proposals if few is None else {name: proposals[name] for name in proposals if name in few}
+    if prepared.sought is not None:
+        proposals = {name: proposals[name] for name in proposals if name in prepared.sought}
     if not proposals:
         return searched
     progress("weighing formulas")
@@ -941,7 +941,7 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
         return searched
     more = replace(prepared, effects={**prepared.effects, **kept})
     again = search(more, prior=prior, after=searched, progress=progress)
-    return searched if few is None and apparatus.is_refit_budget_spent() else again
+    return searched if prepared.is_refit_budget_spent() else again
 
 
 def needs_more_than_memoryless_noise(searched: Searched) -> bool:

@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 from probewise.errors import ParameterError
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.inputs import delayed_held_column
 from probewise.systems.integrate import Integrations, integrate_states
 from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.step import steps_for_table
@@ -198,12 +197,10 @@ def _column(times, values, at, hold):
     return values[max(np.searchsorted(times, at, side="right") - 1, 0)]
 
 
-def _integrated(rates, start, times, breaks=()):
-    """Integrate rates(t, s, middle) from break to break, the rows among them; `middle` is that of the interval."""
-    inside = [t for t in breaks if times[0] < t < times[-1]]
-    edges = np.unique(np.concatenate([times, inside]))
+def _integrated(rates, start, times):
+    """Integrate rates(t, s, middle) from row to row; `middle` is that of the interval."""
     states = [np.asarray(start, dtype=float)]
-    for low, high in pairwise(edges):
+    for low, high in pairwise(times):
         if high - low < 1e-12:
             states.append(states[-1])
             continue
@@ -217,20 +214,19 @@ def _integrated(rates, start, times, breaks=()):
             atol=1e-12,
         )
         states.append(solved.y[:, -1])
-    return np.array(states)[np.searchsorted(edges, times)]
+    return np.array(states)
 
 
-def _spring_by_solve_ivp(hold, *, spring=lambda t, middle, k: _SPRING, delay=0.0, gain=1.0, breaks=()):
+def _spring_by_solve_ivp(hold, *, spring):
     """Return x at all rows; `spring` is a function of the time, the middle of the interval and the run."""
     out = np.empty(len(TABLE))
     for k, (times, force) in enumerate(zip(_TIMES, _FORCE, strict=True)):
 
         def rates(t, s, middle, k=k, times=times, force=force):
-            at = middle if hold == "previous" else t  # within an interval nothing that is held jumps
-            push = gain * _column(times, force, at - delay, hold)
+            push = _column(times, force, middle if hold == "previous" else t, hold)
             return [s[1], push - spring(t, middle, k) * s[0] - _FRICTION * s[1]]
 
-        out[_ROWS[k]] = _integrated(rates, [_START, 0.0], times, [*breaks, *(times + delay)])[:, 0]
+        out[_ROWS[k]] = _integrated(rates, [_START, 0.0], times)[:, 0]
     return out
 
 
@@ -241,37 +237,35 @@ def _spring_of_column(hold, columns, mean, a):
     return spring
 
 
-DELAY = "input_delay:force"
 CASES = {
-    "depends:k:force": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _FORCE, _MEAN_FORCE, 0.3)}),
-    "depends:k:warm": ([0.3], lambda hold: {"spring": _spring_of_column(hold, _WARM, _MEAN_WARM, 0.3)}),
-    "drifts:k": ([0.2], lambda hold: {"spring": lambda t, middle, k: _SPRING + 0.2 * t}),
-    "steps:k": ([1.0, 4.01], lambda hold: {"spring": lambda t, middle, k: _SPRING + (middle > 4.01), "breaks": [4.01]}),
+    "depends:k:force": ([0.3], lambda hold: _spring_of_column(hold, _FORCE, _MEAN_FORCE, 0.3)),
+    "depends:k:warm": ([0.3], lambda hold: _spring_of_column(hold, _WARM, _MEAN_WARM, 0.3)),
+    "drifts:k": ([0.2], lambda hold: _spring_of_column(hold, _TIMES, 0.0, 0.2)),
+    "steps:k": ([1.0, 4.01], lambda hold: _spring_of_column(hold, [1.0 * (t > 4.01) for t in _TIMES], 0.0, 1.0)),
     "differs:k": (
         [[0.5, -0.8][int(name)] for name in TABLE.scan_names],
-        lambda hold: {"spring": lambda t, middle, k: _SPRING + [0.5, -0.8][k]},
+        lambda hold: lambda t, middle, k: _SPRING + [0.5, -0.8][k],
     ),
-    DELAY: ([0.33], lambda hold: {"delay": 0.33}),
 }
 
 
 @pytest.mark.parametrize("hold", ["previous", "linear"])
 @pytest.mark.parametrize("name", CASES)
 def test_an_input_goes_on_between_rows_as_what_moves_it(name, hold, about_of, forms_of):
-    """A column that is held or on straight lines, as the law says, late or not; time; a jump at its time; a run."""
+    """What an effect makes of a parameter at the rows is held, or on straight lines, as the law says."""
     setting, how = CASES[name]
     about = about_of[hold]
     found = _predicted(about, forms_of[hold][name], np.array([setting]))[0]
-    expected = _spring_by_solve_ivp(hold, **how(hold))
+    expected = _spring_by_solve_ivp(hold, spring=how(hold))
     size = np.abs(expected - about.predicted).max()
     assert size > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-5 * size)
 
 
 @pytest.mark.parametrize("hold", ["previous", "linear"])
-@pytest.mark.parametrize("name", ["depends:k:force", "drifts:k", "steps:k", DELAY])
+@pytest.mark.parametrize("name", ["depends:k:force", "steps:k", "input_delay:force"])
 def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name, hold, about_of, forms_of):
-    about, setting = about_of[hold], np.array(CASES[name][0])
+    about, setting = about_of[hold], np.array(CASES[name][0] if name in CASES else [0.33])
     settings = setting * (1 + 0.02 * np.random.default_rng(1).normal(size=(5, len(setting))))
     refusing = Integrations(n_refused=99)  # it is stepped
     stepped = replace(about, system=replace(about.system, integrations=refusing))
@@ -284,51 +278,15 @@ def test_all_steps_at_once_lead_where_stepping_leads_with_effects_on_inputs(name
     assert not refusing.known
 
 
-def test_a_battery_reads_the_current_of_one_dead_time_earlier():
-    """V = u0 - r I - v, v' = (d I^2 - v) / tau: the reading and the rates see the late current, also its square."""
-    rng = np.random.default_rng(2)
-    times = np.cumsum(rng.choice([0.3, 1.0, 2.5], 60))
-    current = np.repeat(rng.choice([0.0, 1.0, 2.0, 3.0, -1.0], 20), 3)
-    table = RunTable({"t_s": times, "amp": current, "y": np.zeros(60)}, time="t_s")
-    r, d, tau, delay = 0.05, 0.03, 8.0, 1.7
-    law = Law(
-        {"v": 0.0},
-        lambda s, p, u: {"v": (p["d"] * u["amp"] ** 2 - s["v"]) / p["tau"]},
-        lambda s, p, u: 3.7 - p["r"] * u["amp"] - s["v"],
-    )
-    about = _about(law, ("r", "d", "tau"), table, (r, d, tau), max_step=1.0)
-    found = _predicted(about, bind_forms(about)["input_delay:amp"], np.array([[delay]]))[0]
-
-    def rates(t, s, middle):
-        return [(d * _column(times, current, middle - delay, "previous") ** 2 - s[0]) / tau]
-
-    v = _integrated(rates, [0.0], times, times + delay)[:, 0]
-    late = np.array([_column(times, current, t - delay, "previous") for t in times])
-    np.testing.assert_allclose(found, 3.7 - r * late - v, atol=1e-7)
-
-
-def test_a_late_column_is_held_exactly_one_row_later_where_the_dead_time_is_a_gap():
-    """Times of a tenth of a second are not exact: a dead time of three of them ends at a row, not just before it."""
-    times = 0.1 * np.arange(40)
-    values = np.random.default_rng(1).normal(size=(1, 40))
-    table = RunTable({"t_s": times, "u": values[0]}, time="t_s")
-    found = delayed_held_column(values, np.array([[0.0], [0.3], [99.0]]), table)
-    np.testing.assert_array_equal(found[0], values[0])
-    np.testing.assert_array_equal(found[1], values[0, np.maximum(np.arange(40) - 3, 0)])
-    np.testing.assert_array_equal(found[2], np.full(40, values[0, 0]))
-
-
-def test_a_late_column_on_straight_lines_conserves_what_it_brings():
+def test_a_late_column_that_is_held_conserves_what_it_brings():
     """x' = u: what came until the last row is all that the column brought until one dead time before."""
     times = np.cumsum(np.random.default_rng(5).choice([0.2, 1.0, 3.0], 40))
     flow = np.repeat([0.0, 4.0, 1.0, 6.0], 10)
     table = RunTable({"t_s": times, "flow": flow, "y": np.zeros(40)}, time="t_s")
-    law = Law({"x": 0.0}, lambda s, p, u: {"x": p["gain"] * u["flow"] + 0 * s["x"]}, hold="linear")
+    law = Law({"x": 0.0}, lambda s, p, u: {"x": p["gain"] * u["flow"] + 0 * s["x"]})
     about = _about(law, ("gain",), table, (1.0,), max_step=1.0)
-    taus = np.array([[0.07], [0.9], [4.4]])
+    taus = np.array([[0.0], [0.07], [0.9], [4.4]])
     found = _predicted(about, bind_forms(about)["input_delay:flow"], taus)
     for x, tau in zip(found, taus[:, 0], strict=True):
-        fine = np.unique(np.concatenate([np.linspace(times[0] - tau, times[-1] - tau, 1000), times]))
-        fine = fine[fine <= times[-1] - tau]
-        brought = np.sum(np.diff(fine) * np.interp(0.5 * (fine[1:] + fine[:-1]), times, flow))
-        assert x[-1] == pytest.approx(brought, rel=1e-9)
+        brought = np.diff(np.clip(times, None, times[-1] - tau)) @ flow[:-1]
+        assert x[-1] == pytest.approx(brought + tau * flow[0], rel=1e-9)

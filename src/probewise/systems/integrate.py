@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
-from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, StepPart, of_columns, values_at_rows
+from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, of_columns, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import FOURTH_ORDER, N_LONGER, RODAS, Rosenbrock, RungeKutta, Steps
 
@@ -45,7 +45,7 @@ def integrate_states(
     """Integrate a law step by step; return every state at every row, by name, (n_samples, n_points).
 
     Parameters are (n_samples, 1), or (n_samples, n_points) if they vary by row; columns (n_points,), or
-    (n_samples, n_points) if an effect changes them; as recorded, of those that `motion` delays.
+    (n_samples, n_points) if an effect changes them.
     """
     motion, known = LawWithEffects(motion) if isinstance(motion, Law) else motion, {*steps.n_before.tolist()}
     kept = [s for k, s in enumerate(states_by_step(motion, steps, parameters, columns)) if k in known]
@@ -56,14 +56,12 @@ def states_by_step(motion: LawWithEffects, steps: Steps, parameters: Values, col
     """Integrate the law: yield all states, (n_states, n_samples, n_runs), at the start and after each step."""
     s = initial_states(motion, steps, parameters, number_of_samples(parameters, columns))
     with np.errstate(all="ignore"):
-        given = LawInputs(motion, steps, parameters, columns)
+        given = LawInputs(motion.law, steps, parameters, columns)
         yield s
         for k, n in enumerate(steps.n_steps.tolist()):
-            inputs = given.of_gaps(slice(k, k + 1), 1)
+            stepper = Stepper(motion, steps.method, given.of_gaps(slice(k, k + 1), 1))
             for i in range(n):
-                for part in given.parts_of_steps(inputs, np.array([k]), i / n, 1 / n):
-                    s = step_in_part(motion, steps.method, part, s)
-                yield s
+                yield (s := stepper.step(s, i / n, 1 / n))
 
 
 def evaluations_per_step(motion: LawWithEffects, method: RungeKutta | Rosenbrock) -> int:
@@ -170,17 +168,6 @@ class Stepper:
         return self.method.advance(lambda at, given: rates(at, given, ways), between, s, begin, length, between.gap)
 
 
-def step_in_part(motion: LawWithEffects, method: RungeKutta | Rosenbrock, part: StepPart, s: FloatArray) -> FloatArray:
-    """Return the states, (n_states, n_samples, n_columns), after a part of some steps; other columns stay as is."""
-    columns, inputs, begin, length = part
-    stepper = Stepper(motion, method, inputs)
-    if columns is None:
-        return stepper.step(s, begin, length)
-    out = s.copy()
-    out[:, :, columns] = stepper.step(s[:, :, columns], begin, length)
-    return out
-
-
 def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:
     """Return where a straight line through (low, at_low) and (high, at_high) is 0; `low` if it does not fall."""
     apart = at_low - at_high
@@ -247,9 +234,9 @@ def integrate_from_known_trajectories(
     n_samples, n_runs = len(theta), steps.gaps.shape[1]
     motion, *given = law_and_inputs(np.arange(n_samples))
     evaluations = evaluations_per_step(motion, steps.method)
-    n_parts = int(steps.n_steps.sum() + len(steps.n_steps) * bool(motion.dead_times))  # a late column divides steps
+    n_steps = int(steps.n_steps.sum())
     if n_samples * n_runs > _FEW_NEAR or memory.n_refused >= _REFUSALS:
-        memory.n_evaluations += n_parts * evaluations
+        memory.n_evaluations += n_steps * evaluations
         return integrate_states(motion, steps, *given)
     states, left, cost, refused = np.zeros(0), np.arange(n_samples), 0, False
     every = [each for each in memory.known if each.steps == steps]
@@ -278,7 +265,7 @@ def integrate_from_known_trajectories(
             states = stepped
         else:
             states[:, left] = stepped
-        cost += n_parts
+        cost += n_steps
         finite = np.flatnonzero(np.isfinite(stepped).all(axis=(0, 2, 3)))[:_MOST_NEW].tolist()
         memory.add([KnownTrajectory(steps, effects, theta[left[k]], stepped[:, k]) for k in finite])
     memory.n_evaluations += cost * evaluations
@@ -347,23 +334,19 @@ class _NewtonState:
         n_samples = self.states.shape[1]
         self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
         self.done, self.active = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
-        self._chosen, self._parts = np.zeros(0, dtype=np.int64), list[StepPart]()
-        self._motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
-        self.states[:, :, 0] = initial_states(self._motion, self.steps, parameters, n_samples)
+        self._chosen = np.zeros(0, dtype=np.int64)
+        motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
+        self.states[:, :, 0] = initial_states(motion, self.steps, parameters, n_samples)
 
     def states_at_step_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Take each step from the state before it; return the states after it, (n_states, n, n_steps, n_runs)."""
         steps, begins = self.steps, states[:, :, :-1]
         if not np.array_equal(samples, self._chosen):
-            self._motion, parameters, columns = self.law_and_inputs(samples)
-            given = LawInputs(self._motion, steps, parameters, columns)
-            inputs = given.of_gaps(steps.gap, len(steps.gap))
-            self._parts = [*given.parts_of_steps(inputs, steps.gap, steps.begin, steps.length)]
-            self._chosen = samples
-        after = begins.reshape(len(begins), len(samples), -1)
-        for part in self._parts:
-            self.n_evaluated += len(samples) * (len(steps.begin) if part[0] is None else len(part[0]))
-            after = step_in_part(self._motion, steps.method, part, after)
+            motion, parameters, columns = self.law_and_inputs(samples)
+            inputs = LawInputs(motion.law, steps, parameters, columns).of_gaps(steps.gap, len(steps.gap))
+            self._chosen, self._stepper = samples, Stepper(motion, steps.method, inputs)
+        self.n_evaluated += len(samples) * len(steps.begin)
+        after = self._stepper.step(begins.reshape(len(begins), len(samples), -1), steps.begin, steps.length)
         return after.reshape(begins.shape)
 
     def step_residuals(self, samples: IntArray) -> FloatArray:

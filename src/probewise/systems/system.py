@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -288,14 +288,14 @@ class SystemChain:
 
     def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
-        system, recorded = self.system, columns_without_reading(self.system.simulator, plan)
-        columns = self._apply_stage(Stage.INPUT, recorded, theta, plan)
+        system = self.system
+        columns = self._apply_stage(Stage.INPUT, columns_without_reading(system.simulator, plan), theta, plan)
         parameters = self._apply_stage(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
         caller, law = system.caller, system.simulator.law
         if caller is None:
             assert law is not None
             try:
-                states = self._integrated_states(law, parameters, columns, recorded, theta, plan)
+                states = self._integrated_states(law, parameters, columns, theta, plan)
                 readings = readings_of_states(law, states, parameters, columns)
             except ProbewiseError:
                 raise
@@ -317,24 +317,13 @@ class SystemChain:
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
     def _integrated_states(
-        self, law: Law, parameters: Values, columns: Columns, recorded: Columns, theta: FloatArray, plan: RunTable
+        self, law: Law, parameters: Values, columns: Columns, theta: FloatArray, plan: RunTable
     ) -> dict[str, FloatArray]:
-        """Integrate the law with its effects; return every state at the rows, (n_samples, n_points), by name.
-
-        `columns` are those `recorded` with all effects on inputs; rates take them without those that act between rows.
-        """
-        between = {effect: getattr(effect.apply, "between_rows", None) for effect in self.effects}
-        of_rates = columns
-        if any(act is not None and effect.stage is Stage.INPUT for effect, act in between.items()):
-            of_rates = self._apply_stage(Stage.INPUT, recorded, theta, plan, but=between)
+        """Integrate the law with its effects; return every state at the rows, (n_samples, n_points), by name."""
 
         def law_and_inputs(samples: IntArray) -> tuple[LawWithEffects, dict[str, FloatArray], dict[str, NDArray[Any]]]:
-            motion = LawWithEffects(law)
-            for effect, own in self._effects_with_theta_columns:
-                if (act := between[effect]) is not None:
-                    motion = act(motion, theta[samples, own])
-            motion = self._apply_stage(Stage.RATE, motion, theta[samples], plan)
-            return motion, take_samples(parameters, samples), take_samples(of_rates, samples)
+            motion = self._apply_stage(Stage.RATE, LawWithEffects(law), theta[samples], plan)
+            return motion, take_samples(parameters, samples), take_samples(columns, samples)
 
         steps, memory, n_own = self.system.steps(plan), self.system.integrations, self.system.n_params
         of = (self.system.runs, self.effects)
@@ -348,12 +337,9 @@ class SystemChain:
                     view = effect.apply(view, theta[:, columns], plan)
         return limited_to_range(view, self.system, plan) if self.system.limited else view
 
-    def _apply_stage(
-        self, stage: Stage, value: Any, theta: FloatArray, plan: Any, *, but: Mapping[AnyEffect, Any] | None = None
-    ) -> Any:
-        """Return the value of a stage with its effects, of which those with a value in `but` are left out."""
+    def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._effects_with_theta_columns:
-            if effect.stage is stage and (but is None or but[effect] is None):
+            if effect.stage is stage:
                 value = effect.apply(value, theta[:, columns], plan)
         return value
 

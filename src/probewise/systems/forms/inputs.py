@@ -35,13 +35,12 @@ from probewise.systems.forms.readings import delayed_values, values_at_earlier_t
 from probewise.systems.forms.reference import (
     AMPLITUDE,
     POSITIVE,
-    ActInTime,
     Form,
     ReferenceFit,
     clipping_between,
     period_with_sd,
 )
-from probewise.systems.law import LawWithEffects, Limit, rounding_of_times
+from probewise.systems.law import LawWithEffects, Limit
 from probewise.systems.table import covariate_of_column
 
 _NO_SHARE = 1e-9  # of what a bound stops: none
@@ -112,11 +111,8 @@ def _forms_on_column(about: ReferenceFit, name: str) -> Iterator[Form]:
         yield from size("backlash", play, ("width", name), late, f"{name} has {{0}} of play")
     yield from _periodic_error_form(about, name)
     if table.has_varying_time:
-        held, is_law = about.is_held_between_rows(name), about.system.simulator.law is not None
-        of_held = delayed_held_column if is_law else mean_of_delayed_held_column
-        delay, says = _column_changer(name, of_held if held else delayed_values), f"{name} acts with a delay of {{0}}"
-        if is_law:
-            delay = ActInTime(delay, lambda motion, theta: motion.plus(dead_times={name: theta[:, :1]}))
+        late_values = mean_of_delayed_held_column if about.is_held_between_rows(name) else delayed_values
+        delay, says = _column_changer(name, late_values), f"{name} acts with a delay of {{0}}"
         yield from size("input_delay", delay, ("tau_s", unit), late, f"{says} {unit}", needs_rising_time=True)
 
 
@@ -149,16 +145,6 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     guess, counted_from = 1e-4 * float(np.std(values)), origin_in_words(name, origin)
     given = (f"periodic_error:{name}", Stage.INPUT, *own)
     yield from about.form(*given, guess=guess, kind=WaveEffect, counted_from=counted_from)
-
-
-@within_runs
-def delayed_held_column(values: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the value that a held column had one dead time before each row, (n_samples, n_points)."""
-    earlier = time - theta[:, :1] + rounding_of_times(time)
-    before = np.clip(np.searchsorted(time, earlier, side="right") - 1, 0, None)
-    before = np.where(theta[:, :1] == 0, np.arange(len(time)), before)  # also of rows with the same time
-    every, rows = np.broadcast_arrays(values, before)
-    return np.take_along_axis(every, rows, axis=1)
 
 
 @within_runs

@@ -27,15 +27,12 @@ from probewise.sensor import Stage
 from probewise.systems.forms.reference import (
     AMPLITUDE,
     POSITIVE,
-    ActBetween,
-    ActInTime,
     BlockForm,
     Form,
     ReferenceFit,
     flag,
     period_with_sd,
 )
-from probewise.systems.law import Jump, LawWithEffects
 from probewise.systems.table import RunTable, covariate_of_column
 
 _AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
@@ -169,13 +166,11 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
 class Modulation:
     """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `declared` is what `ReferenceFit.form` takes of it: parameters, covariates, words and more; `between_rows` what a
-    parameter does between the rows of a law, where that is not as its `hold` says.
+    `declared` is what `ReferenceFit.form` takes of it: parameters, covariates, words and more.
     """
 
     at_rows: Callable[[FloatArray, RunTable], FloatArray]
     declared: dict[str, Any]
-    between_rows: ActBetween | None = None
 
 
 def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
@@ -187,11 +182,7 @@ def linear_drift_modulation(about: ReferenceFit, what: str, unit: str) -> Modula
         "says": lambda mean, sd: f"{what} drifts by {value_with_sd(mean[0], sd[0], unit)} per {per}",
         "counted_from": origin_in_words(table.time, origin, per),
     }
-
-    def between_rows(motion: LawWithEffects, theta: FloatArray) -> LawWithEffects:
-        return motion.plus(drifts={what: theta[:, :1]})
-
-    return Modulation(lambda theta, rows: theta[:, :1] * (rows.time_s - origin), declared, between_rows)
+    return Modulation(lambda theta, rows: theta[:, :1] * (rows.time_s - origin), declared)
 
 
 def column_proportional_modulation(about: ReferenceFit, what: str, unit: str, name: str) -> Modulation:
@@ -230,9 +221,6 @@ def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, m
         at, begin, end = change_points.variable_at_rows(rows), theta[:, -1:], theta[:, 1:2]
         return np.asarray(theta[:, :1] * ((at > begin) & ((at <= end) | (end <= begin))))
 
-    def between_rows(motion: LawWithEffects, theta: FloatArray) -> LawWithEffects:
-        return motion.plus(jumps=(Jump(what, theta[:, :1], theta[:, 1:2]),))
-
     size, begin = {"a": (AMPLITUDE, unit)}, {f"at_{place}": (Uniform(first, last), of_place)}
     never, middle = Fixed(first - 2.0, first - 1.0), 0.5 * (first + last)
     declared = {"covariates": ("row",) if by_row else ("time",), "says": says, "change_points": change_points}
@@ -241,7 +229,7 @@ def change_point_step_modulation(about: ReferenceFit, what: str, unit: str, *, m
         declared |= {"parameters": size | until | begin, "entries": entries, "kind": BlockForm, "never": never}
     else:
         declared |= {"parameters": size | begin, "entries": np.array([[[1.0, middle]]]), "kind": StepEffect}
-    return Modulation(at_rows, declared, None if by_row else between_rows)
+    return Modulation(at_rows, declared)
 
 
 def value_per_run_modulation(about: ReferenceFit, what: str, unit: str) -> Modulation:
@@ -338,10 +326,9 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or float(np.ptp(prior.from_unit(_QUARTILES))))
 
         def varied(form: str, how: Modulation, size: float, name: str = name) -> Iterator[Form]:
-            def at_rows(value: Any, theta: FloatArray, table: RunTable) -> Any:
+            def act(value: Any, theta: FloatArray, table: RunTable) -> Any:
                 return {**value, name: value[name] + how.at_rows(theta, table)}
 
-            act = at_rows if how.between_rows is None else ActInTime(at_rows, how.between_rows)
             return modulated_form(about, form, Stage.PARAMETER, how, act, size)
 
         of = name, unit_of_name(name)

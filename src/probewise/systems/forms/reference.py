@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations, permutations
@@ -30,7 +30,6 @@ from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.calls import call_on_views
 from probewise.systems.integrate import integrate_states
-from probewise.systems.law import LawWithEffects
 from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
@@ -56,23 +55,8 @@ _FLAG_WIDTH = 1e-9  # of its prior
 _BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
 _BLOCKS = 0.1  # odds of a step that goes back: as those of a second wave
 
-ActBetween = Callable[[LawWithEffects, FloatArray], LawWithEffects]
-"""Function of a law with other effects and parameters (n_samples, n_params); adds what the effect does between rows."""
-
 Form: TypeAlias = Effect
 """An effect that is bound to a target of a simulator: its act takes the table of the runs."""
-
-
-@dataclass(frozen=True)
-class ActInTime:
-    """An act `at_rows` of an effect that acts otherwise between the rows of a law than the law's `hold` says."""
-
-    at_rows: Act
-    between_rows: ActBetween
-
-    def __call__(self, value: Any, theta: FloatArray, table: RunTable) -> Any:
-        """Return the stage's value at the rows with the effect."""
-        return self.at_rows(value, theta, table)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -356,8 +340,9 @@ class ReferenceFit:
         """Return whether the model holds a column until the next row, so that a value acts on later readings only."""
         if self.known is not None:
             return column in self.known.held
-        if self.system.simulator.law is not None:
-            return self.system.simulator.law.hold == "previous"
+        law = self.system.simulator.law
+        if law is not None and law.hold == "linear":
+            return False
         rows = max(self.table.rows_by_scan(), key=len)
         there = np.zeros(len(self.table))
         there[rows[len(rows) // 2]] = _NUDGE * float(np.nanstd(self.table.covariates[column]))

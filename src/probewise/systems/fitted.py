@@ -53,8 +53,8 @@ class FittedSystem(NamedSamples):
     level
         Smallest and largest of the readings predicted for the recording, in their unit.
     max_step, stiff
-        Largest integration step at fourth order, in the unit of time, infinite without a law; and whether a linearly
-        implicit method takes it.
+        Largest integration step, in the unit of time, infinite without a law; and whether a linearly implicit method
+        takes it.
     known
         The recording and fit by which the effects were scaled and given origins; None if there are noise effects at
         most.

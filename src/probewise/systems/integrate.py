@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, of_columns, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
-from probewise.systems.step import FOURTH_ORDER, N_LONGER, RODAS, Rosenbrock, RungeKutta, Steps
+from probewise.systems.step import Method, Steps, rosenbrock_step
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
@@ -64,18 +64,13 @@ def states_by_step(motion: LawWithEffects, steps: Steps, parameters: Values, col
                 yield (s := stepper.step(s, i / n, 1 / n))
 
 
-def evaluations_per_step(motion: LawWithEffects, method: RungeKutta | Rosenbrock) -> int:
+def evaluations_per_step(motion: LawWithEffects, method: Method) -> int:
     """Return about how often a step of a law evaluates its rates, of all samples together.
 
     Friction asks for the direction of motion, and splits steps in which a state comes to rest or breaks loose: by half
     as much again, where samples of a search do so at different times.
     """
-    if isinstance(method, Rosenbrock):
-        n_stages = 13 + 2 * len(motion.law.states)  # its linear algebra included
-    elif method is FOURTH_ORDER or not motion.may_halt:
-        n_stages = len(method.b)
-    else:
-        n_stages = N_LONGER * len(FOURTH_ORDER.b)
+    n_stages = 9 + 2 * len(motion.law.states) if method is rosenbrock_step else 4  # with its linear algebra
     return n_stages + n_stages // 2 if motion.friction else n_stages
 
 
@@ -90,27 +85,19 @@ def initial_states(motion: LawWithEffects, steps: Steps, parameters: Values, n_s
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """Steps of a law, by a Runge-Kutta or a Rosenbrock method, with its inputs `between` two rows.
+    """Steps of a law by a method, with its inputs `between` two rows.
 
     States are (n_states, n_samples, n_columns). In the methods `begin` and `length` are shares of the gap: numbers, or
     one for each column.
     """
 
     motion: LawWithEffects
-    method: RungeKutta | Rosenbrock
+    method: Method
     between: StepInputs
 
     def step(self, s: FloatArray, begin: Any, length: Any) -> FloatArray:
-        """Return the states after a step; it is split where friction brings a state to rest or lets it go.
-
-        A motion that may come to a halt within a step takes one of eighth order as several of fourth order.
-        """
+        """Return the states after a step; it is split where friction brings a state to rest or lets it go."""
         motion = self.motion
-        if motion.may_halt and self.method is not FOURTH_ORDER and self.method is not RODAS:
-            shorter, part = replace(self, method=FOURTH_ORDER), length / N_LONGER
-            for k in range(N_LONGER):
-                s = shorter.step(s, begin + k * part, part)
-            return s
         ways = motion.directions_of_motion(s, self.between(begin))
         after = self._step_without_split(s, begin, length, ways)
         for state, way in ways.items():
@@ -165,7 +152,7 @@ class Stepper:
 
     def _step_without_split(self, s: FloatArray, begin: Any, length: Any, ways: dict[int, Any]) -> FloatArray:
         rates, between = self.motion.rates, self.between
-        return self.method.advance(lambda at, given: rates(at, given, ways), between, s, begin, length, between.gap)
+        return self.method(lambda at, given: rates(at, given, ways), between, s, begin, length, between.gap)
 
 
 def _zero_of_straight_line(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:

@@ -60,11 +60,6 @@ class LawWithEffects:
                 own[what] = {**known, **{name: known[name] + v if name in known else v for name, v in new.items()}}
         return replace(self, **own)
 
-    @property
-    def may_halt(self) -> bool:
-        """Whether a state may come to a halt within a step."""
-        return bool(self.limits or self.friction)
-
     @cached_property
     def friction_of(self) -> dict[int, FloatArray]:
         """The size of the friction by the number of the state."""

@@ -111,8 +111,7 @@ class Law:
     rate of each state by name, per unit of time; all are arrays that broadcast against each other: np.where and np.sin,
     no `if` and no math.sin. `observe` returns the reading, an array that broadcasts to the states' shape; None: the
     first state. `hold` says how columns go on between rows: "previous" (held) or "linear". `max_step_s` is the largest
-    integration step at fourth order, in the unit of time; one of eighth order, taken where gaps need several, may be
-    three times as long. None: chosen automatically.
+    integration step, in the unit of time; None: chosen automatically.
     """
 
     states: Mapping[str, str | float]

@@ -50,8 +50,8 @@ class System:
     simulator, runs
         The user's simulator, and the names of the runs.
     max_step, stiff
-        Largest integration step at fourth order, in the unit of time, if there is a law; and whether it is integrated
-        by a linearly implicit method.
+        Largest integration step, in the unit of time, if there is a law; and whether it is integrated by a linearly
+        implicit method.
     caller
         Caller of `simulate`, if there is no law.
     first

@@ -12,11 +12,9 @@ import io
 import json
 import math
 import os
-import struct
 import sys
 import traceback
 import warnings
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -24,7 +22,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy
 
 from probewise._arrays import FloatArray
 from probewise._kinds import checked_path
@@ -230,12 +227,8 @@ def shipped(name: str) -> Path:
     return Path(str(resources.files("probewise"))) / "data" / f"{name}.csv"
 
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # grey, RGB, palette, grey and RGB with alpha
-_ALLOWED = "a PNG of 8 bits per channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
+_ALLOWED = "a PNG of 8 bits per channel, or an .npy with a two-dimensional array of numbers from 0 to 255, of at most 1e8 pixels"
 _LARGEST_PIXELS = 100_000_000
-# By version; 3.0 is only for structured arrays.
-_NPY_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def is_file_name_without_path(name: str) -> bool:
@@ -250,11 +243,28 @@ def read_image(path: Path) -> FloatArray:
     0, as outside the image. FileError if it is not such an image, or is damaged.
     """
     content = read_bytes(path, _ALLOWED)
-    if path.suffix.lower() == ".npy":
-        return _albedo_from_npy(path, content)
-    if not content.startswith(_SIGNATURE):
-        raise FileError(path, "the file does not begin as a PNG does", _ALLOWED)
-    return _albedo_from_png(path, content)
+    try:
+        return (_albedo_from_npy if path.suffix.lower() == ".npy" else _albedo_from_png)(io.BytesIO(content))
+    except Exception as error:  # damaged files make Pillow and NumPy raise many kinds
+        raise FileError(path, f"no such picture ({message_of(error, kind=False)})", _ALLOWED) from error
+
+
+def _albedo_from_npy(file: io.BytesIO) -> FloatArray:
+    values = np.load(file, allow_pickle=False)
+    is_picture = isinstance(values, np.ndarray) and values.ndim == 2 and values.dtype.kind in "uif" and values.size > 0
+    if not is_picture or values.size > _LARGEST_PIXELS or not ((values >= 0) & (values <= 255)).all():
+        raise ValueError(shown(values))
+    return np.asarray(values, dtype=np.float64) / 255.0
+
+
+def _albedo_from_png(file: io.BytesIO) -> FloatArray:
+    from PIL import Image as Pillow  # imported here: most recordings have no image
+
+    with Pillow.open(file, formats=["PNG"]) as picture:
+        if picture.mode not in ("1", "L", "LA", "P", "RGB", "RGBA") or picture.width * picture.height > _LARGEST_PIXELS:
+            raise ValueError(f"{picture.width} x {picture.height} pixels of the mode {picture.mode}")
+        pixels = np.asarray(picture.convert("RGBA"), dtype=np.float64)
+    return np.asarray(pixels[..., :3].mean(axis=-1) / 255.0 * (pixels[..., 3] / 255.0))
 
 
 def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
@@ -279,63 +289,3 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     out = io.BytesIO()
     Pillow.fromarray(grey.astype(np.uint8)).save(out, "PNG")
     return out.getvalue()
-
-
-def _albedo_from_npy(path: Path, content: bytes) -> FloatArray:
-    allowed = f"a two-dimensional array of numbers, at most {_LARGEST_PIXELS}"
-    file = io.BytesIO(content)
-    try:
-        shape, by_columns, dtype = _NPY_HEADERS[npy.read_magic(file)](file)
-    # numpy parses the header as Python; a malicious one can raise almost any exception.
-    except Exception as error:
-        raise FileError(path, f"not readable as .npy ({error})", allowed) from error
-    size = math.prod(shape)
-    if len(shape) != 2 or dtype.kind not in "uif" or min(shape) < 1 or size > _LARGEST_PIXELS:
-        raise FileError(path, f"{dtype} of shape {shape}", allowed)
-    n_bytes = len(content) - file.tell()
-    if n_bytes != size * dtype.itemsize:
-        raise FileError(path, f"{n_bytes} bytes of numbers", f"{size * dtype.itemsize} for {dtype} of shape {shape}")
-    values = np.frombuffer(content, dtype, offset=file.tell()).reshape(shape, order="F" if by_columns else "C")
-    albedo = values.astype(np.float64)
-    bad = ~((albedo >= 0) & (albedo <= 255))
-    if bad.any():
-        row, column = (int(k) for k in np.argwhere(bad)[0])
-        raise FileError(path, f"pixel [{row}, {column}] is {albedo[row, column]}", "0 to 255")
-    return albedo / 255.0
-
-
-def _albedo_from_png(path: Path, content: bytes) -> FloatArray:
-    from PIL import Image as Pillow  # imported here: most recordings have no image
-
-    if content[12:16] != b"IHDR" or len(content) < 33:
-        raise FileError(path, "the PNG has no header", _ALLOWED)
-    width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", content[16:29])
-    if depth != 8 or colour not in _CHANNELS or interlace or not 0 < width * height <= _LARGEST_PIXELS:
-        found = f"{width} x {height} pixels, {depth} bits, colour type {colour}, interlace {interlace}"
-        raise FileError(path, found, f"{_ALLOWED}, at most {_LARGEST_PIXELS} pixels")
-    try:
-        Pillow.open(io.BytesIO(content), formats=["PNG"]).verify()  # the checksums
-        with Pillow.open(io.BytesIO(content), formats=["PNG"]) as picture:
-            palette = b"" if picture.palette is None else picture.palette.getdata()[1]  # before it is padded
-            if picture.mode == "P" and len(palette) <= 3 * int(np.asarray(picture).max()):
-                raise ValueError("the palette is missing or too short for the pixels")
-            pixels = np.asarray(picture.convert("RGBA"), dtype=np.float64)
-        size = height * (1 + width * _CHANNELS[colour])
-        n_bytes = _count_bytes_of_pixels(content, size + 1)
-    except Exception as error:  # damaged files make Pillow raise many kinds
-        raise FileError(path, f"the PNG is damaged or cut short ({error})", _ALLOWED) from error
-    if n_bytes != size:  # Pillow takes missing lines for black
-        raise FileError(path, f"{n_bytes} bytes of pixel data", f"{size} bytes for {width} x {height} pixels")
-    return np.asarray(pixels[..., :3].mean(axis=-1) / 255.0 * (pixels[..., 3] / 255.0))
-
-
-def _count_bytes_of_pixels(content: bytes, most: int) -> int:
-    """Count the decompressed bytes of a PNG's pixels up to `most`: a small file can expand to gigabytes."""
-    packed, at = bytearray(), len(_SIGNATURE)
-    while at < len(content):
-        begin = at + 8
-        end = begin + int.from_bytes(content[at : at + 4], "big")
-        if content[at + 4 : begin] == b"IDAT":
-            packed += content[begin:end]
-        at = end + 4  # behind the checksum
-    return len(zlib.decompressobj().decompress(packed, most))

@@ -30,8 +30,10 @@ from probewise.world import Blob, World, gaussian_spot
 
 RNG = np.random.default_rng(0)
 EDGE = HalfPlane(0.0, 0.0)
-RECORDING = Recording.from_arrays(
-    x_mm=np.linspace(-20, 20, 30), y_mm=0, readings=np.linspace(10, 60, 30), patterns={"edge": EDGE}, unit="LEGO"
+RECORDING = Recording.from_table(
+    {"x_mm": np.linspace(-20, 20, 30), "y_mm": 0, "reading": np.linspace(10, 60, 30)},
+    patterns={"edge": EDGE},
+    unit="LEGO",
 )
 PLAN = RECORDING.plan
 # The pattern is named, and nobody says what it is.
@@ -59,9 +61,8 @@ def simulator(**changed):
 
 
 def arrays(**changed):
-    """A recording of which nothing is wrong but what is changed."""
-    known = {"x_mm": np.arange(30.0), "y_mm": 0, "readings": np.arange(30.0), "patterns": EDGE, "unit": "V"}
-    return Recording.from_arrays(**{**known, **changed})
+    """A plan of which nothing is wrong but what is changed."""
+    return Plan.from_arrays(**{"x_mm": np.arange(30.0), "y_mm": 0, "patterns": EDGE, "unit": "V", **changed})
 
 
 def record(number, plan, asked):
@@ -70,7 +71,7 @@ def record(number, plan, asked):
 
 
 OVEN = simulator()
-FIELD = Recording.from_arrays(x_mm=[500.0], y_mm=250.0, readings=[10.0], patterns={"field": EDGE}, unit="LEGO")
+FIELD = Recording.from_table({"x_mm": [500.0], "y_mm": 250.0, "reading": [10.0]}, patterns={"field": EDGE}, unit="LEGO")
 
 
 class OneNumber:

@@ -13,8 +13,8 @@ the readings that a diagnosis advises.
 
 `Inquiry(model, prior, settings, noise, rng=rng)` chooses the settings of any other instrument.
 
-`Recording.from_arrays` and `Recording.from_table` make recordings, `read_recording`, `read_plan` and `read_sensor` read
-files. Results display themselves in notebooks.
+`Recording.from_table` makes recordings, `read_recording`, `read_plan` and `read_sensor` read files. Results display
+themselves in notebooks.
 
 The parts are packages, loaded at first use. In the order of one reading's path: `arm` (where readings come from),
 `recordings`, `scene` (what lies under the sensor), `sensor` (from scene to reading), `inference`, `nested` (evidence

@@ -88,9 +88,8 @@ def fitted(recording, level):
 def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_recording():
     """5,000 readings of level 7, of which about half are diagnosed; the repaired model's level is 5."""
     n = 5000
-    everything = Recording.from_arrays(
-        x_mm=np.arange(n) / n, y_mm=np.zeros(n), readings=np.full(n, 7.0), patterns=Uniform(0.5), unit="LEGO"
-    )
+    table = {"x_mm": np.arange(n) / n, "y_mm": np.zeros(n), "reading": np.full(n, 7.0)}
+    everything = Recording.from_table(table, patterns=Uniform(0.5), unit="LEGO")
     rows = rows_to_diagnose(everything)
     assert len(rows) < n
     recording = everything.take(rows)

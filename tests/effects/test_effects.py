@@ -505,8 +505,7 @@ def test_the_extent_of_a_recording_is_its_range_length_and_duration():
 def test_hysteresis_compares_the_directions_that_the_recording_has(x_mm, said):
     """The reading at 9 mm is a scan of its own, at rest."""
     scan = ["rest" if x == 9 else "back" if k > 3 else "forth" for k, x in enumerate(x_mm)]
-    recording = Recording.from_arrays(
-        x_mm=x_mm, y_mm=0.0, readings=np.arange(len(x_mm)), scan=scan, patterns=Uniform(0.5), unit="V"
-    )
+    table = {"x_mm": x_mm, "y_mm": 0.0, "reading": np.arange(len(x_mm)), "scan": scan}
+    recording = Recording.from_table(table, patterns=Uniform(0.5), unit="V")
     effect = VOCABULARY["hysteresis"].for_extent(Extent.of(recording))
     assert said in effect.sentence(np.array([3.0]), np.array([0.2]))

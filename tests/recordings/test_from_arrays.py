@@ -22,11 +22,13 @@ from probewise.recordings import (
 )
 
 EDGE = HalfPlane(0.0, 0.0)
-THREE = {"x_mm": [-10, 0, 10], "y_mm": 0, "readings": [0.4, 1.6, 2.9], "patterns": {"edge": EDGE}, "unit": "V"}
+THREE = {"x_mm": [-10, 0, 10], "y_mm": 0, "reading": [0.4, 1.6, 2.9]}
+OPTIONS = ("patterns", "unit", "min", "max", "controls")
 
 
 def made(**changes):
-    return Recording.from_arrays(**(THREE | changes))
+    options = {"patterns": {"edge": EDGE}, "unit": "V"} | {k: changes.pop(k) for k in OPTIONS if k in changes}
+    return Recording.from_table(THREE | changes, **options)
 
 
 ROW = {"x_mm": [1], "y_mm": [2], "reading": [3]}
@@ -91,14 +93,14 @@ def test_scans_begin_where_their_name_changes_and_times_are_a_second_apart():
 
 
 def test_missing_readings_and_those_out_of_range_are_left_out_and_noted():
-    recording = made(readings=[None, 9, 2.5], max=5)
+    recording = made(reading=[None, 9, 2.5], max=5)
     assert recording.usable.tolist() == [False, False, True]
     assert recording.notes == ("1 reading missing, left out", "1 reading outside the range up to 5, left out")
     masked = np.ma.masked_greater([0.4, 99.0, 2.9], 50)
-    assert np.isnan(made(readings=masked).readings).tolist() == [False, True, False]
+    assert np.isnan(made(reading=masked).readings).tolist() == [False, True, False]
     for wrong in (np.ma.array(["a", "b", "c"]), np.ma.array([1j, 2.0, 3.0])):
-        with pytest.raises(ParameterError, match="readings"):
-            made(readings=wrong)
+        with pytest.raises(ParameterError, match="reading"):
+            made(reading=wrong)
 
 
 def test_text_columns_of_a_table_are_noted_and_left_out():
@@ -117,7 +119,7 @@ def test_a_table_may_say_n_a_where_a_number_is_missing_and_hold_dates():
     assert np.isnan(recording.plan.covariates["lux"]).tolist() == [False, True, True]
     assert recording.plan.time_s.tolist() == [0.0, 2.0, 5.0]
     stamps = np.array(["2026-11-23T18:00:00", "2026-11-23T18:00:00.5"], dtype="datetime64[ms]")
-    assert made(x_mm=[0, 1], readings=[1, 2], time_s=stamps).plan.time_s.tolist() == [0.0, 0.5]
+    assert made(x_mm=[0, 1], reading=[1, 2], time_s=stamps).plan.time_s.tolist() == [0.0, 0.5]
 
 
 @pytest.mark.parametrize("text", ["infinity", "1_000"])
@@ -125,14 +127,14 @@ def test_a_text_that_is_no_number_in_a_file_is_none_in_a_table(text):
     table = {"x_mm": [0, 1], "y_mm": [0, 0], "reading": [1, 2], "lux": ["3", text]}
     recording = of_table(table)
     assert recording.notes == ("column lux holds no numbers, ignored",)
-    with pytest.raises(ParameterError, match="readings is"):
-        made(x_mm=[0, 1], readings=["3", text])
+    with pytest.raises(ParameterError, match="reading is"):
+        made(x_mm=[0, 1], reading=["3", text])
 
 
 def test_dates_with_and_without_a_time_zone_are_refused_together():
     begun = datetime.datetime(2026, 11, 23, 18, 0, tzinfo=datetime.UTC)
     with pytest.raises(ParameterError, match=r"time_s is .* dates that all have a time zone, or none of them"):
-        made(x_mm=[0, 1], readings=[1, 2], time_s=[begun, begun.replace(tzinfo=None)])
+        made(x_mm=[0, 1], reading=[1, 2], time_s=[begun, begun.replace(tzinfo=None)])
 
 
 @pytest.mark.parametrize(
@@ -146,13 +148,13 @@ def test_dates_with_and_without_a_time_zone_are_refused_together():
         ({"x_mm": ["a", "b", "c"]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [0, 1, 10**400]}, "x_mm is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [[0], [1, 2], 3]}, "x_mm is .*; allowed: numbers, in an array or a list"),
-        ({"readings": [0, 1, 1j]}, "readings is .*; allowed: numbers, in an array or a list"),
+        ({"reading": [0, 1, 1j]}, "reading is .*; allowed: numbers, in an array or a list"),
         ({"x_mm": [0, 1], "y_mm": [0, 1, 2]}, r"x_mm has shape \(2,\); allowed: \(3,\), one per reading"),
         ({"pattern": ["edge", None, "edge"]}, r"pattern\[1\] is None; allowed: a name in every row"),
         ({"scan": ["a", "b", None]}, r"scan\[2\] is None; allowed: a name in every row"),
         ({"x_mm": [0, None, 1]}, r"x_mm\[1\] is nan; allowed: finite numbers"),
         ({"y_mm": [[0, 1, 2]]}, r"y_mm has shape \(1, 3\); allowed: \(3,\), one per reading"),
-        ({"readings": [np.nan] * 3}, "allowed: at least one number within the declared range"),
+        ({"reading": [np.nan] * 3}, "allowed: at least one number within the declared range"),
         ({"scan": ["a"]}, "scan has 1 names; allowed: 3"),
         ({"session": [0, 0, 1]}, r"session\[2\] is 1.0; allowed: a whole number from 0, the same throughout a scan"),
         ({"min": 5, "max": 0}, "max is 0.0; allowed: greater than min, 5"),
@@ -211,5 +213,5 @@ def test_rows_are_taken_by_number_by_truth_and_by_slice():
 
 def test_degrees_given_where_radians_are_meant_are_warned_of():
     with pytest.warns(UnitWarning, match="orientation_rad reaches 90 rad, .* convert degrees"):
-        Recording.from_arrays(**THREE, orientation_rad=[0, 45, -90])
-    Recording.from_arrays(**THREE, orientation_rad=[0, np.pi, -2 * np.pi])
+        made(orientation_rad=[0, 45, -90])
+    made(orientation_rad=[0, np.pi, -2 * np.pi])

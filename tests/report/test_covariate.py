@@ -48,7 +48,9 @@ def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, v
     place = Place(covariate, scan, start, end, 0.001, 5.0, np.zeros(2), np.zeros(2), values=at)
     rows = np.arange(len(at))
     scans = ["one", *["two"] * (len(at) - 1)]
-    taken = Recording.from_arrays(x_mm=rows, y_mm=0, readings=rows, patterns=Uniform(0.5), unit="V", scan=scans)
+    taken = Recording.from_table(
+        {"x_mm": rows, "y_mm": 0, "reading": rows, "scan": scans}, patterns=Uniform(0.5), unit="V"
+    )
     diagnosis = SimpleNamespace(recording=taken, apparatus=LightSensorApparatus())
     view = views_of_place(diagnosis, place)[-1]
     assert view.category_names_on_axis == names

@@ -203,15 +203,12 @@ def test_what_is_seen_lies_between_black_and_white(name, x, y, sd, rho):
 
 
 class Checkers:
-    """A user's own region without a closed form: it has albedo and coverage only."""
+    """A user's own region without a closed form: it has its albedo only."""
 
     n_regions = 1
 
     def albedo(self, points_mm):
         return np.where(np.floor(points_mm / 20.0).sum(axis=1) % 2 == 0, 1.0, 0.0)[None]
-
-    def coverage(self, centers_mm, pixel_mm, turn_rad):
-        return self.albedo(centers_mm)
 
 
 def test_a_region_without_a_closed_form_is_summed_over_pixels():

@@ -276,10 +276,6 @@ class ChangedRegion:
         """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         return self.changed(self.region.albedo(points_mm), points_mm)
 
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over pixels, the change taken at their centres: (n_regions, n_points)."""
-        return self.changed(self.region.coverage(centers_mm, pixel_mm, turn_rad), centers_mm)
-
 
 @dataclass(frozen=True, eq=False)
 class RegionWithGradient(ChangedRegion):

@@ -338,8 +338,7 @@ def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
 def _read_with_json(path: object, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
     """Read a table and its description: the plan, the readings or None, and notes."""
     # A table in memory is the usual mistake.
-    allowed = "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), "
-    path = checked_path("path", path, allowed + "Recording.from_arrays(...)")
+    path = checked_path("path", path, "the name of a CSV file; a table in memory: Recording.from_table(...)")
     if path.suffix.lower() == ".json":
         raise FileError(path, "this is a description", "the name of the CSV beside it")
     known = ("x_mm", "y_mm", "reading")

@@ -227,7 +227,7 @@ def shipped(name: str) -> Path:
     return Path(str(resources.files("probewise"))) / "data" / f"{name}.csv"
 
 
-_ALLOWED = "a PNG of 8 bits per channel, or an .npy with a two-dimensional array of numbers from 0 to 255, of at most 1e8 pixels"
+_ALLOWED = "a PNG of 8 bits per channel, or an .npy of two axes with numbers 0 to 255; at most 1e8 pixels"
 _LARGEST_PIXELS = 100_000_000
 
 

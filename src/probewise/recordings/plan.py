@@ -346,74 +346,6 @@ class Recording(ShowsItself):
         return np.zeros(len(self.plan), dtype=np.bool_)
 
     @classmethod
-    def from_arrays(
-        cls,
-        *,
-        x_mm: ArrayLike,
-        y_mm: ArrayLike,
-        readings: ArrayLike,
-        patterns: Mapping[str, Pattern] | Pattern,
-        unit: str,
-        pattern: str | Sequence[str] | None = None,
-        orientation_rad: ArrayLike = 0.0,
-        time_s: ArrayLike | None = None,
-        scan: str | Sequence[object] | None = None,
-        session: ArrayLike | None = None,
-        covariates: Mapping[str, ArrayLike] | None = None,
-        min: float | None = None,
-        max: float | None = None,
-        step: float | None = None,
-        sensor: str = "",
-        height_mm: float | None = None,
-        controls: tuple[str, ...] = (),
-        source: str = "",
-    ) -> Self:
-        """Make a recording from arrays, lists or columns of a table, with one entry per reading in the order taken.
-
-        Raises ParameterError if a pattern is named but not described, an argument has the wrong type, or no reading is
-        usable; ShapeError if the arguments differ in length.
-
-        `readings` are in `unit`, shape (n_points,), NaN, None or a text such as "n/a" where one is missing; `source` is
-        their origin, for reports. All else is as in `Plan.from_arrays`.
-
-        Examples
-        --------
-        >>> from probewise.recordings import HalfPlane, Recording
-        >>> edge = HalfPlane(normal_rad=0.0, offset_mm=0.0)
-        >>> recording = Recording.from_arrays(
-        ...     x_mm=[-10, 0, 10], y_mm=0, readings=[0.4, 1.6, 2.9], patterns={"edge": edge}, unit="V", min=0, max=5
-        ... )
-        >>> recording.plan.pattern_names, int(recording.usable.sum())
-        (('edge',), 3)
-        """
-        x_mm, y_mm, numbers = floats(x_mm, "x_mm"), floats(y_mm, "y_mm"), floats(texts_to_numbers(readings), "readings")
-        sizes = [places.size for places in (x_mm, y_mm) if places.ndim > 0]
-        fitting = numbers.ndim == 0 or not sizes or numbers.size in sizes
-        values = numbers_per_reading("readings", numbers, None if fitting else sizes[0])
-        plan = Plan.from_arrays(
-            x_mm=numbers_per_reading("x_mm", x_mm, len(values)),
-            y_mm=y_mm,
-            patterns=patterns,
-            unit=unit,
-            pattern=pattern,
-            orientation_rad=orientation_rad,
-            time_s=time_s,
-            scan=scan,
-            session=session,
-            covariates=covariates,
-            min=min,
-            max=max,
-            step=step,
-            sensor=sensor,
-            height_mm=height_mm,
-            controls=controls,
-        )
-        recording = cls(plan, values, source)
-        if not recording.usable.any():
-            raise ParameterError("readings", values.tolist(), "at least one number within the declared range")
-        return replace(recording, notes=recording.notes_on_unusable_readings())
-
-    @classmethod
     def from_table(
         cls,
         table: TableLike,
@@ -432,9 +364,11 @@ class Recording(ShowsItself):
 
         `table` has columns `reading`, `x_mm` and `y_mm`, and optionally `orientation_deg` (or `orientation_rad`),
         `scan`, `session`, `pattern` and `time_s`. Every other numeric column is a covariate; text columns are ignored,
-        except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers. All else is as
-        in `Recording.from_arrays`. Raises ParameterError if a column is missing, a pattern is named but not described,
-        or an argument has the wrong type; ShapeError if the columns differ in length.
+        except what was commanded: `led` (True and False, too), `height_mm` and `controls` are numbers. A reading is
+        NaN, None or a text such as "n/a" where it is missing; `x_mm` or `y_mm` may be one number for all; `source` is
+        their origin, for reports; all else is as in `Plan.from_arrays`. Raises ParameterError if a column is missing, a
+        pattern is named but not described, an argument has the wrong type, or no reading is usable; ShapeError if the
+        columns differ in length.
 
         Examples
         --------
@@ -453,10 +387,10 @@ class Recording(ShowsItself):
                 raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
             turn_rad = np.radians(numbers_per_reading("orientation_deg", turn_deg))
         covariates, notes = numeric_covariates_and_notes(columns, controls)
-        recording = cls.from_arrays(
-            x_mm=columns["x_mm"],
+        readings = numbers_per_reading("reading", texts_to_numbers(columns["reading"]))
+        plan = Plan.from_arrays(
+            x_mm=numbers_per_reading("x_mm", columns["x_mm"], len(readings)),
             y_mm=columns["y_mm"],
-            readings=columns["reading"],
             patterns=patterns,
             unit=unit,
             pattern=columns.get("pattern"),
@@ -471,9 +405,11 @@ class Recording(ShowsItself):
             sensor=sensor,
             height_mm=height_mm,
             controls=controls,
-            source=source,
         )
-        return replace(recording, notes=(*notes, *recording.notes))
+        recording = cls(plan, readings, source)
+        if not recording.usable.any():
+            raise ParameterError("reading", readings.tolist(), "at least one number within the declared range")
+        return replace(recording, notes=(*notes, *recording.notes_on_unusable_readings()))
 
     def __len__(self) -> int:
         return len(self.plan)
@@ -527,8 +463,7 @@ def require_plan(plan: object) -> None:
 
 def require_recording(recording: object) -> None:
     """Raise ParameterError unless `recording` is a Recording; the message says how to make one."""
-    allowed = "a Recording: read_recording('NAME.csv'), Recording.from_arrays(...) or Recording.from_table(table, ...)"
-    allowed += ", of probewise.recordings"
+    allowed = "a Recording: read_recording('NAME.csv') or Recording.from_table(table, ...), of probewise.recordings"
     if callable(getattr(recording, "recording", None)) and not isinstance(recording, type):
         allowed = f"a Recording: take its .recording(), this is the {type(recording).__name__}"
     require_kind("recording", recording, Recording, allowed)

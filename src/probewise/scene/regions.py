@@ -1,6 +1,6 @@
 """Albedo regions, one per hypothesis: frozen values of batched geometry (paper, eq. 1; patterns S_BW, S_a to S_d).
 
-A new kind is a frozen dataclass with `n_regions`, `albedo` and `coverage`. It may register the distance to its edge
+A new kind is a frozen dataclass with `n_regions` and `albedo`. It may register the distance to its edge
 (`edge_distance`) and, where that is closed, its outline (`outlines`); a closed form registered with
 `sensor.gaussian.mean_albedo_under_one_gaussian` makes a footprint over it cost microseconds, not milliseconds.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, singledispatch
+from functools import singledispatch
 from itertools import pairwise
 from typing import Protocol
 
@@ -26,8 +26,8 @@ class Region(Protocol):
     """An albedo field for each hypothesis: `n_regions` of them, 1 where all share one.
 
     Regions are small frozen values of batched geometry (scene/regions.py). The sensor integrates
-    a region in closed form where its kind has one (sensor/gaussian.py), or pixel by pixel through
-    `coverage` (sensor/discrete.py).
+    a region in closed form where its kind has one (sensor/gaussian.py), or pixel by pixel
+    (sensor/discrete.py).
     """
 
     @property
@@ -37,13 +37,6 @@ class Region(Protocol):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, (n_points, 2) lab frame -> (n_regions, n_points)."""
-        ...
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over each of many square pixels, (n_regions, n_points).
-
-        The pixels have centres `centers_mm` (n_points, 2), side `pixel_mm`, and are turned by `turn_rad` (n_points,).
-        """
         ...
 
 
@@ -100,65 +93,22 @@ def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatAr
     return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
 
 
-def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
-    """Return the share, 0 to 1, of each square pixel of side `pixel_mm` on the positive side of a straight edge.
+_PLACES_IN_A_PIXEL = 16
+# Of Roberts's sequence in two dimensions, which fills pixels evenly, and rows of pixels, too.
+_NEXT_PLACE = np.array([0.7548776662466927, 0.5698402909980532])
 
-    It is the cumulative of the square's projection on the normal, a trapezium. `distance_mm`: signed distance of the
-    pixel's centre from the edge, positive inside; `angle_rad`, which broadcasts with it: angle between the edge's
-    normal and a side of the square.
+
+def mean_albedo_of_pixels(region: Region, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+    """Return the mean albedo over each of many square pixels, from 16 places in each, (n_regions, n_points).
+
+    The pixels have centres `centers_mm` (n_points, 2), side `pixel_mm`, and are turned by `turn_rad` (n_points,).
     """
-    cosine, sine = np.abs(np.cos(angle_rad)), np.abs(np.sin(angle_rad))
-    wide = 0.5 * pixel_mm * np.maximum(cosine, sine)
-    narrow = 0.5 * pixel_mm * np.minimum(cosine, sine)
-    t = np.abs(distance_mm)
-    left_over = np.maximum(wide + narrow - t, 0.0)
-    # The corner's triangle has area left_over^2 / (8 wide narrow) of the square; without a
-    # corner (narrow = 0) the flank alone decides.
-    corner = left_over**2 / (8 * wide * np.maximum(narrow, 1e-12 * pixel_mm))
-    flank = 0.5 - 0.5 * t / wide
-    outside = np.where(t <= wide - narrow, flank, corner)
-    outside = np.minimum(outside, 0.5)
-    return np.where(distance_mm >= 0, 1 - outside, outside)
-
-
-def share_inside_polygon(
-    edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray
-) -> FloatArray:
-    """Return the share of each square inside a polygon, exactly, (n_regions, n_points).
-
-    Green's theorem on the polygon clipped to the square: the sum over directed edges, the inside on their left, of the
-    area between the edge, clamped to the square, and its lower side. `edges_mm`: (n_regions, n_edges, 2 ends, 2);
-    `centers_mm`: of the pixels, (n_points, 2), of side `pixel_mm` and turned by `turn_rad`, (n_points,).
-    """
-    cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
-    total = np.zeros((len(edges_mm), len(centers_mm)))
-    for k in range(edges_mm.shape[1]):
-        ends = []
-        for end in (edges_mm[:, k, 0], edges_mm[:, k, 1]):
-            dx = end[:, :1] - centers_mm[:, 0]
-            dy = end[:, 1:] - centers_mm[:, 1]
-            ends.append(((cosine * dx + sine * dy) / pixel_mm, (cosine * dy - sine * dx) / pixel_mm))
-        (x1, y1), (x2, y2) = ends
-        run = x2 - x1
-        upright = np.abs(run) < 1e-12
-        slope = (y2 - y1) / np.where(upright, 1.0, run)
-        a, b = np.clip(x1, -0.5, 0.5), np.clip(x2, -0.5, 0.5)
-        ya, yb = y1 + slope * (a - x1), y1 + slope * (b - x1)
-        rise = yb - ya
-        flat = np.abs(rise) < 1e-9
-        mean_height = np.where(
-            flat,
-            np.clip(0.5 * (ya + yb), -0.5, 0.5),
-            (_integral_of_clip(yb) - _integral_of_clip(ya)) / np.where(flat, 1.0, rise),
-        )
-        total -= np.where(upright, 0.0, (b - a) * (mean_height + 0.5))
-    return np.clip(total, 0.0, 1.0)
-
-
-def _integral_of_clip(y: FloatArray) -> FloatArray:
-    """Return the antiderivative of clip(y, -1/2, 1/2) that is 0 at 0."""
-    inner = np.clip(y, -0.5, 0.5)
-    return 0.5 * inner**2 + 0.5 * np.abs(y - inner)
+    number = np.arange(len(centers_mm) * _PLACES_IN_A_PIXEL).reshape(len(centers_mm), -1)
+    across, up = (pixel_mm * (number * share % 1.0 - 0.5) for share in _NEXT_PLACE)
+    cosine, sine = np.cos(turn_rad)[:, None], np.sin(turn_rad)[:, None]
+    x, y = centers_mm[:, :1] + cosine * across - sine * up, centers_mm[:, 1:] + sine * across + cosine * up
+    found = region.albedo(np.stack([x.ravel(), y.ravel()], axis=-1))
+    return np.asarray(found.reshape(len(found), len(centers_mm), -1).mean(axis=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,9 +122,6 @@ class UniformRegion(RegionBatch):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.repeat(self.level[:, None], len(points_mm), axis=1)
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        return self.albedo(centers_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +138,6 @@ class HalfPlaneRegion(RegionBatch):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.where(self.signed_distance_mm(*points_mm.T) > 0, self.inside, self.outside)
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        away, turn = self.signed_distance_mm(*centers_mm.T), self.normal_rad[:, None] - turn_rad
-        return self.outside + (self.inside - self.outside) * share_inside_half_plane(away, turn, pixel_mm)
 
     def signed_distance_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Return the distance from the edge, positive inside; places broadcast with (n_regions, 1)."""
@@ -251,10 +194,6 @@ class PolygonRegion(RegionBatch):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.where(_count_ray_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        share = share_inside_polygon(self.edges_mm, centers_mm, pixel_mm, turn_rad)
-        return self.outside + (self.inside - self.outside) * share
 
 
 def _count_ray_crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArray:
@@ -356,15 +295,6 @@ class QuadrantRegion(RegionBatch):
         beyond = (points_mm[None] - self.corner_mm[:, None]) * self.direction[:, None] > 0
         return np.where(beyond.all(axis=-1), self.inside, self.outside)
 
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        reach = pixel_mm + max(1.0, float(np.abs(centers_mm[None] - self.corner_mm[:, None]).max(initial=0.0)))
-        x, y = self.corner_mm[:, 0], self.corner_mm[:, 1]
-        far_x, far_y = x + 2 * reach * self.direction[:, 0], y + 2 * reach * self.direction[:, 1]
-        square = np.stack([np.stack(p, axis=-1) for p in ((x, y), (far_x, y), (far_x, far_y), (x, far_y))], axis=1)
-        return PolygonRegion.from_vertices(square, inside=self.inside, outside=self.outside).coverage(
-            centers_mm, pixel_mm, turn_rad
-        )
-
 
 @edge_distance.register
 def _edge_distance_of_quadrant(region: QuadrantRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
@@ -395,19 +325,6 @@ class EllipseRegion(RegionBatch):
         """Return the albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
         p, q = self.unit_circle_coordinates(*points_mm.T)
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, the edge taken as straight: (n_regions, n_points)."""
-        p, q = self.unit_circle_coordinates(*centers_mm.T)
-        a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
-        level = np.hypot(p, q)
-        # Gradient of the level sqrt(p^2 + q^2); it is zero only at the centre, far from the edge.
-        along, across = p / a, q / b
-        steepness = np.hypot(along, across) / np.maximum(level, 1e-12)
-        distance = (1 - level) / np.maximum(steepness, 1e-12)
-        angle = np.arctan2(across, along) + self.angle_rad[:, None]
-        share = share_inside_half_plane(distance, angle - turn_rad, pixel_mm)
-        return self.outside + (self.inside - self.outside) * share
 
     def unit_circle_coordinates(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return coordinates in which the edge is the unit circle; places broadcast with (n_regions, 1)."""
@@ -466,20 +383,6 @@ class StripesRegion(RegionBatch):
         share = self.position_along_normal_mm(*points_mm.T) / self.period_mm[:, None]
         return np.where(share - np.floor(share) < self.duty[:, None], self.inside, self.outside)
 
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        period = self.period_mm[:, None]
-        along = self.position_along_normal_mm(*centers_mm.T)
-        along = along - period * np.floor(along / period)
-        angle = self.normal_rad[:, None] - turn_rad
-        share = np.zeros_like(along)
-        # Half a pixel's diagonal is 0.71 pixels: edges further away do not cut the pixel.
-        reach = 1 + math.ceil(0.75 * pixel_mm / float(self.period_mm.min()))
-        for k in range(-reach, reach + 1):
-            start = k * period
-            share += share_inside_half_plane(along - start, angle, pixel_mm)
-            share -= share_inside_half_plane(along - start - self.duty[:, None] * period, angle, pixel_mm)
-        return self.outside + (self.inside - self.outside) * share
-
     def position_along_normal_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Return how far places are from the first stripe's edge; they broadcast with (n_regions, 1)."""
         normal = self.normal_rad[:, None]
@@ -508,10 +411,6 @@ class RampRegion(RegionBatch):
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         normal = self.normal_rad[:, None]
         return self.per_mm[:, None] * (points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal))
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels: exactly the value at their centres."""
-        return self.albedo(centers_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -544,45 +443,6 @@ class ImageRegion:
         within = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
         return np.where(within, self.values[np.where(within, row, 0), np.where(within, column, 0)], 0.0)[None]
 
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, (1, n_points): exact if unturned, else by eight strips."""
-        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
-        steep, flat = np.maximum(np.abs(cosine), 1e-9), np.maximum(np.abs(sine), 1e-9)
-        half = 0.5 * pixel_mm
-        height = half * (np.abs(cosine) + np.abs(sine))
-        total, area = np.zeros(len(centers_mm)), np.zeros(len(centers_mm))
-        n_strips = 8
-        for k in range(n_strips):
-            low, high = (2 * k / n_strips - 1) * height, (2 * (k + 1) / n_strips - 1) * height
-            y = 0.5 * (low + high)
-            # Inside the square |c x + s y| and |c y - s x| are at most half a side.
-            middle_1, middle_2 = -sine * y * cosine / steep**2, cosine * y * sine / flat**2
-            left = np.maximum(middle_1 - half / steep, middle_2 - half / flat)
-            right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
-            bottom, top = centers_mm[:, 1] + low, centers_mm[:, 1] + high
-            near, far = centers_mm[:, 0] + left, centers_mm[:, 0] + right
-            integral = self._albedo_integral_to_lower_left
-            total += integral(far, top) - integral(near, top)
-            total -= integral(far, bottom) - integral(near, bottom)
-            area += (right - left) * (high - low)
-        return (total / area)[None]
-
-    @cached_property
-    def _summed_area_table(self) -> FloatArray:
-        """Sums of the pixels to the lower left of each corner, (n_rows + 1, n_columns + 1)."""
-        return np.pad(self.values[::-1].cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-
-    def _albedo_integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Return the integral of the albedo to the lower left of each point (x, y), in mm^2."""
-        n_rows, n_columns = self.values.shape
-        u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
-        v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)
-        i, j = np.minimum(v.astype(np.int64), n_rows - 1), np.minimum(u.astype(np.int64), n_columns - 1)
-        u, v, table = u - j, v - i, self._summed_area_table
-        lower = (1 - u) * table[i, j] + u * table[i, j + 1]
-        upper = (1 - u) * table[i + 1, j] + u * table[i + 1, j + 1]
-        return np.asarray(((1 - v) * lower + v * upper) * self.pixel_mm**2)
-
 
 @dataclass(frozen=True, eq=False)
 class RegionsOfMixedKinds(RegionBatch):
@@ -605,9 +465,6 @@ class RegionsOfMixedKinds(RegionBatch):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return self._joined(len(points_mm), lambda part: part.albedo(points_mm))
-
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        return self._joined(len(centers_mm), lambda part: part.coverage(centers_mm, pixel_mm, turn_rad))
 
     def _joined(self, n_points: int, of: Callable[[Region], FloatArray]) -> FloatArray:
         out = np.empty((self.n_regions, n_points))

@@ -153,10 +153,6 @@ class CardedRegion:
         covered = [card.region.albedo(points_mm) for card in self.cards]
         return mean_albedo_with_cards(self.region.albedo(points_mm), self.cards, covered)
 
-    def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
-        return mean_albedo_with_cards(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
-
 
 def mean_albedo_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
     """Return the white fraction seen with cards: `seen` is that without, `covered` each card's share of the view.

@@ -3,7 +3,7 @@
 The first of the two independent routes to the response R (paper, eq. RwithSSF): exact integrals of each
 Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
 `probewise.sensor.discrete`. A new kind of region may register its closed form with
-`mean_albedo_under_one_gaussian.register`; without one it is integrated numerically from its `coverage`.
+`mean_albedo_under_one_gaussian.register`; without one it is integrated numerically from its `albedo`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from probewise.scene.regions import (
     RegionsOfMixedKinds,
     StripesRegion,
     UniformRegion,
+    mean_albedo_of_pixels,
 )
 from probewise.scene.scenes import CardedRegion, mean_albedo_with_cards
 from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_of_cells_in_place
@@ -92,7 +93,7 @@ def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_node
     """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
 
     A region without a registered closed form is summed over square pixels, a quarter of the smaller
-    standard deviation wide, each with its coverage: error about 1e-3, and a `SlowWarning` is issued.
+    standard deviation wide: error about 1e-3, and a `SlowWarning` is issued.
     """
     kind = type(region).__name__
     warnings.warn(
@@ -114,7 +115,8 @@ def mean_albedo_under_one_gaussian(region: Region, gaussian: LabGaussian, n_node
         grid = np.stack(np.meshgrid(steps * sd[0], long_steps, indexing="ij"), axis=-1).reshape(-1, 2)
         weight = np.exp(-0.5 * np.sum((grid / sd) ** 2, axis=1))
         turn = np.full(len(grid), np.arctan2(axes[1, 0], axes[0, 0]))
-        share = region.coverage(np.array([x[i, j], y[i, j]]) + grid @ axes.T, sd[0] / 4, turn)
+        places = np.array([x[i, j], y[i, j]]) + grid @ axes.T
+        share = mean_albedo_of_pixels(region, places, sd[0] / 4, turn)
         out[i, j] = share[i if region.n_regions > 1 else 0] @ weight / weight.sum()
     return out
 

@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
-from probewise.systems.law import LawInputs, LawWithEffects, StepInputs, of_columns, values_at_rows
+from probewise.systems.law import LawWithEffects, StepInputs, of_columns, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
 from probewise.systems.step import Method, Steps, rosenbrock_step
 
@@ -56,7 +56,7 @@ def states_by_step(motion: LawWithEffects, steps: Steps, parameters: Values, col
     """Integrate the law: yield all states, (n_states, n_samples, n_runs), at the start and after each step."""
     s = initial_states(motion, steps, parameters, number_of_samples(parameters, columns))
     with np.errstate(all="ignore"):
-        given = LawInputs(motion.law, steps, parameters, columns)
+        given = StepInputs.over_table(motion.law, steps, parameters, columns)
         yield s
         for k, n in enumerate(steps.n_steps.tolist()):
             stepper = Stepper(motion, steps.method, given.of_gaps(slice(k, k + 1), 1))
@@ -330,7 +330,7 @@ class _NewtonState:
         steps, begins = self.steps, states[:, :, :-1]
         if not np.array_equal(samples, self._chosen):
             motion, parameters, columns = self.law_and_inputs(samples)
-            inputs = LawInputs(motion.law, steps, parameters, columns).of_gaps(steps.gap, len(steps.gap))
+            inputs = StepInputs.over_table(motion.law, steps, parameters, columns).of_gaps(steps.gap, len(steps.gap))
             self._chosen, self._stepper = samples, Stepper(motion, steps.method, inputs)
         self.n_evaluated += len(samples) * len(steps.begin)
         after = self._stepper.step(begins.reshape(len(begins), len(samples), -1), steps.begin, steps.length)

@@ -149,6 +149,37 @@ class StepInputs:
         """Return parameters and columns, by name, at a share of the gap between rows: read-only arrays."""
         return _at_share(self.start[0], self.rise[0], share), _at_share(self.start[1], self.rise[1], share)
 
+    @classmethod
+    def over_table(cls, law: Law, steps: Steps, parameters: Values, columns: Columns) -> StepInputs:
+        """Return a law's inputs over the table of its steps, (n_points,) or (n_samples, n_points) each.
+
+        Between the rows they go on as the law's `hold` says, also what an effect makes of them at the rows.
+        """
+        rows, time, linear = steps.rows, str(steps.table.time), law.hold == "linear"
+        p, u, dp, du = ({} for _ in range(4))
+        for name, values in parameters.items():
+            p[name] = own = values_at_rows(values, rows)
+            if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
+                p[name] = own[:, :1]
+            elif linear:
+                dp[name] = np.diff(own, axis=1)
+        for name, values in columns.items():
+            u[name] = own = values_at_rows(values, rows)
+            if name == time or (linear and values.dtype == np.float64):
+                du[name] = np.diff(own, axis=1)
+        return cls(time, (p, u), (dp, du))
+
+    def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
+        """Return those over a table in some of its gaps, of several steps one after the other."""
+
+        def in_gaps(values: Any) -> Any:
+            if values.shape[1] > 1:
+                return values[:, gaps].reshape(len(values), -1)
+            constant = values[:, 0]
+            return np.tile(constant, (1, n_gaps)) if n_gaps > 1 and constant.shape[1] > 1 else constant
+
+        return self.mapped(in_gaps)
+
     def mapped(self, chosen: Callable[[Any], Any]) -> StepInputs:
         """Return them with a function applied to every array."""
         p, u, dp, du = ({name: chosen(v) for name, v in each.items()} for each in (*self.start, *self.rise))
@@ -169,39 +200,6 @@ def _at_share(start: Values, rise: Values, share: Any) -> Values:
         out[name] = value = out[name] + share * by
         value.setflags(False)  # of writing; a keyword would double the time
     return out
-
-
-class LawInputs:
-    """Parameters and columns of a law over the table of its steps, (n_points,) or (n_samples, n_points) each.
-
-    Between the rows both go on as the law's `hold` says, also what an effect makes of them at the rows.
-    """
-
-    def __init__(self, law: Law, steps: Steps, parameters: Values, columns: Columns) -> None:
-        rows, time, linear = steps.rows, str(steps.table.time), law.hold == "linear"
-        p, u, dp, du = ({} for _ in range(4))
-        for name, values in parameters.items():
-            p[name] = own = values_at_rows(values, rows)
-            if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
-                p[name] = own[:, :1]
-            elif linear:
-                dp[name] = np.diff(own, axis=1)
-        for name, values in columns.items():
-            u[name] = own = values_at_rows(values, rows)
-            if name == time or (linear and values.dtype == np.float64):
-                du[name] = np.diff(own, axis=1)
-        self.over_table = StepInputs(time, (p, u), (dp, du))
-
-    def of_gaps(self, gaps: IntArray | slice, n_gaps: int) -> StepInputs:
-        """Return parameters and columns in some of the gaps between positions, of several steps one after the other."""
-
-        def in_gaps(values: Any) -> Any:
-            if values.shape[1] > 1:
-                return values[:, gaps].reshape(len(values), -1)
-            constant = values[:, 0]
-            return np.tile(constant, (1, n_gaps)) if n_gaps > 1 and constant.shape[1] > 1 else constant
-
-        return self.over_table.mapped(in_gaps)
 
 
 def of_columns(values: Any, columns: IntArray) -> Any:

@@ -26,14 +26,15 @@ from probewise.inquiry.entropy import best_places_mask
 from probewise.nested import EvidenceChange, RemainingEvidence
 from probewise.recordings import Disc, HalfPlane, Plan, Recording
 from probewise.recordings import Uniform as UniformPattern
-from probewise.scene import AnyOf, Circle, Field, KnownScene
+from probewise.scene import AnyOf, Circle, Field, KnownScene, region_of
 from probewise.scene.shapes import Rectangle
 from probewise.sensor import (
     Chain,
-    DiscreteSSF,
     FixedLevels,
     FreeMixture,
+    Poses,
     footprint_of,
+    mean_albedo_by_pixels,
     mean_ssf_field,
     merged_mean_mixture,
 )
@@ -212,7 +213,8 @@ def test_the_papers_robot_has_the_mean_of_the_sampled_fields():
         levels = FixedLevels(0.0, 1.0)
         seen = Chain(posed.model.ssf, levels, scene).predict(none, plan)[0]
         each = Chain(FreeMixture(1), levels, scene).predict(samples[:, :6], plan)
-        pixels = Chain(DiscreteSSF(field), levels, scene).predict(none, plan)[0]
+        poses = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
+        pixels = mean_albedo_by_pixels(region_of(pattern), field, poses)[0]
         merged = Chain(merged_mean_mixture(footprint_of(samples[:, :6], 1)), levels, scene).predict(none, plan)[0]
         np.testing.assert_allclose(seen, each.mean(axis=0), atol=2.5e-3)
         np.testing.assert_allclose(seen, pixels, atol=2.5e-3)

@@ -83,7 +83,7 @@ def test_sessions_are_written_read_back_and_made_from_a_table(tmp_path):
     assert read_recording(tmp_path / "made.csv").plan.sessions == (0, 1)
     table = columns_of(recording) | {"session": [0, 0, 1]}
     assert Recording.from_table(table, patterns={"edge": EDGE}, unit="V").plan.sessions == (0, 1)
-    assert made(scan=[*"aab"], session=2).plan.sessions == ()
+    assert made(scan=[*"aab"], session=[2, 2, 2]).plan.sessions == ()
 
 
 def test_scans_begin_where_their_name_changes_and_times_are_a_second_apart():

@@ -18,15 +18,12 @@ from probewise.sensor import (
     ACCURATE_NODES,
     FAST_NODES,
     Chain,
-    DiscreteSSF,
     FixedLevels,
     FixedMixture,
     FreeLevels,
     FreeMixture,
     NaiveSensor,
     Stage,
-    footprint_of,
-    mean_ssf_field,
 )
 
 PATTERNS = {
@@ -36,7 +33,6 @@ PATTERNS = {
     "disc": kinds.Disc((3.0, 1.0), 8.0),
 }
 ONE = np.array([1.0, 0.5, 1.5, 0.02, 0.01, 0.005])
-U_MM = np.arange(-30, 31, 2.0)
 TWO = np.concatenate([ONE, [0.6, -2.0, 3.0, 0.03, 0.05, -0.01]])
 
 
@@ -66,14 +62,6 @@ CHAINS = {
     "two_free": (Chain(FreeMixture(2), FreeLevels(), KnownScene(PATTERNS)), lambda n: thetas(n, 2)),
     "known_sensor": (
         Chain(fixed_mixture(TWO), FixedLevels(10, 50), HypothesisScene(Circle())),
-        lambda n: np.random.default_rng(2).uniform([-5, -5, 5], [5, 5, 12], (n, 3)),
-    ),
-    "field": (
-        Chain(
-            DiscreteSSF(mean_ssf_field(footprint_of(TWO[None], 2), u_mm=U_MM, v_mm=U_MM)),
-            FixedLevels(10, 50),
-            HypothesisScene(Circle()),
-        ),
         lambda n: np.random.default_rng(2).uniform([-5, -5, 5], [5, 5, 12], (n, 3)),
     ),
     "naive": (
@@ -186,8 +174,6 @@ def test_effects_that_cannot_be_are_refused():
     base = CHAINS["one_free"][0]
     with pytest.raises(ParameterError, match="each name once"):
         base.with_effects(GAIN, GAIN)
-    with pytest.raises(ParameterError, match="none at the footprint with a DiscreteSSF"):
-        CHAINS["field"][0].with_effects(SPREAD)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bend_coefficients, 
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
-    DiscreteSSF,
     FixedMixture,
     FreeMixture,
     SSFField,
@@ -42,7 +41,6 @@ __all__ = [
     "N_FREE_FORM",
     "AnyEffect",
     "Chain",
-    "DiscreteSSF",
     "Effect",
     "FixedLevels",
     "FixedMixture",

@@ -19,13 +19,11 @@ from probewise.scene.scenes import Scene
 from probewise.sensor.commanded import (
     footprint_at_commanded_height,
     has_commanded_height_or_led,
-    height_ratio,
     led_state,
     with_declared_height_commanded,
 )
-from probewise.sensor.discrete import mean_albedo_by_pixels
 from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, mean_albedo_under_one_gaussian, moments_in_lab_frame
-from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
+from probewise.sensor.ssf import FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
     Footprint,
@@ -133,9 +131,6 @@ class Chain:
         require_like("ssf", self.ssf, ("names", "footprint"), f"an SSF such as FreeMixture(1) or FixedMixture, {order}")
         require_levels(self.levels, order)
         require_scene(self.scene, order)
-        at_footprint = [effect.name for effect in self.effects if effect.stage == Stage.FOOTPRINT]
-        fits = not (at_footprint and isinstance(self.ssf, DiscreteSSF))
-        require(fits, "effects", at_footprint, "none at the footprint with a DiscreteSSF; use mixture_of_field")
         labels = [effect.name for effect in self.effects]
         require(len(set(labels)) == len(labels), "effects", labels, "each name once")
         object.__setattr__(self, "effects", tuple(sorted(self.effects, key=lambda e: (e.stage, e.name))))
@@ -157,8 +152,8 @@ class Chain:
 
         `theta`: hypotheses, shape (n_samples, n_params), columns as `names`; `plan`: pose, time and pattern of every
         reading, n_points rows. Returns readings, shape (n_samples, n_points). Raises ShapeError if the columns of theta
-        do not match `names`; ParameterError if the plan has a pattern that the scene lacks, theta holds no valid SSF,
-        or a height is commanded of a `DiscreteSSF`.
+        do not match `names`; ParameterError if the plan has a pattern that the scene lacks, or theta holds no valid
+        SSF.
         """
         plan = self.plan_at_calibrated_height(plan)
         at_once = len(theta)
@@ -200,10 +195,6 @@ class Chain:
         require_theta_columns(theta, self.names)
         plan = self.plan_at_calibrated_height(plan)
         layout = self._layout_under_poses(theta, plan)
-        if isinstance(self.ssf, DiscreteSSF):
-            allowed = "none with a DiscreteSSF; use mixture_of_field"
-            require(height_ratio(plan) is None, "plan", "a commanded height_mm", allowed)
-            return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = footprint_at_commanded_height(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._stage_applier(theta, plan)(Stage.FOOTPRINT, plain)
         geometries = self._hypotheses_by_geometry(theta, footprint)
@@ -406,17 +397,6 @@ def _response_of_each_geometry(
     parts = response(layout, one_each, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
     weight = np.broadcast_to(footprint.weight[:, 0], (n_samples, n_gaussians))
     return np.stack([own @ parts[at] for own, at in zip(weight, which, strict=True)])
-
-
-def _discrete_response(layout: RegionsAndPoses, ssf: DiscreteSSF) -> FloatArray:
-    found = []
-    for rows, region in layout.rows_and_regions:
-        there = Poses(*(select_reading_columns(a, rows) for a in layout.poses.arrays))
-        found.append((rows, mean_albedo_by_pixels(region, ssf.field, there)))
-    out = np.zeros((max((len(part) for _, part in found), default=1), len(layout.plan)))
-    for rows, part in found:
-        out[:, rows] = part
-    return out
 
 
 def region_named(regions: Mapping[str, Region], name: str) -> Region:

@@ -181,21 +181,6 @@ class SSFField(ShowsItself):
         return np.asarray((self.values.ravel()[:, None] * off).T @ off)
 
 
-@dataclass(frozen=True)
-class DiscreteSSF:
-    """A fixed SSF, a field of pixels without free parameters; responses to it are the paper's sum over pixels."""
-
-    field: SSFField
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return ()
-
-    def footprint(self, theta: FloatArray) -> Footprint:
-        """Return the field as one Gaussian with its mean and covariance, negative values left out."""
-        return mixture_of_field(self.field).footprint(theta)
-
-
 def mean_ssf_field(
     footprint: Footprint, *, u_mm: FloatArray, v_mm: FloatArray, weights: FloatArray | None = None
 ) -> SSFField:

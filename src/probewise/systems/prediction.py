@@ -388,6 +388,9 @@ def _chain_samples_and_whether_drawn(
     n, system, is_drawn = len(fitted.samples), chain.system, False
     fixed = {f"{form.name}.{name}" for form in chain.effects for name in getattr(form, "fixed", ())}
     out = np.empty((n, len(chain.names)))
+    of_effects = [name for name in at if any(name.startswith(f"{own}.") for own in fitted.effects)]
+    lost = next((name for name in of_effects if name not in chain.names), None)  # of a model of an earlier version
+    require(lost is None, "names", lost, "a parameter that this version knows; diagnose again with it")
     for k, name in enumerate(chain.names):
         if name in at:
             out[:, k] = fitted.samples[:, at[name]]

@@ -343,20 +343,6 @@ def test_a_wave_whose_frequency_changes_is_begun_from_its_two_columns():
     np.testing.assert_allclose(found, expected, atol=0.01 * a)
 
 
-def test_two_settlings_add_up_at_the_start_of_each_run():
-    form = _proposed("t since the start of the run")
-    found = form.apply(np.zeros((1, N_ROWS)), np.array([[0.5, -0.8, 0.2, 2.0]]), TABLE)[0]
-    np.testing.assert_allclose(found, 0.5 * np.exp(-_T / 0.2) - 0.8 * np.exp(-_T / 2.0))
-    setting = form.start(form.bank()[0], np.array([2.0, -3.0]))
-    typical = form.bank()[0, 0, 0]
-    np.testing.assert_allclose(setting[:2], [2 * typical, -3 * typical])
-    turned = form.apply(np.zeros((1, N_ROWS)), np.array([[-0.8, 0.5, 2.0, 0.2]]), TABLE)[0]
-    np.testing.assert_allclose(turned, found, atol=1e-12)
-    assert form.n_peaks == 2  # for the two may be exchanged, and their priors are the same
-    density = form.prior.log_prob(np.array([[0.5, -0.8, 0.2, 2.0], [-0.8, 0.5, 2.0, 0.2]]))
-    assert density[0] == pytest.approx(density[1])
-
-
 def test_a_dose_is_the_integral_since_the_start_of_the_run_and_saturates():
     """Route two: the trapezoid rule by its own sum over each run."""
     centre = float(f"{TABLE.columns['room_c'].mean():.6g}")

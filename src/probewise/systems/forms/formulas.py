@@ -36,7 +36,6 @@ from probewise.systems.forms.modulations import (
     text_rounded_to_spread,
     trial_frequencies_in_time,
 )
-from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
 from probewise.systems.forms.reference import AMPLITUDE, ONE_AMPLITUDE, POSITIVE, Form, ReferenceFit, switch_points
 from probewise.systems.table import RunTable, covariate_of_column
 
@@ -48,7 +47,6 @@ _ROWS_OF_A_WAVE = 6  # least rows per period: with fewer a square wave is not to
 _SOFT = 0.5  # steepness of its edges to begin with: at 1 it is nearly a sinusoid
 _MOST_SWEPT = 40  # waves in the recording of which the frequency may change: faster ones would need gigabytes
 _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the recording: phases to within a radian
-_N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
@@ -99,7 +97,6 @@ def formula_forms(about: ReferenceFit) -> Iterator[Form]:
     if in_time:
         yield from _square_wave_form(about)
         yield from _swept_wave_form(about)
-        yield from _double_settling_form(about)
     still = [_Variable.of(name, column, 0.0) for name, column in about.states.items() if varies(column)]
     still += [_Variable.of(n, c, _rounded_mean(c)) for n, c in columns.items() if n not in about.states]
     for state in about.states:
@@ -325,23 +322,6 @@ def _swept_wave_form(about: ReferenceFit) -> Iterator[Form]:
         sine_and_cosine_entries(1.0, *np.transpose(settings)),
         kind=WaveEffect,
     )
-
-
-def _double_settling_form(about: ReferenceFit) -> Iterator[Form]:
-    """Yield a settling of the reading with two time constants from the start of each run."""
-
-    def change(value: Any, rows: RunTable, a: Any, b: Any, tau1: Any, tau2: Any) -> Any:
-        since = time_since_start_of_run(rows)
-        return a * np.exp(-since / tau1) + b * np.exp(-since / tau2)
-
-    between, unit = settling_time_prior(about), about.reading_unit
-    taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
-    pairs = [(taus[i], taus[j]) for i in range(_N_SETTLING) for j in range(i + _APART, _N_SETTLING)]
-    bank = np.array([[[1.0, 0.0, *pair], [0.0, 1.0, *pair]] for pair in pairs])
-    size, tau = (AMPLITUDE, unit), (between, about.time_unit)
-    parameters: Declared = {"a": size, "b": size, "tau1": tau, "tau2": tau}
-    text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
-    yield from _proposal(about, text, parameters, change, ("time", "run"), bank, guess=1.0, expression=text)
 
 
 def _varying_influence_form(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:

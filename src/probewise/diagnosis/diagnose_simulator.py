@@ -34,7 +34,7 @@ from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Sim
 from probewise.systems.forms import ReferenceFit
 from probewise.systems.forms.binding import sorting_column
 from probewise.systems.forms.reference import note_on_row_order
-from probewise.systems.forms.stop import MeterStop, is_signal_beyond, meter_stops_and_masks
+from probewise.systems.forms.stop import MeterStop, meter_stops_and_masks
 from probewise.systems.integrate import Integrations
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
@@ -105,24 +105,6 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
         why += "run; fill the gaps in to use them"
     note = f"{count_with_noun(int(lost.sum()), 'reading')} left out: a column that the {why}"
     return _without_readings(recording, lost, note)
-
-
-def without_readings_at_scattered_stop(
-    system: System, recording: RunRecording
-) -> tuple[RunRecording, MeterStop | None]:
-    """Leave out, with a note, readings at an undeclared stop of the meter that are scattered over the table.
-
-    The stop, None if there is none, counts only if a fit to the other readings predicts these beyond it.
-    """
-    for stop, rows in meter_stops_and_masks(recording, system.simulator.reading, scattered=True):
-        without = _without_rows_at_stop(recording, stop, rows)
-        if without.usable.sum() < system.least_readings:
-            continue
-        fitted, found, sd = fit_system(system, without)
-        predicted = fitted.chain(recording.plan, ()).predict(fitted.theta(found.z[None, :]), recording.plan)[0]
-        if is_signal_beyond(stop, predicted[rows], sd):
-            return without, stop
-    return recording, None
 
 
 def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolArray) -> RunRecording:
@@ -292,8 +274,6 @@ def prepare_system(
         raise ParameterError("readings within the declared range", n_within, allowed)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
-    if stop is None:
-        recording, stop = without_readings_at_scattered_stop(system, recording)
     plain = system
     system, found, sd = fit_system(plain, recording)
     first = SimulatorApparatus(ReferenceFit(system, table, found.z, sd))

@@ -49,28 +49,9 @@ def test_nothing_is_seen_where_no_meter_stops(case):
     assert _stop(_table(_NOT_STOPPED[case])) is None
 
 
-def _prepared(readings):
-    """Rows in no order, so that hardly two readings at the stop follow each other."""
-    table = _table(readings)
-    mixed = np.random.default_rng(4).permutation(_N)
-    return prepare_system(_simulator(), table_for(_simulator(), {name: v[mixed] for name, v in table.items()}))
-
-
-@pytest.mark.parametrize(
-    ("readings", "level"),
-    [(lambda y: np.minimum(y, 5.7), 5.7), (lambda y: np.maximum(y, 2.2), 2.2)],
-    ids=["ceiling", "floor"],
-)
-def test_a_stop_is_seen_in_rows_in_no_order_where_the_signal_is_beyond(readings, level):
-    prepared = _prepared(readings)
-    assert prepared.apparatus.stop is not None
-    assert prepared.apparatus.stop.level == level
-    assert any("where the meter stops" in note for note in prepared.recording.notes)
-
-
 def test_lost_readings_at_the_end_of_the_range_are_no_stop():
     lost = np.random.default_rng(6).random(_N) < 0.08
-    prepared = _prepared(lambda y: np.where(lost, 9.0, y))
+    prepared = prepare_system(_simulator(), table_for(_simulator(), _table(lambda y: np.where(lost, 9.0, y))))
     assert prepared.apparatus.stop is None
     assert prepared.apparatus.lost is not None
     assert prepared.apparatus.lost.known[1] == 9.0

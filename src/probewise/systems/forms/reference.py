@@ -38,8 +38,6 @@ _BY_CHANCE = 1e-4  # probability below which sorted readings are no chance
 _LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
 _LEAST_CUT = 0.003  # of a range, that is cut off at least by what is looked for
 _N_LEVELS = 10  # of either
-_WILD_SHARE = 0.001  # of the values, at either end, beside one that may be wild
-_WILD = 4.0  # times the range of the other values, from which some are wild
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
@@ -168,23 +166,15 @@ class Clipping:
 
 
 def clipping_between(values: FloatArray) -> Clipping | None:
-    """Return the clipping of some values at a level within their range, NaN aside; None if that is empty.
-
-    A wild value, as 9999 in one cell, is left out: it would move the level that tells a ceiling from a floor.
-    """
-    ordered = np.sort(values[np.isfinite(values)])
-    if not ordered.size or ordered[0] == ordered[-1]:
+    """Return the clipping of some values at a level within their range, NaN aside; None if that is empty."""
+    known = values[np.isfinite(values)]
+    if not known.size or np.ptp(known) == 0:
         return None
-    n_wild = 1 + int(_WILD_SHARE * len(ordered))
-    inner, others = ordered, ordered[n_wild:-n_wild]
-    range_ = np.ptp(others) if others.size else 0.0
-    if 0 < _WILD * range_ < np.ptp(ordered):
-        inner = ordered[(ordered >= others[0] - range_) & (ordered <= others[-1] + range_)]
-    low, high = float(inner[0]), float(inner[-1])
+    low, high = float(known.min()), float(known.max())
     span = high - low
     ceilings = high - span * np.geomspace(_LEAST_CUT, 0.97 * (1 - _LOWER_PART), _N_LEVELS)  # densest at the ends
     tried = np.append(ceilings, low + span * np.geomspace(_LEAST_CUT, 0.97 * _LOWER_PART, _N_LEVELS))
-    return Clipping(Uniform(low, high), low + _LOWER_PART * span, tried, float(ordered[-1]) + span)
+    return Clipping(Uniform(low, high), low + _LOWER_PART * span, tried, high + span)
 
 
 _VALUES_OF_A_SIDE = 3  # at least, on either side of a switch

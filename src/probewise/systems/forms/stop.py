@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import BoolArray
 from probewise.effects import NoiseEffect
 from probewise.effects.noise import lattice_step
 from probewise.priors import Uniform
@@ -22,7 +22,6 @@ _FINE = 0.1
 # Share of the other readings that equal the one before. Eight equal readings in turn, or five and three, are then by
 # chance in one of 1e5 places, and at the end of the range in fewer.
 _OFTEN = 0.1
-_NEARLY_ALL = 0.9  # of the readings at a stop must have a signal near it or beyond
 
 
 @dataclass(frozen=True)
@@ -56,15 +55,12 @@ class MeterStop:
         )
 
 
-def meter_stops_and_masks(
-    recording: Recording, reading: str = "the reading", *, scattered: bool = False
-) -> Iterator[tuple[MeterStop, BoolArray]]:
+def meter_stops_and_masks(recording: Recording, reading: str = "the reading") -> Iterator[tuple[MeterStop, BoolArray]]:
     """Yield stops at the largest and smallest reading, with the mask of the rows there, (n_points,).
 
     At least eight readings must equal that reading exactly, five of them in succession: noise makes readings differ,
-    unless the meter saturates after the noise. Where they are `scattered`, few other readings may have an exact equal;
-    lost readings look alike, and only a fit tells whether the signal is beyond (`is_signal_beyond`). None where
-    rounding is too coarse to tell, or at an end that was declared.
+    unless the meter saturates after the noise. None where rounding is too coarse to tell, or at an end that was
+    declared.
     """
     usable = np.flatnonzero(recording.usable)
     readings, scan = recording.readings[usable], recording.plan.scan[usable]
@@ -78,22 +74,8 @@ def meter_stops_and_masks(
         stands, there = readings == level, recording.readings == level
         if stands.sum() < _LEAST_IN_ALL or recording.censored[there].any():
             continue
-        if scattered:
-            n_each = np.unique(readings[~stands], return_counts=True)[1]
-            is_stop = n_each[n_each > 1].sum() / max(n_each.sum(), 1) <= _OFTEN
-        else:
-            elsewhere = steps[~stands[1:][in_turn]]
-            follows = np.append(False, stands[:-1] & stands[1:] & in_turn)
-            streaks = np.diff(np.flatnonzero(np.append(~follows, True)))  # of rows at the stop, or one elsewhere
-            is_stop = np.mean(elsewhere == 0) <= _OFTEN and streaks.max() >= _LEAST_IN_TURN
-        if is_stop:
+        elsewhere = steps[~stands[1:][in_turn]]
+        follows = np.append(False, stands[:-1] & stands[1:] & in_turn)
+        streaks = np.diff(np.flatnonzero(np.append(~follows, True)))  # of rows at the stop, or one elsewhere
+        if np.mean(elsewhere == 0) <= _OFTEN and streaks.max() >= _LEAST_IN_TURN:
             yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), there
-
-
-def is_signal_beyond(stop: MeterStop, predicted: FloatArray, sd: float) -> bool:
-    """Return whether a fit to the other readings explains those at a stop, which it predicts as `predicted`, (n_rows,).
-
-    More than half of them must be predicted beyond the stop, and nine in ten at most two noise sds within it.
-    """
-    beyond = (predicted - stop.level) * (1.0 if stop.is_ceiling else -1.0)
-    return bool(np.mean(beyond > -2 * sd) >= _NEARLY_ALL and np.median(beyond) > 0)

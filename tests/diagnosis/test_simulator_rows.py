@@ -21,18 +21,15 @@ from probewise.diagnosis.simulator_rows import SimulatorApparatus, possible_run_
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.recordings import Plan
 from probewise.systems import (
-    FittedSystem,
     Law,
     RunTable,
     Simulator,
     System,
     as_recording,
     concatenate_tables,
-    predict_system,
     table_for,
 )
 from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.table import covariate_of_column
 
@@ -180,55 +177,6 @@ def test_a_step_that_correlated_noise_imitates_is_as_well_known_as_by_the_closed
     assert sd < 3.0
     assert at.mean == pytest.approx(mean, abs=0.5 * sd)
     assert at.sd == pytest.approx(sd, rel=0.4)
-
-
-NAME = "depends:rate:temp_c"
-_HOURS, _TEMP = (a.ravel() for a in np.meshgrid(np.linspace(1.0, 40.0, 12), np.linspace(20.0, 80.0, 8)))
-SIMULATOR = Simulator(
-    "y",
-    "V",
-    {"start": (5, 15), "rate": ("log", 1e-4, 1.0)},
-    simulate=lambda p, u: p["start"] * np.exp(-p["rate"] * u["hours"]),
-)
-
-
-def _table(y):
-    return RunTable({"hours": _HOURS, "temp_c": _TEMP, "y": y})
-
-
-def _about(misfit):
-    table = _table(np.zeros(_HOURS.size))
-    system = System.of(SIMULATOR, table)
-    return ReferenceFit(system, table, np.zeros(system.n_params), 0.05, misfit=misfit)
-
-
-def test_a_scale_parameter_changes_linearly_first_and_by_a_factor_of_the_same_slope_second():
-    about = _about(100.0)
-    form = bind_forms(about)[NAME]
-    start, rate = about.theta[0]
-    warmer = _TEMP - _TEMP.mean()
-    linear, factor = form.variants()
-    for variant, expected in (
-        (linear, lambda a: rate + a * warmer),
-        (factor, lambda a: rate * np.exp(a / rate * warmer)),
-    ):
-        (which,) = np.unique(variant.bank()[:, :, 1])
-        chain = about.system.chain(about.table, [variant])
-        found = chain.predict(np.array([[start, rate, 3e-4, which]]), about.table)[0]
-        np.testing.assert_allclose(found, start * np.exp(-expected(3e-4) * _HOURS), rtol=1e-6)
-        assert variant.fixed == ("as_factor",)
-        assert np.isfinite(variant.prior.log_prob(np.array([[3e-4, which]])))[0]
-
-
-def test_a_stored_model_of_an_earlier_version_depends_linearly():
-    """Its file holds `a` alone: predictions are those of the same file with the new parameter at 0."""
-    about = _about(1.0)
-    names = ("start", "rate", f"{NAME}.a")
-    samples = np.array([10.0, 0.02, 3e-4]) * (1 + 0.01 * np.random.default_rng(0).standard_normal((500, 3)))
-    old = FittedSystem(SIMULATOR, names, samples, np.full(500, 0.05), effects=(NAME,), known=extract_stored_fit(about))
-    mean = predict_system(old, about.table, rng=np.random.default_rng(0)).mean
-    rate = samples[:, 1:2] + samples[:, 2:] * (_TEMP - _TEMP.mean())
-    np.testing.assert_allclose(mean, (samples[:, :1] * np.exp(-rate * _HOURS)).mean(axis=0), atol=0.02)
 
 
 def test_what_comes_next_is_the_last_fifth_of_the_readings_of_each_run():

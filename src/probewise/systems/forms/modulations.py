@@ -22,7 +22,7 @@ from probewise.effects.effect import (
     sine_and_cosine_entries,
 )
 from probewise.effects.reference import is_far_from_zero
-from probewise.priors import LogUniform, Marginal, SharedScalePrior, Uniform
+from probewise.priors import LogUniform, SharedScalePrior, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.reference import (
     AMPLITUDE,
@@ -30,14 +30,10 @@ from probewise.systems.forms.reference import (
     BlockForm,
     Form,
     ReferenceFit,
-    flag,
     period_with_sd,
 )
 from probewise.systems.table import RunTable, covariate_of_column
 
-_AS_FACTOR = "as_factor"  # name of the parameter that is 0 for the linear variant, and 1 for the one by a factor
-_FAR = 0.3  # change of a parameter by its own size, as large as the misfit asks for, at which the variants differ
-_MOST_NATS = 50.0  # largest logarithm of a factor
 _N_VALUES = 9
 _UNSEEN = 1e-7  # of the noise
 _ALL = 17  # digits of a number in double precision
@@ -338,40 +334,7 @@ def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
                 yield from varied(f"{kind}:{name}", modulation(about, *of), size)
         for column in about.varying_columns:
             how = column_proportional_modulation(about, *of, column)
-            for form in varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column]))):
-                yield _linear_or_by_factor(about, form, name, how) if isinstance(prior, LogUniform) else form
-
-
-def _linear_or_by_factor(about: ReferenceFit, form: Form, name: str, how: Modulation) -> Form:
-    """Return a form of a parameter with two variants: it changes linearly, or by a factor, exponentially.
-
-    A parameter with a log prior has no sign, and what changes it, as the temperature changes a rate, often multiplies
-    it. `a` is the slope where the modulation is 0 in both. The second variant is offered where the misfit may ask for a
-    change that is not small beside the parameter; otherwise they are the same.
-    """
-
-    def act(value: dict[str, FloatArray], theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:
-        change, before = how.at_rows(theta, table), value[name]
-        if np.all(theta[:, 1] < 0.5):
-            return {**value, name: before + change}
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factor = np.exp(np.clip(change / before, -_MOST_NATS, _MOST_NATS))
-        return {**value, name: np.where(theta[:, 1:2] > 0.5, before * factor, before + change)}
-
-    def says(mean: FloatArray, sd: FloatArray) -> str:
-        by_factor = ", and in proportion to itself (exponentially)" if mean[1] > 0.5 else ""
-        return form.sentence(mean, sd) + by_factor
-
-    def variant(as_factor: bool) -> Form:
-        value, prior = flag(as_factor)
-        priors: dict[str, Marginal] = {**form.marginals, _AS_FACTOR: prior}
-        bank = np.insert(form.entries, 1, value, axis=2)
-        return replace(form, parameters=priors, units=(*form.units, "1"), apply=act, entries=bank, sentence=says)
-
-    there = about.system.parameters(about.theta, about.table)[name]
-    most = float(np.abs(how.at_rows(form.entries[0, :1], about.table)).max()) * max(about.misfit, 1.0)
-    is_near = most < _FAR * float(np.abs(there).min())
-    return variant(False) if is_near else replace(variant(False), alternatives=(variant(True),))
+            yield from varied(f"depends:{name}:{column}", how, guess / float(np.nanstd(table.covariates[column])))
 
 
 def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:

@@ -49,7 +49,6 @@ _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without
 AMPLITUDE, POSITIVE = HeavyTailedPrior(1.0), HeavyTailedPrior(1.0, positive=True)
 """Priors of amplitudes of a form before `ReferenceFit.scaled` finds their typical size: of either sign, or positive."""
 
-_FLAG_WIDTH = 1e-9  # of its prior
 _BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
 _BLOCKS = 0.1  # odds of a step that goes back: as those of a second wave
 
@@ -86,12 +85,6 @@ class BlockForm(StepEffect):
         chosen = rng.choice(len(weights), len(theta), p=weights)
         drawn = low[chosen] + (high - low)[chosen] * rng.random((len(theta), 3))[:, 1:]
         return np.concatenate([theta[:, :1], drawn], axis=1)
-
-
-def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
-    """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
-    value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH
-    return value, Fixed(value - 0.5 * _FLAG_WIDTH, value + 0.5 * _FLAG_WIDTH, odds)
 
 
 def period_with_sd(frequency: float, sd: float, time_unit: str) -> str:

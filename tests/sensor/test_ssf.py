@@ -78,23 +78,6 @@ def test_the_mixture_of_a_field_keeps_its_moments(n_gaussians):
     assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, rel=1e-4, abs=1e-3)
 
 
-@pytest.mark.parametrize("n_gaussians", [1, 2])
-@pytest.mark.parametrize(
-    "values",
-    [[[1.0]], [[0.0, 0.0], [0.0, 3.0]], [[1.0, 2.0, 3.0]], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [2.0, 0.0, 0.0]]],
-)
-def test_a_field_of_one_pixel_or_of_a_line_of_them_is_as_wide_as_its_pixels(values, n_gaussians):
-    """The moments are those of the squares, by a fine grid within each."""
-    field = SSFField(np.array(values), 2.0, (-1.0, 5.0))
-    within = (np.arange(200) + 0.5) / 100 - 1.0
-    u, v = (field.centers_mm[:, axis, None, None] + (within if axis else within[:, None]) for axis in (0, 1))
-    u, v = np.broadcast_arrays(u, v)
-    weight = np.broadcast_to(field.values.ravel()[:, None, None], u.shape).ravel()
-    mixture = mixture_of_field(field, n_gaussians=n_gaussians)
-    assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-6)
-    assert mixture.cov_mm2 == pytest.approx(np.cov(u.ravel(), v.ravel(), aweights=weight, ddof=0), abs=1e-3)
-
-
 def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
     """One Gaussian for the mean of many fields: its moments are the mean field's."""
     rng = np.random.default_rng(1)

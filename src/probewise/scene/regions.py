@@ -77,8 +77,8 @@ def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
     """Trace the closed edge of each hypothesis, for drawing, rasterising and culling.
 
     `region`: ellipses, polygons, a mixture of these, or any kind that registers its outline (`outlines.register`);
-    `n_vertices`: of a curved edge. Returns one array (n, 2) per hypothesis, mm, the first vertex repeated at the end;
-    pieces of a polygon that crosses itself are separated by NaN. ParameterError if the region has no closed edge.
+    `n_vertices`: of a curved edge. Returns one array (n, 2) per hypothesis, mm, the first vertex repeated at the end.
+    ParameterError if the region has no closed edge.
     """
     raise ParameterError("region", type(region).__name__, "EllipseRegion, PolygonRegion or a mixture of them")
 
@@ -249,17 +249,7 @@ def _even_odd_boundary_edges(edges: FloatArray) -> FloatArray:
 
 @outlines.register
 def _outlines_of_polygon(region: PolygonRegion, *, n_vertices: int = 96) -> list[FloatArray]:
-    traces = []
-    for edges in region.edges_mm:
-        if np.array_equal(edges[1, 1], edges[0, 0]):  # given clockwise: each edge was turned round in its place
-            edges = edges[::-1]
-        points = [edges[0, 0]]
-        for start, end in edges:
-            if not np.array_equal(points[-1], start):
-                points += [np.full(2, np.nan), start]
-            points.append(end)
-        traces.append(np.array(points))
-    return traces
+    return [np.concatenate([edges[:, 0], edges[:1, 0]]) for edges in region.edges_mm]
 
 
 @edge_distance.register

@@ -17,7 +17,6 @@ from probewise.sensor.stages import Footprint
 
 _REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
 _NEGLIGIBLE = 1e-9  # share of a field's light that is not drawn
-_ON_A_LINE = 1e-6  # of a pixel: root sum square distance from a line
 
 
 def mixture_parameter_names(n_gaussians: int) -> tuple[str, ...]:
@@ -255,22 +254,12 @@ def merged_mean_mixture(footprint: Footprint, *, n_gaussians: int = 1) -> FixedM
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Pixels count as points; but where all lie on a line, or there is one alone, as squares, whose width is added to the
-    covariance. Negative values of the field count as 0. Gaussians without mass are left out of the `n_gaussians`.
-    Raises ParameterError if one of several Gaussians would have no width, as one on a single pixel.
+    Pixels count as points, negative values of the field as 0. Gaussians without mass are left out of the `n_gaussians`.
+    Raises ParameterError if a Gaussian would have no width, as one on a single pixel.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
-    places = field.centers_mm[kept]
-    across = np.linalg.svd(places - places.mean(axis=0), compute_uv=False).min() if len(places) > 1 else 0.0
-    width = field.pixel_mm**2 / 12 if across < _ON_A_LINE * field.pixel_mm else 0.0
-    return _merge_gaussians(values[kept], places, np.tile(width * np.eye(2), (len(places), 1, 1)), n_gaussians)
-
-
-def _quadratic_form(off: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Return the quadratic form off' matrix off for each row of `off`, (n, 2) -> (n,)."""
-    x, y = off[:, 0], off[:, 1]
-    return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
+    return _mixture_of_points(values[kept], field.centers_mm[kept], n_gaussians)
 
 
 def _similar_groups(w: FloatArray, places: FloatArray, n_groups: int) -> list[IntArray]:
@@ -305,12 +294,12 @@ def _mass_mean_covariance(w: FloatArray, means: FloatArray, covs: FloatArray) ->
     return mass, mean, (w @ covs).reshape(2, 2) / mass + (w[:, None] * off).T @ off / mass
 
 
-def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
-    """Merge weighted Gaussians (points: covariance 0) into at most `n_gaussians`, by expectation-maximisation."""
+def _mixture_of_points(w: FloatArray, places: FloatArray, n_gaussians: int) -> FixedMixture:
+    """Fit at most `n_gaussians` to weighted points (n, 2), by expectation-maximisation."""
     require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
     w = w / w.sum()
-    flat_covs = covs.reshape(len(w), 4)
-    _, mean, cov = _mass_mean_covariance(w, means, flat_covs)
+    none = np.zeros((len(w), 4))
+    _, mean, cov = _mass_mean_covariance(w, places, none)
     if n_gaussians == 1:
         return FixedMixture(np.ones(1), mean[None], cov[None])
     # Start from Gaussians of increasing width, spread along the principal axis.
@@ -325,7 +314,7 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
         log_p = np.empty((len(w), n_gaussians))
         for k in range(n_gaussians):
             inverse = np.linalg.inv(shapes[k])
-            quadratic = _quadratic_form(means - centers[k], inverse) + flat_covs @ inverse.ravel()
+            quadratic = np.einsum("ni,ij,nj->n", places - centers[k], inverse, places - centers[k])
             log_p[:, k] = np.log(weights[k]) - 0.5 * (quadratic + np.log(np.linalg.det(shapes[k])))
         top = log_p.max(axis=1, keepdims=True)
         p = np.exp(log_p - top)
@@ -334,7 +323,7 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
         shares = w[:, None] * p / total
         alive = shares.sum(axis=0) > 1e-9
         shares, n_gaussians = shares[:, alive], int(alive.sum())
-        fitted = [_mass_mean_covariance(shares[:, k], means, flat_covs) for k in range(n_gaussians)]
+        fitted = [_mass_mean_covariance(shares[:, k], places, none) for k in range(n_gaussians)]
         weights, centers, shapes = (np.array(part) for part in zip(*fitted, strict=True))
         shapes = shapes + floor
         if score - last < 1e-8:

@@ -111,7 +111,7 @@ def runge_kutta_step(
     second = rates(s + 0.5 * width * first, middle)
     third = rates(s + 0.5 * width * second, middle)
     last = rates(s + width * third, between(begin + length))
-    return np.asarray(s + width * (first / 6 + second / 3 + third / 3 + last / 6))
+    return np.asarray(s + width * (1 / 6 * first + 1 / 3 * second + 1 / 3 * third + 1 / 6 * last))
 
 
 @dataclass(frozen=True, eq=False)

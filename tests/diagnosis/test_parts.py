@@ -184,20 +184,33 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     assert found == pytest.approx(math.log(total / len(visible)), abs=1e-6)
 
 
-def _problem_and_templates():
-    """Templates of one to three columns about a fit of four parameters, with memory and a lost reading."""
+_ROW = np.arange(60)
+_CARRY, _LOST = np.where(_ROW % 10 > 0, 0.3, 0.0), _ROW == 5  # memory within runs of ten, and a lost reading
+_LAWS = {
+    "memory": NoiseLaw(np.ones(60), _CARRY, _LOST),
+    "memory of unlike readings": NoiseLaw(np.exp(0.2 * np.sin(_ROW)), _CARRY, _LOST),
+    "memory within interleaved runs": NoiseLaw(
+        np.ones(60), np.where(_ROW > 1, 0.3, 0.0), _LOST, before=np.maximum(_ROW - 2, 0)
+    ),
+    "a walk": NoiseLaw(np.ones(60), np.zeros(60), _LOST, walk=np.full(60, 0.2)),
+}
+
+
+def _problem_and_templates(law=_LAWS["memory of unlike readings"]):
+    """Templates of one to three columns about a fit of four parameters."""
     rng = np.random.default_rng(4)
     n, p = 60, 4
     templates = [rng.normal(size=(n, k)) for k in (1, 2, 1, 3)]
-    law = NoiseLaw(np.exp(0.2 * rng.normal(size=n)), np.full(n, 0.3) * (np.arange(n) % 10 > 0), np.arange(n) == 5)
     basis, _ = np.linalg.qr(rng.normal(size=(n + p, p)))
     residuals = rng.normal(size=(n + p, 3))
     residuals -= basis @ (basis.T @ residuals)
     return Linearised(basis, residuals[:, 0], law, 1.3, n), residuals, templates
 
 
-def test_a_pair_weighs_as_one_template_of_all_its_columns():
-    problem, _, templates = _problem_and_templates()
+@pytest.mark.parametrize("law", _LAWS.values(), ids=_LAWS)
+def test_a_pair_weighs_as_one_template_of_all_its_columns(law):
+    """Route one: columns that are whitened; route two: products that take the whitening's adjoint and precision."""
+    problem, _, templates = _problem_and_templates(law)
     banks = {name: [template] for name, template in zip("abcd", templates, strict=True)}
     singles = {name: TemplateBank.of(own, [name]).log_bayes_factors(problem)[:, 0] for name, own in banks.items()}
     for (a, b), found in log_bayes_factors_of_pairs(problem, banks, singles).items():

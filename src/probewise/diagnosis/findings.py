@@ -18,7 +18,7 @@ from probewise.diagnosis.noise import n_rows_since_previous_usable, noise_statis
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
 from probewise.diagnosis.search.hypotheses import ALIASED_NATS, Searched, WeighedFit, noise_effects_in_vocabulary
-from probewise.diagnosis.templates import TemplateCache, log_bayes_factors_by_label, log_mean_exp
+from probewise.diagnosis.templates import TemplateCache, log_mean_exp
 from probewise.diagnosis.verdict import N_DRAWS, Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit
 from probewise.effects import Effect, NoiseEffect, is_out_of_vocabulary
@@ -323,9 +323,8 @@ def _formula_of_curve(
     formulas = [form for form in every.values() if (form.covariates, form.stage) == (curve.covariates, curve.stage)]
     if parent is None or not formulas:
         return None, ""
-    problem = Linearised.of(parent.found, best.fit.evidence[best.noise].likeliest_law)
     bank = TemplateCache(prepared.usable_rows).coarse_bank(parent.found, formulas)
-    scores = log_bayes_factors_by_label(problem, bank)
+    scores = bank.log_bayes_factors_by_label(parent.found, best.fit.evidence[best.noise].likeliest_law)
     chosen = max(formulas, key=lambda form: log_mean_exp(scores[form.name]))
     fit, _ = searched.refits.refit_with_effect(parent, chosen)
     formula, _ = _formula_beside(searched, best, fit, rng=rng)

@@ -116,6 +116,13 @@ class Null(Protocol):
     def admits(self, effect: Effect) -> bool:
         """Return whether this model has the stage at which an effect acts."""
 
+    def part_that_predicts(self, rows: IntArray, plan: Plan, effects: Sequence[Effect]) -> tuple[Plan, IntArray]:
+        """Return a part of a plan that suffices to predict some of its rows, and their numbers there; by default all.
+
+        `rows`: their numbers in the plan, (n_rows,); the numbers in the part have the same order.
+        """
+        return plan, rows
+
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates z, (n_samples, n_params), to the model's own parameters: theta without the effects'."""
 
@@ -216,6 +223,15 @@ class Model:
         """Return the noise-free readings of every row of a plan, its own by default, (n_samples, n_points)."""
         return self.chain.predict(self.theta(z), self.plan if plan is None else plan)
 
+    def predict_rows(self, rows: IntArray, z: FloatArray) -> FloatArray:
+        """Return the noise-free readings of some rows of its plan, (n_samples, n_rows); others only if needed."""
+        part, at = self.part_that_predicts(rows)
+        return self.chain.predict(self.theta(z), part)[:, at]
+
+    def part_that_predicts(self, rows: IntArray) -> tuple[Plan, IntArray]:
+        """Return a part of its plan that suffices to predict some rows, and their numbers there, as a null does."""
+        return self.sensor.part_that_predicts(rows, self.plan, self.effects)
+
     def predict_and_differentiate(self, z: FloatArray, *, by: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Return predictions, (n_points,), and slopes, (n_points, n_params), at one point z (n_params,).
 
@@ -268,7 +284,7 @@ class Fit:
         """
         without, stay = self.model.model_and_mask_without(name)
         with np.errstate(invalid="ignore", over="ignore"):
-            change = self.predicted - without.predict(self.z[None, stay])[0, usable]
+            change = self.predicted - without.predict_rows(usable, self.z[None, stay])[0]
         farthest = _FARTHEST_CHANGE * (float(np.abs(self.predicted).max(initial=0.0)) + self.sd)
         possible = np.isfinite(change)
         change = np.clip(change, -farthest, farthest)
@@ -312,6 +328,7 @@ def fit_each_start(
 
     If many predictions cost little more than one, the fits advance together, in batches that fit a processor's cache.
     """
+    usable = np.flatnonzero(recording.usable)
     walks = [_fit_coroutine(model, recording, start, law, max_steps, tolerance, hopeless_above) for start in starts]
     at_once = 1
     if model.sensor.predicts_in_bulk:
@@ -320,7 +337,7 @@ def fit_each_start(
     for first in range(0, len(walks), at_once):
         asked = {k: next(walks[k]) for k in range(first, min(first + at_once, len(walks)))}
         while asked:
-            predicted = model.predict(np.concatenate(list(asked.values())))
+            predicted = model.predict_rows(usable, np.concatenate(list(asked.values())))
             ends = np.cumsum([len(points) for points in asked.values()])
             for k, part in zip(list(asked), np.split(predicted, ends[:-1]), strict=True):
                 try:
@@ -340,9 +357,8 @@ def _fit_coroutine(
     tolerance: float,
     hopeless_above: float,
 ) -> Generator[FloatArray, FloatArray, Fit]:
-    """Fit from one start: yields points (n, n_params), is sent their predictions (n, n_points), returns the fit."""
-    usable = recording.usable
-    readings = recording.readings[usable]
+    """Fit from one start: yields points (n, n_params), is sent their predictions (n, n_usable), returns the fit."""
+    readings = recording.readings[recording.usable]
     dear = model.sensor.predicts_dearly
     one_by_one = dear and not model.sensor.predicts_in_bulk
 
@@ -354,7 +370,7 @@ def _fit_coroutine(
 
     def request_slopes(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         points, steps = difference_points_and_steps(z)
-        return _prediction_and_slopes((yield points)[:, usable], steps)
+        return _prediction_and_slopes((yield points), steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
@@ -384,20 +400,20 @@ def _fit_coroutine(
         in_bulk = model.sensor.predicts_in_bulk
         about, steps = difference_points_and_steps(tries) if in_bulk and not dear else (tries[:0], tries[:0])
         batch = yield np.concatenate(about) if len(about) else tries[: 1 if dear else None]
-        if dear and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
+        if dear and not best - objective(batch, tries[:1])[0] > _AS_EXPECTED * expected:
             if not exact:
                 (predicted, slopes), exact = (yield from request_slopes(z)), True
                 continue
             batch = np.concatenate([batch, (yield tries[1:])])
         tries = tries[: len(batch)] if dear else tries
-        all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
+        all_predicted = batch.reshape(len(tries), -1, batch.shape[1])
         values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)
         short = expected > tolerance and not best - values.min() > _AS_EXPECTED * expected
         if short and in_bulk:
             # In a curved valley that is oblique to the coordinates, damping by their scales stops every step.
             more = _points_after_steps(z, _steps_along_valley(curvature, downhill))
-            found = objective((yield more)[:, usable], more)
+            found = objective((yield more), more)
             tries = np.concatenate([tries, more])
             values = np.append(values, np.where(np.isfinite(found), found, np.inf))
         at = int(np.argmin(values))

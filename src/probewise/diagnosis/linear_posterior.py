@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, fit_each_start, with_prior
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.effects import Effect, HeavyTailedPrior
@@ -169,9 +169,9 @@ class TangentModel:
         """What tells that many predictions cost little: the model itself."""
         return self
 
-    def predict(self, z: FloatArray) -> FloatArray:
-        """Return approximate readings of each row, (n_samples, n_params) -> (n_samples, n_points)."""
+    def predict_rows(self, rows: IntArray, z: FloatArray) -> FloatArray:
+        """Return approximate readings of some rows, (n_samples, n_params) -> (n_samples, n_rows)."""
         moved, n_own = z - self.z, self.system.n_params
         moved[:, :n_own] = (self.system.theta(z[:, :n_own]) - self.theta) / self.derivatives
         view = self.view + moved @ self.slopes
-        return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)
+        return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)[:, rows]

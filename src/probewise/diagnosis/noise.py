@@ -326,6 +326,37 @@ class NoiseLaw:
         return self(columns[:, None])[:, 0] if columns.ndim == 1 else whiten_under_each([self], columns)[0]
 
     @cached_property
+    def _own_and_before(self) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the factors by which whitening without a walk takes each reading, and off it the one `before` it."""
+        before = self.before if self.before.size else np.maximum(np.arange(len(self.sd)) - 1, 0)
+        weight, free = self.kept / self._whitening_sd, np.sqrt(1 - self.carry**2)
+        return weight / free, self.carry / free * weight[before], before
+
+    def adjoint(self, columns: FloatArray) -> FloatArray:
+        """Return the transpose of whitening applied to columns (n_points, k), of the same shape."""
+        if self.walk.size:
+            there = self.kept > 0
+            solved, _ = dtbtrs(self._difference_covariance_root, columns[there], uplo="L", trans="T")
+            solved[:-1] -= solved[1:]
+            out = np.zeros(columns.shape)
+            out[there] = solved
+            return out
+        own, off, before = self._own_and_before
+        out = own[:, None] * columns
+        np.subtract.at(out, before, off[:, None] * columns)
+        return out
+
+    @property
+    def precision(self) -> list[tuple[IntArray | None, FloatArray]]:
+        """Inverse covariance without a walk: its diagonal, and what is off it, if any, by the reading `before` each.
+
+        Each part is (n_points,); None stands before the diagonal.
+        """
+        own, off, before = self._own_and_before
+        diagonal = own**2 + np.bincount(before, off**2, minlength=len(own))
+        return [(None, diagonal), *([(before, -own * off)] if np.any(off) else [])]
+
+    @cached_property
     def _difference_covariance_root(self) -> FloatArray:
         """Banded Cholesky factor of the covariance of successive differences, (2, n_kept)."""
         kept = ~self.lost

@@ -116,6 +116,10 @@ class HypothesisProblem:
         """Return the readings of all rows, (n_samples, n_params) -> (n_samples, n_points)."""
         return self._in_blocks(self.model.predict, z)
 
+    def predict_usable(self, z: FloatArray) -> FloatArray:
+        """Return the predictions of the usable readings, (n_samples, n_params) -> (n_samples, n_usable)."""
+        return self._in_blocks(partial(self.model.predict_rows, np.flatnonzero(self.recording.usable)), z)
+
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood, averaged over the kept noise nodes: (n_samples, n_params) -> (n_samples,)."""
         return self._in_blocks(self._log_likelihood_of_block, theta)
@@ -125,8 +129,8 @@ class HypothesisProblem:
         return np.concatenate([function(block) for block in blocks])
 
     def _log_likelihood_of_block(self, theta: FloatArray) -> FloatArray:
-        usable = self.recording.usable
-        predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
+        usable = np.flatnonzero(self.recording.usable)
+        predicted = self.model.predict_rows(usable, np.clip(theta, -FARTHEST, FARTHEST))
         nodes, kept = self.noise.nodes, self._kept_node_indices
         laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         with np.errstate(all="ignore"):  # of predictions that ran away: impossible below
@@ -332,7 +336,7 @@ class _Ridge:
     def _linearise(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Return slopes (k, n_params, n), residuals (k, n), both in noise sds, precisions, and which are possible."""
         usable, (points, steps) = self.problem.recording.usable, difference_points_and_steps(z)
-        predicted = self.problem.predict(points.reshape(-1, z.shape[1]))[:, usable]
+        predicted = self.problem.predict_usable(points.reshape(-1, z.shape[1]))
         with np.errstate(all="ignore"):
             left = self.law((self.problem.recording.readings[usable] - predicted).T).T
             left = (left / self._variance(self.best) ** 0.5).reshape(*points.shape[:2], -1)
@@ -641,7 +645,7 @@ def posterior_draws(
     surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse. The
     parameters are those of `sample_model`.
     """
-    model, law, usable = found.model, noise.likeliest_law, recording.usable
+    model, law, usable = found.model, noise.likeliest_law, np.flatnonzero(recording.usable)
     # Laplace's approximation: normal, of covariance steps.T @ steps, with `slopes` and `residual` in noise sds.
     whitened = law(found.residuals)[:, None]
     sigma = law.likeliest_sigma(whitened)
@@ -660,7 +664,7 @@ def posterior_draws(
         """Return the mode, one Newton step from the fit, unless that leaves the domain of the formula."""
         downhill = slopes.T @ residual - found.z
         center = np.clip(found.z + np.linalg.solve(with_prior(slopes.T @ slopes), downhill), -FARTHEST, FARTHEST)
-        is_possible = np.isfinite(model.predict(center[None, :])[0, usable]).all()
+        is_possible = np.isfinite(model.predict_rows(usable, center[None, :])).all()
         return np.asarray(center) if is_possible else found.z
 
     if not annealed:
@@ -702,7 +706,7 @@ def posterior_draws(
             if drawn is not None:
                 return drawn
     center, readings = mode(), recording.readings[usable]
-    near = surrogate_log_density(lambda z: model.predict(z)[:, usable], center, steps, readings, law, sd)
+    near = surrogate_log_density(partial(model.predict_rows, usable), center, steps, readings, law, sd)
     e = resampled_or_annealed(normal, lambda e: -0.5 * np.sum(e**2, axis=1), near, _MOVES_NEAR, _N_NEAR)
     e = resampled_or_annealed(e, near, lambda e: log_posterior(center + e @ steps), _MOVES, n_samples, tried)
     return center + e @ steps

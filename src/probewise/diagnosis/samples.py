@@ -26,7 +26,7 @@ from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.posterior import n_tried, posterior_draws
 from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, effects_out_of_vocabulary
-from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_by_label, templates_of_effect
+from probewise.diagnosis.templates import TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import GlobalTest, Judged
 from probewise.effects import NUISANCES, Effect, Extent, NoiseEffect
 from probewise.effects.noise import quantisation, sd_of_estimated_lattice_step
@@ -56,7 +56,7 @@ def weights_beside_other_effects(
             without = Fit(model, found.z[stay], predicted, left, slopes, found.sd, found.objective)
             templates = templates_of_effect(without, effect, usable)
             bank = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns))
-            scores = log_bayes_factors_by_label(Linearised.of(without, law), bank)[effect.name]
+            scores = bank.log_bayes_factors(Linearised.of(without, law))[:, 0]
             if np.isfinite(scores).all():
                 out[effect.name] = templates.variant_probabilities(scores)
     return out
@@ -156,7 +156,7 @@ def sample_model(
     z = np.clip(draws, -FARTHEST, FARTHEST)
     # Samples that are not annealed serve for the effects only: their noise is that of the fit. Where each sample is a
     # call, those that were tried serve for all.
-    predicted = model.predict(z[: n_tried(model)])[:, usable] if annealed else found.predicted[None, :]
+    predicted = model.predict_rows(usable, z[: n_tried(model)]) if annealed else found.predicted[None, :]
     residuals = np.resize(readings - predicted, (N_SAMPLES, len(usable)))
     noise_sd = draw_noise_sd(law, residuals, rng=rng)
     largest = float(np.abs(readings).max()) or 1.0

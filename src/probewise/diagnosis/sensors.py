@@ -71,6 +71,7 @@ class CalibratedSensor:
     calibrated_height_mm: float | None = None
     sd_prior: SdPrior | None = None
     predicts_in_bulk = predicts_dearly = may_be_far_off = False
+    part_that_predicts = Null.part_that_predicts
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", read_only_floats(self.center))

@@ -171,7 +171,7 @@ class _Descent:
 
     def __init__(self, system: System, recording: Recording, law: NoiseLaw) -> None:
         self.system, self.law, self.model = system, law, Model(system, (), recording.plan)
-        self.usable, self.readings = recording.usable, recording.readings[recording.usable]
+        self.usable, self.readings = np.flatnonzero(recording.usable), recording.readings[recording.usable]
         self.flat = np.array([isinstance(prior, Uniform | LogUniform) for prior in system.marginals.values()])
         self.low, self.high = np.where(self.flat, 0.0, -FARTHEST), np.where(self.flat, 1.0, FARTHEST)
         self.per_block = max(AT_ONCE // len(recording), 1)
@@ -183,9 +183,10 @@ class _Descent:
         """Return whitened residuals, (..., n_params) -> (..., n_usable)."""
         u = np.where(self.flat, x, ndtr(x)).reshape(-1, x.shape[-1])
         blocks = np.array_split(u, -(-len(u) // self.per_block))
+        part, at = self.model.part_that_predicts(self.usable)
         with np.errstate(all="ignore"):
             out = [
-                self.law((self.readings - self.model.chain.predict(theta, self.model.plan)[:, self.usable]).T).T
+                self.law((self.readings - self.model.chain.predict(theta, part)[:, at]).T).T
                 for theta in map(self.system.prior.from_unit_cube, blocks)
             ]
         return np.concatenate(out).reshape(*x.shape[:-1], -1)

@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
-from typing import TypeAlias, cast
+from typing import cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised, scale_and_project, whiten_to_unit_rms
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised, scale_and_project
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.prior_odds import Names
@@ -28,11 +28,10 @@ from probewise.sensor import Stage
 
 _INVISIBLE = -50.0  # log Bayes factor of a template that the fit absorbs entirely
 _ABSENT = 1e-9  # share of a template's squares below which its projection is rounding
-_REMEMBERED = 5  # most recent noise models of which whitened templates are cached, unless in groups
-_MOST_AT_ONCE = 2**22  # numbers of templates that are whitened together; more in groups of an eighth, for the cache
-
-_Whitened: TypeAlias = tuple[FloatArray, dict[int, FloatArray]]
-"""Templates, whitened, of unit rms each, (n_points, n_columns), and by width Gram matrices, (n, width, width)."""
+_MOST_AT_ONCE = 2**19  # numbers of templates that are multiplied together, for a processor's cache
+_MOST_REMEMBERED = 2**25  # numbers of templates that are remembered: those of a few hundred rows about every fit
+_MOST_PASSING = 2**22  # numbers of templates that are not remembered
+_FEW_KINDS = 16  # of readings, by their precision: ends and gaps of scans make a handful; other noise, one a reading
 
 
 @dataclass(eq=False)
@@ -46,7 +45,9 @@ class TemplateBank:
     templates: tuple[FloatArray, ...]
     labels: tuple[str, ...]
     which: IntArray
-    _whitened: dict[tuple[bytes, ...], _Whitened] = field(default_factory=dict, repr=False)
+    _grams: dict[tuple[bytes, ...], list[FloatArray]] = field(default_factory=dict, repr=False)
+    _sums: dict[tuple[int, bool, bytes], FloatArray] = field(default_factory=dict, repr=False)
+    _scores: dict[tuple[Fit, NoiseLaw], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str]) -> TemplateBank:
@@ -55,6 +56,11 @@ class TemplateBank:
         numbers = {key: number for number, key in enumerate(unique)}
         which = np.array([numbers[id(template)] for template in templates], dtype=np.int64)
         return cls(tuple(unique.values()), tuple(labels), which)
+
+    @classmethod
+    def by_name(cls, each: Mapping[str, Sequence[FloatArray]]) -> TemplateBank:
+        """Build a bank of the templates of each name, which is their label."""
+        return cls.of([t for own in each.values() for t in own], [name for name, own in each.items() for _ in own])
 
     def __getitem__(self, at: int) -> FloatArray:
         """Return the template of entry number `at`, (n_points, k)."""
@@ -76,14 +82,14 @@ class TemplateBank:
         return TemplateBank.of([self[k] for k in members], [self.labels[k] for k in members])
 
     @cached_property
-    def groups(self) -> list[slice]:
-        """Successive templates that are whitened together: all, or parts of those of a long table."""
-        if not self.templates:
-            return []
-        ends = np.cumsum(self.widths) * len(self.templates[0])
-        part = ends // (_MOST_AT_ONCE // 8) if ends[-1] > _MOST_AT_ONCE else np.zeros_like(ends)
-        bounds = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), len(part)]
-        return [slice(first, end) for first, end in itertools.pairwise(bounds)]
+    def groups(self) -> list[IntArray]:
+        """Numbers of the templates that are multiplied together: of one width, few enough for a processor's cache."""
+        out = list[IntArray]()
+        for width in dict.fromkeys(self.widths.tolist()):
+            members = np.flatnonzero(self.widths == width)
+            at_once = max(_MOST_AT_ONCE // (max(len(self.templates[0]), 1) * width), 1)
+            out += np.split(members, range(at_once, len(members), at_once))
+        return out
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
         """Return the log Bayes factor of adding each entry to a fit, amplitude and noise sd integrated out.
@@ -92,66 +98,104 @@ class TemplateBank:
         (n_entries, n_draws).
         """
         own = problem.residual[:, None] if residuals is None else residuals
-        n, n_kept = problem.n_points, problem.n_kept
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.templates), own.shape[1]))
-        for group, (whitened, grams) in self._whitened_under(problem.law):
-            taken, along = problem.basis[:n].T @ whitened, whitened.T @ own[:n]  # what the fit absorbs, and the rest
-            widths = self.widths[group]
-            for width, products in grams.items():  # all templates of one width at a time
-                members = np.flatnonzero(widths == width)
-                at = (np.cumsum(widths) - widths)[members, None] + np.arange(width)
-                absorbed = taken[:, at].transpose(1, 0, 2)
-                left = products - absorbed.transpose(0, 2, 1) @ absorbed
-                out[group.start + members] = _log_bayes_factors_of_grams(left, along[at], total, n_kept)
+        for members, _, left, along in self.projected(problem, own):
+            out[members] = _log_bayes_factors_of_grams(left, along, total, problem.n_kept)
         return out[self.which]
+
+    def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw) -> dict[str, FloatArray]:
+        """Return the log Bayes factors of its entries about a fit under noise `law`, (n_entries,), by label; cached."""
+        if (found, law) not in self._scores:
+            scores = self.log_bayes_factors(Linearised.of(found, law))[:, 0]
+            self._scores[found, law] = {label: scores[at] for label, at in self.indices_by_label.items()}
+        return self._scores[found, law]
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
         """Return the share of each entry's norm that a fit does not absorb, (n_entries,)."""
-        out, basis = [np.zeros(0)], problem.basis[: problem.n_points]
-        for group, (whitened, _) in self._whitened_under(problem.law):
-            taken = basis.T @ whitened
-            starts = np.cumsum(self.widths[group]) - self.widths[group]
-            whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), starts) for a in (whitened, taken))
-            out.append(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
-        return np.concatenate(out)[self.which]
+        out = np.empty(len(self.templates))
+        for members, grams, left, _ in self.projected(problem, np.zeros((len(problem.basis), 0))):
+            whole, kept = (np.trace(each, axis1=1, axis2=2) for each in (grams, left))
+            out[members] = np.sqrt(np.maximum(1 - (whole - kept) / np.maximum(whole, 1e-300), 0.0))
+        return out[self.which]
 
-    def _whitened_under(self, law: NoiseLaw) -> Iterator[tuple[slice, _Whitened]]:
-        """Yield all groups of templates, whitened and scaled to unit rms each, with Gram matrices.
+    def projected(
+        self, problem: Linearised, columns: FloatArray
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
+        """Yield products of the templates of each group, as if they were whitened and scaled to unit rms.
 
-        They are cached for the last few noise models if they are one group.
+        They need not be for products with other columns: these are whitened once more, by the adjoint.
+
+        `columns`: projected columns, (n_rows, k). Yields numbers of templates, (n,), Gram matrices before and after the
+        fit is projected out, (n, width, width), and products with `columns`, (n, width, k).
         """
-        if len(self.groups) != 1:
-            yield from ((group, _whitened_with_grams(self.templates[group], law)) for group in self.groups)
-            return
-        key = law.whitening_key
-        known = self._whitened.pop(key, None)
-        self._whitened[key] = known = known or _whitened_with_grams(self.templates, law)
-        if len(self._whitened) > _REMEMBERED:
-            self._whitened.pop(next(iter(self._whitened)))
-        yield self.groups[0], known
+        law, n, n_absorbed = problem.law, problem.n_points, problem.basis.shape[1]
+        beside = law.adjoint(np.concatenate([problem.basis[:n], columns[:n]], axis=1))
+        for members, grams in zip(self.groups, self._grams_under(law), strict=True):
+            norms = np.sqrt(np.maximum(np.einsum("tkk->tk", grams), 0.0))
+            scale = math.sqrt(law.n_kept / grams.shape[2]) / np.where(norms > 0, norms, 1.0)
+            scaled = grams * scale[:, :, None] * scale[:, None, :]
+            rows = self._rows(members)
+            products = (rows.reshape(-1, n) @ beside).reshape(*scale.shape, -1) * scale[:, :, None]
+            taken = products[:, :, :n_absorbed]
+            yield members, scaled, scaled - taken @ taken.transpose(0, 2, 1), products[:, :, n_absorbed:]
+
+    def _rows(self, members: IntArray) -> FloatArray:
+        """Return templates of one width, (n, width, n_points)."""
+        every = np.concatenate([self.templates[k].T for k in members])
+        return every.reshape(len(members), -1, every.shape[1])
+
+    def _grams_under(self, law: NoiseLaw) -> list[FloatArray]:
+        """Return the Gram matrices of the whitened templates of each group, (n, width, width); cached.
+
+        Without a random walk they are sums over readings of a few precisions, which are the same for many noise models.
+        """
+        if (key := law.whitening_key) not in self._grams:
+            parts = (
+                [] if law.walk.size else [(part, *np.unique(each, return_inverse=True)) for part, each in law.precision]
+            )
+            self._grams[key] = out = list[FloatArray]()
+            for number, members in enumerate(self.groups):
+                rows = self._rows(members)
+                rows[:, :, law.lost] = 0.0  # before sums of which some are taken off
+                if law.walk.size:
+                    rows = law(rows.reshape(-1, rows.shape[2]).T).T.reshape(rows.shape)
+                each = [self._weighted_grams(number, rows, *part) for part in parts] or [_gram_matrices(rows, rows)]
+                out.append(np.sum(each, axis=0))
+        return self._grams[key]
+
+    def _weighted_grams(
+        self, number: int, rows: FloatArray, before: IntArray | None, weights: FloatArray, kinds: IntArray
+    ) -> FloatArray:
+        """Return Gram matrices in which each reading has a weight, one of `weights` by its kind, (n, width, width).
+
+        With `before` they are of each reading with another one. `number`: that of the group of templates, whose sums
+        over readings of few kinds are cached.
+        """
+        key = number, before is None, kinds.tobytes()
+        if len(weights) > _FEW_KINDS or key not in self._sums:
+            others = rows if before is None else np.take(rows, before, axis=2)
+        if len(weights) > _FEW_KINDS:
+            grams = _gram_matrices(rows * weights[kinds], others)
+        else:
+            if key not in self._sums:
+                # Nearly all readings are of one kind, whose sums are those of all without the rest.
+                few = [np.flatnonzero(kinds == kind) for kind in range(len(weights))]
+                most = int(np.argmax([len(at) for at in few]))
+                few[most] = few[most][:0]
+                sums = np.array([_gram_matrices(rows[:, :, at], others[:, :, at]) for at in few])
+                sums[most] = _gram_matrices(rows, others) - sums.sum(axis=0)
+                self._sums[key] = sums
+            grams = np.einsum("k,ktij->tij", weights, self._sums[key])
+        return grams if before is None else grams + grams.transpose(0, 2, 1)
 
 
-def _whitened_with_grams(templates: Sequence[FloatArray], law: NoiseLaw) -> _Whitened:
-    widths = np.array([template.shape[1] for template in templates], dtype=np.int64)
-    firsts = np.cumsum(widths) - widths
-    whitened = whiten_to_unit_rms(templates, law)
-    ends = np.append(np.flatnonzero(np.diff(widths)) + 1, len(widths))
-    products: dict[int, list[FloatArray]] = {}
-    for first, end in itertools.pairwise([0, *ends.tolist()]):  # successive templates of one width
-        width, begin = int(widths[first]), int(firsts[first])
-        columns = whitened[:, begin : begin + (end - first) * width].reshape(len(whitened), -1, width)
-        products.setdefault(width, []).append(_gram_matrices(columns))
-    return whitened, {width: np.concatenate(grams) for width, grams in products.items()}
-
-
-def _gram_matrices(columns: FloatArray) -> FloatArray:
-    """Return the products of the columns of each template, (n_points, n, width) -> (n, width, width)."""
-    if columns.shape[2] > 2:
-        blocks = columns.transpose(1, 0, 2)
-        return np.asarray(blocks.transpose(0, 2, 1) @ blocks)
-    each = [columns[:, :, k] for k in range(columns.shape[2])]  # without a copy of all columns
-    return np.array([[np.einsum("nt,nt->t", a, b) for a in each] for b in each]).transpose(2, 0, 1)
+def _gram_matrices(rows: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the products of the columns of each template, (n, width, n_points) both -> (n, width, width)."""
+    if rows.shape[1] > 2:
+        return np.asarray(rows @ others.transpose(0, 2, 1))
+    pairs = [[(rows[:, i], others[:, j]) for j in range(rows.shape[1])] for i in range(rows.shape[1])]
+    return np.array([[np.einsum("tn,tn->t", *both) for both in row] for row in pairs]).transpose(2, 0, 1)
 
 
 def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -226,6 +270,11 @@ class EffectTemplates:
         return variant
 
     @cached_property
+    def n_numbers(self) -> int:
+        """Numbers in all columns."""
+        return sum(columns.size for columns in self.columns)
+
+    @cached_property
     def variant_odds(self) -> FloatArray:
         """Prior odds of each variant against the first, (n_variants,)."""
         return np.array([variant.relative_odds for variant in self.variants])
@@ -238,36 +287,53 @@ class EffectTemplates:
 
 @dataclass(eq=False)
 class TemplateCache:
-    """Cache of the templates of effects about fits, on the rows `usable`."""
+    """Cache of the templates of effects about fits, on the rows `usable`; of long tables about the latest alone."""
 
     usable: IntArray
-    known: dict[tuple[Fit, Effect], EffectTemplates] = field(default_factory=dict)
+    known: dict[Fit, dict[Effect, EffectTemplates]] = field(default_factory=dict)
     banks: dict[tuple[Fit, tuple[str, ...]], TemplateBank] = field(default_factory=dict)
 
     def coarse_bank(self, found: Fit, effects: Sequence[Effect]) -> TemplateBank:
         """Return one bank of the templates of several effects about a fit, of fewer variants, labelled by name."""
-        key = found, tuple(effect.name for effect in effects)
+        key, known = (found, tuple(effect.name for effect in effects)), self._keep(found)
         if key not in self.banks:
-            own = [
-                (effect.name, t)
-                for effect in effects
-                for t in self.templates_of(found, effect.with_fewer_variants()).columns
-            ]
-            self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own])
+            few = [effect.with_fewer_variants() for effect in effects]
+            for effect in few:
+                known[effect] = self.templates_of(found, effect)
+            self.banks[key] = TemplateBank.by_name({effect.name: known[effect].columns for effect in few})
         return self.banks[key]
 
-    def templates_of(self, found: Fit, effect: Effect) -> EffectTemplates:
-        """Return the templates of one effect about one fit."""
-        key = found, effect
-        if key not in self.known:
-            own = self._shared_with_first_copy(found, effect)
-            self.known[key] = own or templates_of_effect(found, effect, self.usable)
-        return self.known[key]
+    def passing_banks(self, found: Fit, effects: Sequence[Effect]) -> Iterator[TemplateBank]:
+        """Yield the same in banks of a few effects each, which are not kept."""
+        each, n_numbers = dict[str, tuple[FloatArray, ...]](), 0
+        for effect in effects:
+            own = templates_of_effect(found, effect.with_fewer_variants(), self.usable)
+            each[effect.name] = own.columns
+            n_numbers += own.n_numbers
+            if n_numbers > _MOST_PASSING or effect is effects[-1]:
+                yield TemplateBank.by_name(each)
+                each, n_numbers = {}, 0
 
-    def _shared_with_first_copy(self, found: Fit, effect: Effect) -> EffectTemplates | None:
+    def templates_of(self, found: Fit, effect: Effect) -> EffectTemplates:
+        """Return the templates of one effect about one fit; those of more variants than a bank has are not kept."""
+        known = self._keep(found)
+        own = known.get(effect) or self._shared_with_first_copy(known, effect)
+        return own or templates_of_effect(found, effect, self.usable)
+
+    def _keep(self, found: Fit) -> dict[Effect, EffectTemplates]:
+        """Return the templates about a fit, now the latest; forget those about the earliest if there are too many."""
+        self.known[found] = self.known.pop(found, {})
+        while len(self.known) > 1 and sum(map(_count_numbers, self.known.values())) > _MOST_REMEMBERED:
+            self.known.pop(forgotten := next(iter(self.known)))
+            self.banks = {key: bank for key, bank in self.banks.items() if key[0] is not forgotten}
+        return self.known[found]
+
+    def _shared_with_first_copy(
+        self, known: Mapping[Effect, EffectTemplates], effect: Effect
+    ) -> EffectTemplates | None:
         """Return the templates of a second copy of an effect where those of the first are known and hold them all."""
         name = name_of_first_copy(effect.name)
-        first = next((own for (fit, e), own in self.known.items() if fit is found and e.name == name), None)
+        first = next((own for e, own in known.items() if e.name == name), None)
         if first is None or len(first.variants) > 1 or len(effect.variants()) > 1:
             return None
         numbers = {setting.tobytes(): k for k, setting in enumerate(first.settings)}
@@ -276,6 +342,10 @@ class TemplateCache:
             return None
         columns, settings = (tuple(every[k] for k in cast(list[int], at)) for every in (first.columns, first.settings))
         return EffectTemplates(columns, settings, effect.variants(), np.zeros(len(at), dtype=np.int64))
+
+
+def _count_numbers(known: Mapping[Effect, EffectTemplates]) -> int:
+    return sum(each.n_numbers for each in known.values())
 
 
 def templates_of_effect(found: Fit, effect: Effect, usable: IntArray, *, most: int | None = None) -> EffectTemplates:
@@ -315,10 +385,12 @@ def _predicted_changes(found: Fit, effect: Effect, bank: FloatArray, usable: Int
     n_rows = bank.shape[0] * bank.shape[1]
     own = {e.name: effect_values(e, found.z[None, plain.coordinate_slice(e.name)]) for e in plain.effects}
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
-    inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else np.arange(len(plan))
-    there = plan.take(inside) if effect.scans else plan
-    kept = np.isin(usable, inside, assume_unique=True)
-    at = np.searchsorted(inside, usable[kept])
+    there, at = model.part_that_predicts(usable)
+    kept: BoolArray | slice = slice(None)
+    if effect.scans:
+        inside = np.flatnonzero(scan_indicator(plan, effect.scans))
+        there, kept = plan.take(inside), np.isin(usable, inside, assume_unique=True)
+        at = np.searchsorted(inside, usable[kept])
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
     change = np.zeros((n_rows, len(usable)))
@@ -333,13 +405,11 @@ def _predicted_changes(found: Fit, effect: Effect, bank: FloatArray, usable: Int
             read = model.chain.predict(theta, there)
         else:
             read = model.chain.readings_from_simulated_view(seen, theta, there)
-        change[rows, kept] = read[:, at] - found.predicted[kept]
-    columns = change.T
-    largest = np.abs(found.predicted).max(initial=0.0)
-    columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + largest))] = 0.0  # NaN too
+        change[rows, kept] = (read if len(at) == len(there) else read[:, at]) - found.predicted[kept]
+    size, largest = np.maximum(change.max(axis=1), -change.min(axis=1)), np.abs(found.predicted).max(initial=0.0)
     none = min(_ROUNDING * largest, max(_INSIGNIFICANT * found.sd, _LAST_DIGITS * largest))
-    columns[:, np.abs(columns).max(axis=0) < none] = 0.0
-    return np.split(columns, len(bank), axis=1)
+    change[~((size >= none) & (size < _RUNS_AWAY * (1 + largest)))] = 0.0  # NaN too
+    return np.split(change.T, len(bank), axis=1)
 
 
 _BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
@@ -349,12 +419,6 @@ def log_mean_exp(scores: FloatArray) -> float:
     """Return the log of the mean of Bayes factors that are given as logs."""
     top = float(scores.max())  # thousands of short lists: scipy's general function is ten times slower
     return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
-
-
-def log_bayes_factors_by_label(problem: Linearised, bank: TemplateBank) -> dict[str, FloatArray]:
-    """Return, by label of a bank (an effect's name), the log Bayes factors of its templates, (n_entries,)."""
-    scores = bank.log_bayes_factors(problem)[:, 0]
-    return {name: scores[members] for name, members in bank.indices_by_label.items()}
 
 
 def log_bayes_factors_of_pairs(

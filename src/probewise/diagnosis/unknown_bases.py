@@ -32,6 +32,7 @@ SCAN_ENDS = "ends of scans"
 """The family of transients at the ends of scans or runs."""
 
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
+_ROUNDING = 1e-13  # of a template's squares: a direction of which the fit leaves no more is absorbed
 _MOST_GROUPS = 24
 _N_STEPS = 15  # change points of a covariate
 _FEW_SCANS = 6
@@ -103,10 +104,14 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
     own = OrthonormalBlocks.of(problem, bases.templates)
     single = np.flatnonzero(bases.widths == 1)
     held, twins = np.zeros(len(single), dtype=np.bool_), np.zeros(len(bases.widths), dtype=np.bool_)
-    for group in named.groups:
-        blocks = OrthonormalBlocks.of(problem, named.templates[group])
-        held |= _are_held(own.u[:, own.starts[single]], blocks)
-        twins |= _have_span_of_some(own, blocks)
+    there = np.split(np.any(own.u, axis=0), own.starts[1:])
+    spans = [at + np.flatnonzero(part) for at, part in zip(own.starts, there, strict=True)]
+    for cosines in _cosines(named, problem, own.u):
+        held |= _are_held(cosines[:, :, own.starts[single]])
+        n_directions = np.count_nonzero(np.any(cosines, axis=2), axis=1)
+        for k, span in enumerate(spans):
+            alike = cosines[n_directions == len(span)][:, :, span] if len(span) > 1 else cosines[:0]
+            twins[k] |= bool(np.any(np.linalg.svd(alike, compute_uv=False)[:, len(span) - 1 :] >= _LIKE))
     templates = [0.0 * template if twin else template for template, twin in zip(bases.templates, twins, strict=True)]
     kept = np.delete(np.arange(len(bases.widths)), single[held])
     return replace(bases, templates=tuple(templates)).take_entries(kept)
@@ -118,34 +123,23 @@ def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: 
     if products.size == 0 or not formulas.templates:
         return bases
     own = OrthonormalBlocks.of(problem, [bases[k] for k in products]).u
-    blocks = (OrthonormalBlocks.of(problem, formulas.templates[group]) for group in formulas.groups)
-    held = np.any([_are_held(own, each) for each in blocks], axis=0)
+    held = np.any([_are_held(cosines) for cosines in _cosines(formulas, problem, own)], axis=0)
     return bases.take_entries(np.delete(np.arange(len(bases.labels)), products[held]))
 
 
-def _are_held(columns: FloatArray, blocks: OrthonormalBlocks) -> BoolArray:
-    cosines = np.sqrt(np.add.reduceat((blocks.u.T @ columns) ** 2, blocks.starts, axis=0))
-    return np.asarray(cosines.max(axis=0) >= _LIKE)
+def _cosines(bank: TemplateBank, problem: Linearised, columns: FloatArray) -> Iterator[FloatArray]:
+    """Yield cosines of orthonormal columns, (n_rows, k), with directions of each template of a group, (n, width, k).
 
-
-def _have_span_of_some(blocks: OrthonormalBlocks, others: OrthonormalBlocks) -> BoolArray:
-    """Return which blocks of two or more directions have nearly the span of one of the others, (n_blocks,).
-
-    Spans have as many directions, and the largest angle between them has a cosine of 0.9 or more.
+    The fit is projected out of both; cosines of a direction that it absorbs are 0.
     """
-    spans, other_spans = (
-        [u[:, np.any(u, axis=0)] for u in np.split(each.u, each.starts[1:], axis=1)] for each in (blocks, others)
-    )
-    return np.array(
-        [
-            any(
-                np.linalg.svd(other.T @ span, compute_uv=False)[-1] >= _LIKE
-                for other in other_spans
-                if other.shape[1] == span.shape[1] > 1
-            )
-            for span in spans
-        ]
-    )
+    for _, _, left, along in bank.projected(problem, columns):
+        squares, axes = np.linalg.eigh(left)
+        lengths = np.sqrt(np.where(squares > _ROUNDING * problem.n_kept, squares, np.inf))
+        yield axes.transpose(0, 2, 1) @ along / lengths[:, :, None]
+
+
+def _are_held(cosines: FloatArray) -> BoolArray:
+    return np.asarray(np.sqrt(np.sum(cosines**2, axis=1)).max(axis=0) >= _LIKE)
 
 
 def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import LARGEST_IN_FIT, RunTable, relative_sds_of_column
 
 _N_STARTS = 8
+_FEW = 0.5  # share of a table's rows up to which these alone are predicted: below it, that saves time
+_N_SETTINGS = 6  # of an effect, from the first of its bank on, that are tried
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
 _MOST_STEPS_GIVEN = 100_000  # over the longest run by a person's max_step_s: the trial integrations alone take a minute
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
@@ -63,6 +65,8 @@ class System:
     slack
         Distance within the range, in the unit of the readings, from which noise may carry a reading to an end. For a
         reading at an end, a prediction within this distance counts as beyond the end.
+    parts
+        Parts of tables, by table and rows, and what predicts these rows alone (`part_that_predicts`).
     """
 
     simulator: Simulator
@@ -74,6 +78,7 @@ class System:
     integrations: Integrations = field(default_factory=Integrations)
     limited: bool = True
     slack: float = 0.0
+    parts: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     # It has no SSF, and effects are screened about its fit.
     n_gaussians: ClassVar[int] = 0
@@ -232,6 +237,42 @@ class System:
     def admits(self, effect: Effect) -> bool:
         """Return whether an effect acts at a stage of this system: False for one on rates without a law."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
+
+    def part_that_predicts(
+        self, rows: IntArray, table: RunTable, effects: Sequence[Effect]
+    ) -> tuple[RunTable, IntArray]:
+        """Return a part of a table that suffices to predict some of its rows, and their numbers there.
+
+        Few of many rows suffice if neither the simulator nor an effect looks at others: at trial points of the prior,
+        and of each effect, these rows alone are then predicted as they are beside the others.
+        """
+        if self.caller is None or not self.caller.broadcasts or len(rows) > _FEW * len(table):
+            return table, rows
+        key = table, rows.tobytes(), self.slack
+        if key not in self.parts:
+            self.parts[key] = table.take(rows), {}
+        part, alone = self.parts[key]
+        for effect in (None, *effects):
+            act = effect and effect.apply
+            if act not in alone:
+                alone[act] = self._predicts_alone(effect, rows, table, part)
+            if not alone[act]:
+                return table, rows
+        return part, np.arange(len(rows))
+
+    def _predicts_alone(self, effect: Effect | None, rows: IntArray, table: RunTable, part: RunTable) -> bool:
+        """Return whether the simulator, or it with an effect, predicts some rows as `part` of a table as in it."""
+        trial, theta = replace(self, caller=replace(cast(Caller, self.caller))), self.theta(self.starts)
+        if effect is not None:
+            settings = effect.bank().reshape(-1, effect.bank().shape[-1])
+            settings = settings[:: max(len(settings) // _N_SETTINGS, 1)]
+            theta = np.concatenate([np.resize(theta, (len(settings), theta.shape[1])), settings], axis=1)
+        chain = trial.chain(table, () if effect is None else (effect,))
+        try:
+            whole, own = chain.predict(theta, table)[:, rows], chain.predict(theta, part)
+        except Exception:  # a function that needs the whole table
+            return False
+        return bool(np.isfinite(whole).any()) and np.array_equal(whole, own, equal_nan=True)
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map standard-normal coordinates, (n_samples, n_params), to parameters of that shape."""

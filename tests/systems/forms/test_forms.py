@@ -464,3 +464,20 @@ def test_a_second_wave_of_a_column_is_the_shorter_of_two():
     first, second = FORMS["periodic_error:drive"], FORMS["periodic_error:drive~again"]
     assert second.marginals["period"].high == pytest.approx(first.marginals["period"].high / 2)
     assert np.isfinite(second.prior.log_prob(second.bank()[:, 0])).all()
+
+
+def test_rows_are_predicted_alone_only_where_neither_the_simulator_nor_an_effect_looks_at_others():
+    """Route two: the whole table. What comes late or adds up needs the other rows."""
+    system, rows = System.of(_simulator(), TABLE), np.array([5, 6, 20, 37, 38, 59])
+    forms = bind_forms(ReferenceFit(system, TABLE, np.zeros(2), SD))
+    alone = set()
+    for name, form in forms.items():
+        part, at = system.part_that_predicts(rows, TABLE, (form,))
+        settings = form.bank().reshape(-1, form.bank().shape[-1])
+        theta, chain = np.insert(settings, 0, [[1.0], [2.0]], axis=1), system.chain(TABLE, (form,))
+        np.testing.assert_allclose(chain.predict(theta, part)[:, at], chain.predict(theta, TABLE)[:, rows], rtol=1e-12)
+        alone |= {name} if len(part) == len(rows) else set()
+    assert {"offset_drift", "interference", "sensitivity:room_c", "gain_per_run"} <= alone
+    assert not {"lag", "delay", "hysteresis", "backlash:drive", "input_delay:drive"} & alone
+    adding_up = System.of(_simulator(simulate=lambda p, u: p["offset"] + p["gain"] * np.cumsum(u["drive"])), TABLE)
+    assert adding_up.part_that_predicts(rows, TABLE, ())[0] is TABLE

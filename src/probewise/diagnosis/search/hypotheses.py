@@ -34,7 +34,6 @@ from probewise.diagnosis.templates import (
     EffectTemplates,
     TemplateBank,
     TemplateCache,
-    log_bayes_factors_by_label,
     log_mean_exp,
 )
 from probewise.effects import NUISANCES, PROPOSAL, Effect, NoiseEffect, is_out_of_vocabulary, name_of_first_copy
@@ -375,21 +374,14 @@ class Refits:
 
     `sensor` is the given null, if any; `templates` caches the templates of effects about fits; `known` are candidates
     with their refits with one more effect, by the candidate's form and names, the effect, and the nats against it;
-    `scored` log Bayes factors of the templates of a bank, by label.
+    `plain` are refits of the null under the simplest noise.
     """
 
     sensor: Null | None
     noises: NoiseModels
     templates: TemplateCache
     known: dict[tuple[int, Names, Effect, float], tuple[WeighedFit, Extended]] = field(default_factory=dict, repr=False)
-    scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
-
-    def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: TemplateBank) -> dict[str, FloatArray]:
-        """Return the log Bayes factors of a bank's templates about a fit under noise `law`, by label; cached."""
-        key = found, law, bank
-        if key not in self.scored:
-            self.scored[key] = log_bayes_factors_by_label(Linearised.of(found, law), bank)
-        return self.scored[key]
+    plain: list[WeighedFit] = field(default_factory=list, repr=False)
 
     def likeliest_law(self, candidate: WeighedFit) -> NoiseLaw:
         """Return the noise distribution of a candidate's most probable noise model."""
@@ -446,11 +438,18 @@ class Refits:
         return found
 
     def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit:
-        """Refit the given null under the simplest noise: with no noise effects but those beyond doubt."""
-        law = null.evidence[self.noises.certain].likeliest_law
+        """Refit the given null under the simplest noise: with no noise effects but those beyond doubt.
+
+        The refit of an earlier null is returned if it is better under that noise than this one.
+        """
+        certain = self.noises.certain
+        if self.plain and self.plain[-1].evidence[certain].log_z > null.evidence[certain].log_z:
+            return self.plain[-1]
+        law = null.evidence[certain].likeliest_law
         starts = np.stack([null.found.z, *cast(Null, self.sensor).starts])
         found = self._fit_from_best_start(null.found.model, starts, law, 30)
-        return WeighedFit(found, law, self.noises.evidence_by_noise(found), 0.0, 0.0, {})
+        self.plain.append(WeighedFit(found, law, self.noises.evidence_by_noise(found), 0.0, 0.0, {}))
+        return self.plain[-1]
 
     def refit_with_effect(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended:
         """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
@@ -477,7 +476,7 @@ class Refits:
         @cache
         def screened(law: NoiseLaw) -> tuple[Linearised, FloatArray]:
             problem = Linearised.of(parent.found, law)
-            return problem, log_bayes_factors_by_label(problem, bank)[effect.name]
+            return problem, bank.log_bayes_factors(problem)[:, 0]
 
         by_noise = {noise: log_mean_exp(screened(e.likeliest_law)[1]) for noise, e in parent.leading_noises()}
         own_law = self.likeliest_law(parent)

@@ -52,7 +52,6 @@ from probewise.diagnosis.sensors import (
 from probewise.diagnosis.templates import (
     TemplateBank,
     TemplateCache,
-    log_bayes_factors_by_label,
     log_bayes_factors_of_pairs,
     log_mean_exp,
 )
@@ -180,7 +179,7 @@ class SearchState:
         """
         out: dict[str, FloatArray] = {}
         for bank in self.template_banks(about):
-            out |= self.refits.log_bayes_factors_by_label(parent.found, law, bank)
+            out |= bank.log_bayes_factors_by_label(parent.found, law)
         return out
 
     def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
@@ -370,7 +369,7 @@ def noise_sd_about_given_null(prepared: Prepared) -> float:
         fits = fit_each_start(model, recording, list(null.starts), white_noise_of_recording(recording))
         z = min(fits, key=lambda found: found.objective).z
     with np.errstate(all="ignore"):  # of a start from which the model runs away
-        residuals = np.abs(readings - model.predict(z[None, :])[0, rows])
+        residuals = np.abs(readings - model.predict_rows(rows, z[None, :])[0])
     relative_sd = recording.relative_sd[rows]
     median = float(np.median(residuals[relative_sd <= np.quantile(relative_sd, _MOST_EXACT)])) / MAD_OF_NORMAL
     free = max(len(rows) - model.n_params, 1)
@@ -703,7 +702,7 @@ class UnknownEffects:
         for candidate in candidates:
             for noise, evidence in candidate.leading_noises():
                 law = evidence.likeliest_law
-                scores = self.state.refits.log_bayes_factors_by_label(candidate.found, law, self.bases)
+                scores = self.bases.log_bayes_factors_by_label(candidate.found, law)
                 by_family = {family: log_mean_exp(own) for family, own in scores.items()}
                 if law.share > 0:
                     far_out = outlier_probabilities(candidate.found.residuals, law)
@@ -961,12 +960,10 @@ def _promise_by_formula(searched: Searched, proposals: Mapping[str, Effect]) -> 
     leader = max(fits, key=searched.log_posterior)
     parents = [(null, _WITHIN_ALONE), *([(single, _WITHIN_BESIDE)] if single is not None else [])]
     parents += [(leader, _WITHIN_BESIDE)] if len(leader.names) > 1 else []
-    bank = TemplateCache(searched.prepared.usable_rows).coarse_bank(null.found, list(proposals.values()))
     out: dict[str, float] = {}
-    for parent, within in parents:
-        for _, evidence in parent.leading_noises():
-            scores = log_bayes_factors_by_label(Linearised.of(parent.found, evidence.likeliest_law), bank)
-            for name, own in scores.items():
-                value = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + log_mean_exp(own) + within
-                out[name] = max(value, out.get(name, value))
+    for bank in TemplateCache(searched.prepared.usable_rows).passing_banks(null.found, list(proposals.values())):
+        for parent, within, evidence in ((*each, noise) for each in parents for _, noise in each[0].leading_noises()):
+            least = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + within
+            for name, own in bank.log_bayes_factors_by_label(parent.found, evidence.likeliest_law).items():
+                out[name] = max(least + log_mean_exp(own), out.get(name, -math.inf))
     return out

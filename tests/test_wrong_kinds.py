@@ -65,6 +65,12 @@ def arrays(**changed):
     return Plan.from_arrays(**{"x_mm": np.arange(30.0), "y_mm": 0, "patterns": EDGE, "unit": "V", **changed})
 
 
+def inquiry(**changed):
+    """A line through the origin, measured with noise, of which nothing is wrong but what is changed."""
+    known = {"model": lambda p, x: p["a"] * x, "prior": {"a": (0, 1)}, "settings": np.arange(3.0), "noise": 0.1}
+    return probewise.Inquiry(**{**known, **changed}, rng=RNG)
+
+
 def record(number, plan, asked):
     """Records what is known already."""
     return RECORDING
@@ -126,6 +132,13 @@ A_RECORDING = "allowed: a Recording: read_recording"
 A_SENSOR = "allowed: a FittedSensor: read_sensor"
 
 MISTAKES = {
+    "names in an array without an axis": (lambda: arrays(scan=np.array("a")), "scan is .*one per reading"),
+    "a ragged column": (
+        lambda: fitted(OVEN, {**TABLE, "temp_c": [[1], [1, 2]]}),
+        "column 'temp_c' is .*numbers, in an",
+    ),
+    "no parameter": (lambda: inquiry(prior={}), r"prior is \{\}; allowed: one parameter or more"),
+    "a noise beyond squares": (lambda: inquiry(noise=1e308), "noise sd is 1e\\+308; allowed: a number"),
     # randomness
     "a seed to calibrate": (lambda: calibrate(RECORDING, rng=0), r"rng is 0; .*default_rng\(0\)"),
     # calibrate

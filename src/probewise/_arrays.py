@@ -71,10 +71,10 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
 
 
 def array_or_none(values: ArrayLike) -> NDArray[Any] | None:
-    """Return values as an array; None for a ragged list, which `floats` refuses by its name."""
+    """Return values as an array; None for a ragged list and the like, which `floats` refuses by its name."""
     try:
         return np.asarray(values)
-    except ValueError:
+    except Exception:  # objects may raise anything
         return None
 
 

@@ -77,8 +77,9 @@ class Reported(ShowsItself):
     def save(self, folder: str | Path, *, seed: int | None = None) -> Path:
         """Write the files that the command writes with `--out`, figures and report.html too; return the folder.
 
-        The folder is made if missing; files of the same names are replaced, all or none. With the `seed` of the
-        result's random generator the files are those of the command; without it the report states none.
+        The folder is made if missing; earlier results there are replaced, all or none, and other files of their names
+        get new ones (report_kept.html). With the `seed` of the result's random generator the files are those of the
+        command; without it the report states none.
 
         Raises
         ------

@@ -26,11 +26,13 @@ from probewise.errors import FileError, ParameterError, ProbewiseError, message_
 from probewise.progress import Progress, silent
 
 PAGE = "report.html"
-_STAGED, _COMPLETE = ".writing", ".complete"
+_STAGED, _COMPLETE = ".probewise-writing", ".probewise-complete"  # no person's folder has such a name
 _OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
 _MOST_FAILED = 3  # drawings that a message names
 _MAIN_FILES = {
-    "diagnosis.json": "a diagnosis", "fit.json": "a fit", "audit.json": "an audit", "result.json": "a search"
+    "diagnosis.json": "a diagnosis", "fit.json": "a fit", "audit.json": "an audit", "result.json": "a search",
+    "answers.json": "a demo", "trials.jsonl": "a study", "concealed.jsonl": "a study", "cases.jsonl": "a challenge",
+    "counts.svg": "diagnoses of several recordings",
 }  # fmt: skip
 _WRITABLE = "a file in an existing, writable folder, on a disk with room"
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
@@ -56,7 +58,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes, *, name
             _write_all(stack.enter_context(open(path, "wb", buffering=0)), content)
             return
         target = Path(os.path.realpath(path)) if named else path
-        for left in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
+        for left in target.parent.glob(f".{glob.escape(target.name)}.{'[0-9a-f]' * 8}.part"):
             with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
                 if left.is_file():  # a pipe would be waited for
                     _lock(opened.enter_context(open(left, "rb")).fileno())
@@ -145,8 +147,8 @@ def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Itera
         lock.release()
 
 
-def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
-    """Check before any work that results can be written there, and return the path.
+def checked_output_directory(path: Path, *entries: str, main: str = "", option: str = "--out") -> Path:
+    """Check before any work that results can be written there, and return the path, which an `option` has given.
 
     `entries` are files and folders of it that the run writes as it goes, `main` the file by which its results are
     known. ParameterError if a file is in the way, or results of another verb; FileError if no directory can be made
@@ -155,13 +157,13 @@ def checked_output_directory(path: Path, *entries: str, main: str = "") -> Path:
     for name, results in _MAIN_FILES.items():
         if main not in ("", name) and os.path.exists(path / name):
             allowed = f"another folder: this one holds {results} ({name}), with which these results would mix"
-            raise ParameterError("--out", str(path), allowed)
+            raise ParameterError(option, str(path), allowed)
     _require_short_name(path)
     nearest = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
         what = "is no directory" if nearest.is_symlink() else "is a file"
         here = "this" if nearest == path else nearest
-        raise ParameterError("--out", str(path), f"a directory, existing or new; {here} {what}")
+        raise ParameterError(option, str(path), f"a directory, existing or new; {here} {what}")
     _require_ordinary(p for entry in entries for p in (path / entry, *path.glob(f"{entry}/*")))
     import tempfile  # here, as help needs none
 
@@ -193,7 +195,7 @@ def checked_output_file(path: Path, *inputs: Path | None, option: str = "--out")
         if taken is not None and path.exists() and taken.exists() and path.samefile(taken):
             raise ParameterError(option, str(path), f"another file than the input {taken}")
     if not is_device_or_pipe(path):
-        checked_output_directory(Path(os.path.realpath(path)).parent)
+        checked_output_directory(Path(os.path.realpath(path)).parent, option=option)
     return path
 
 
@@ -224,13 +226,21 @@ class StagedFiles:
 
 
 @contextlib.contextmanager
-def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[StagedFiles]:
+def staged_output(
+    out: Path,
+    *,
+    inputs: Sequence[Path] = (),
+    drawn: Sequence[str] = (),
+    outdated: Sequence[str] = (),
+    main: str | None = None,
+) -> Iterator[StagedFiles]:
     """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
 
-    One of the `inputs` of this run that a result would replace is copied to another name. Files of an earlier run, of
-    the patterns `outdated`, are removed unless this run writes them. FileError if `out` cannot be made or written to,
-    another process writes there for too long, a directory has the name of a result, or a symbolic link that of a
-    directory.
+    If the file `main` is in `out`, or for None, other files there are of an earlier run: they are replaced, and removed
+    if they are to be `drawn` later or have one of the patterns `outdated`. Without it they are a person's: one that
+    results or drawings would replace gets another name, as does one of the `inputs` of this run. FileError if `out`
+    cannot be made or written to, another process writes there for too long, a directory has the name of a result, or a
+    symbolic link that of a directory.
     """
     folder = out / _STAGED
     with _errors_of(out, "made", "a directory you may write to"):
@@ -244,7 +254,7 @@ def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[
             yield stage
             raise_if_stopped()
             with defer_signals():
-                _complete(out, stage, {os.path.realpath(path) for path in inputs}, outdated)
+                _complete(out, stage, {os.path.realpath(path) for path in inputs}, drawn, outdated, main)
                 os.rename(folder, out / _COMPLETE)
                 _move_into_place(out)
         except FileError as error:
@@ -256,14 +266,23 @@ def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _complete(out: Path, stage: StagedFiles, inputs: set[str], outdated: Sequence[str]) -> None:
-    """Add to the results copies of the inputs (real paths) that they replace, `kept`, and marks of outdated files."""
+def _complete(
+    out: Path, stage: StagedFiles, inputs: set[str], drawn: Sequence[str], outdated: Sequence[str], main: str | None
+) -> None:
+    """Add to the results copies of the files that they would destroy, `kept`, and marks of outdated files."""
     names = _files_in(stage.folder)
     for name in names:
         _require_ordinary((out / name).parents[: name.count("/")])
         if (out / name).is_dir():
-            raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
+            raise FileError(out / name, "a directory of that name is in the way", "another folder, or none there")
     replaced = [out / name for name in names if os.path.realpath(out / name) in inputs]
+    outdated = [*outdated, *map(glob.escape, drawn)]
+    if main is not None and not (main and (out / main).exists()):
+        folder = os.path.realpath(out)  # behind a link lies nothing that a result could destroy
+        standing = (name for name in (*names, *drawn) if os.path.realpath(out / name) == os.path.join(folder, name))
+        persons = [name for name in standing if (out / name).is_file() and os.path.join(folder, name) not in inputs]
+        replaced += [out / name for name in persons]
+        outdated = [glob.escape(name) for name in persons]
     stage.replaces = any(os.path.lexists(out / name) for name in names if out / name not in replaced)
     for ending in itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2))):
         stage.kept = {path: path.with_stem(path.stem + ending) for path in replaced}
@@ -288,7 +307,7 @@ def _move_into_place(out: Path) -> None:
     A stranger's folder may hold such results too: they can replace files of that folder only.
     """
     complete = out / _COMPLETE
-    cure = f"the next command with --out {out} puts the rest in place, or remove {complete} to drop it"
+    cure = f"the next results written to {out} put the rest in place first, or remove {complete} to drop it"
     with _errors_of(complete, "moved", f"files in few folders; {cure}"):
         names = [] if complete.is_symlink() else _files_in(complete)
     for name in names:
@@ -314,7 +333,7 @@ def _require_ordinary(paths: Iterable[Path]) -> None:
         if path.is_symlink() or is_device_or_pipe(path):
             link = path.is_symlink()
             found = "is a symbolic link, which may lead out of the folder" if link else "is a device or a pipe"
-            raise FileError(path, found, "another --out, or an ordinary file or folder there")
+            raise FileError(path, found, "another folder, or an ordinary file or folder there")
 
 
 def _remove(path: Path) -> None:
@@ -329,7 +348,8 @@ def _remove(path: Path) -> None:
 class Output(NamedTuple):
     """What is written of a run: files by `files`, figures by name of file, and a page of the drawn figures.
 
-    `outdated` are patterns of files that an earlier run may have left, `main` the file by which its results are known.
+    `outdated` are patterns of files that an earlier run may have left, `main` the file by which its results are known;
+    "": there was none.
     """
 
     files: Callable[[StagedFiles], None]
@@ -394,7 +414,8 @@ class Drawings:
     def write_results(self, made: Output, *, inputs: Sequence[Path] = (), progress: Progress = silent) -> None:
         """Write the files of a run, all or none, then figures and page; remove outdated files of an earlier run."""
         progress("writing the results")
-        with staged_output(self.out, inputs=inputs, outdated=(*made.outdated, *made.drawers, PAGE)) as stage:
+        drawn, main = (*made.drawers, PAGE), made.main
+        with staged_output(self.out, inputs=inputs, drawn=drawn, outdated=made.outdated, main=main) as stage:
             made.files(stage)
         self.write_report(made.drawers, made.page, inputs=inputs, progress=progress)
         self.notes = [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]

@@ -242,9 +242,10 @@ class RoundsFolder:
     def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
         self.path = path
         file, self._settings = path / _SETTINGS, dict(settings)
-        if not resume and file.exists():
-            raise FileError(file, "an investigation is in this folder", "--resume to continue it, or another --out")
         if not resume:
+            if path.exists() and any(path.iterdir()):
+                found = "an investigation is" if file.exists() else "files of a person are"
+                raise FileError(path, f"{found} in this folder", "--resume to continue it, or another --out")
             return
         if not file.exists():
             raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")

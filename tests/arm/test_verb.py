@@ -1,10 +1,12 @@
 """The verb `arm` and `explore --arm`: tasks at the bench, on no bench."""
 
+import numpy as np
 import pytest
 
 from probewise.arm import shipped_geometry_path
 from probewise.arm.nxt import Brick, Link
 from probewise.cli import main
+from probewise.recordings import Image, Plan, write_plan
 
 TASKS = [["jog", "300,200"], ["home"], ["read"], ["scan", "300,200", "310,200"], ["record", "paper"]]
 
@@ -64,6 +66,7 @@ def test_check_of_a_simulated_arm_is_refused_before_anything_is_drawn(tmp_path, 
         ("--out", ["arm", "fit-geometry", "--marks", "marks.csv", "--geometry"]),
         ("--marks", ["arm", "fit-geometry", "--arm", "nxt:none", "--out", "new.toml", "--geometry"]),
         ("--log", ["emulate-nxt", "--geometry"]),
+        ("--out", ["sheets", "jig", "--geometry"]),
         ("--log", ["emulate-nxt", "--sensor"]),
     ],
 )
@@ -73,6 +76,18 @@ def test_a_file_that_is_read_is_not_written(option, words, tmp_path, monkeypatch
     path.write_text(shipped_geometry_path().read_text())
     assert f"{option} is" in said(capsys, *words, path, option, path, status=2).err
     assert path.read_text() == shipped_geometry_path().read_text()
+
+
+@pytest.mark.parametrize("name", ["p.csv", "p.json", "card.png"])
+@pytest.mark.parametrize("what", ["p.csv", "p.json"])
+def test_no_file_of_a_plan_is_written_as_its_sheets(what, name, tmp_path, capsys):
+    patterns = {"card": Image(np.eye(4), 3.0, (-5.0, -6.0), "card.png")}
+    write_plan(Plan.from_arrays(x_mm=[1.0, 2.0], y_mm=0.0, patterns=patterns, unit="V"), tmp_path / "p.csv")
+    before = (tmp_path / name).read_bytes()
+    assert (
+        "another file than the input" in said(capsys, "sheets", tmp_path / what, "--out", tmp_path / name, status=2).err
+    )
+    assert (tmp_path / name).read_bytes() == before
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task[0])
@@ -153,8 +168,13 @@ def test_a_brick_that_is_not_there_is_told_of_with_status_1(tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-def test_a_recording_is_not_overwritten(tmp_path, capsys):
-    (tmp_path / "r.csv").write_text("mine")
-    error = said(capsys, "arm", "record", "paper", "--out", tmp_path / "r.csv", "--arm", "nxt:/none", status=2).err
-    assert "--resume to continue it" in error
-    assert (tmp_path / "r.csv").read_text() == "mine"
+@pytest.mark.parametrize("name", ["r.csv", "r.json", "card.png"])
+def test_what_a_recording_would_replace_stays(name, tmp_path, capsys):
+    (tmp_path / "plans").mkdir()
+    patterns = {"card": Image(np.eye(4), 3.0, (-5.0, -6.0), "card.png")}
+    write_plan(Plan.from_arrays(x_mm=[1.0, 2.0], y_mm=0.0, patterns=patterns, unit="V"), tmp_path / "plans" / "p.csv")
+    (tmp_path / name).write_text("mine")
+    words = ("arm", "record", tmp_path / "plans" / "p.csv", "--out", tmp_path / "r.csv", "--arm", "nxt:/none")
+    error = said(capsys, *words, status=2).err
+    assert f"{tmp_path / name}: the file exists already; allowed: --resume to continue it" in error
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [name]

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from probewise._signals import Stopped
 from probewise._writing import Drawings, NotDrawnError
 from probewise.cli import main
+from probewise.errors import FileError
 from probewise.proof import concealed_study
 from probewise.report.html import figure
 from probewise.systems import run_table_csv
@@ -102,6 +103,17 @@ def test_one_figure_that_fails_leaves_the_others(tmp_path):
     }
     with pytest.raises(NotDrawnError, match=r"^could not draw second\.svg \(ZeroDivisionError: .*\); everything else"):
         drawings.raise_if_any_failed()
+
+
+def test_a_picture_of_a_step_for_which_there_is_no_room_ends_no_search(sensor_file, tmp_path, monkeypatch, capsys):
+    def full(path, content):
+        raise FileError(path, "cannot be written (No space left on device)", "a disk with room")
+
+    monkeypatch.setattr("probewise.cli.explore.write_bytes_atomically", full)
+    words = ("explore", "--sensor", sensor_file, "--max-readings", 1, "--trust", 1, "--quiet", "--out", tmp_path)
+    assert main([str(word) for word in words]) == 1
+    assert "could not draw frames/001.png (FileError: " in capsys.readouterr().err
+    assert {"result.json", "report.html", "journal.jsonl"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_a_page_that_cannot_be_written_is_one_that_is_not_drawn(tmp_path):

@@ -30,7 +30,7 @@ def contents(folder):
 
 def nested(out):
     """Folders in folders, 1,100 deep: too deep for a program that descends by calling itself."""
-    at = out / ".complete"
+    at = out / ".probewise-complete"
     at.mkdir()
     handle = os.open(at, os.O_RDONLY)
     for _ in range(1100):
@@ -52,8 +52,8 @@ def linked(name, target="../outside"):
 def complete(*names):
     def build(out):
         for name in names:
-            (out / ".complete" / name).parent.mkdir(parents=True, exist_ok=True)
-            (out / ".complete" / name).write_text("x")
+            (out / ".probewise-complete" / name).parent.mkdir(parents=True, exist_ok=True)
+            (out / ".probewise-complete" / name).write_text("x")
 
     return build
 
@@ -64,17 +64,17 @@ def through_link(out):
 
 
 FOLDERS = {
-    "staged in a link": linked(".writing"),
-    "complete in a link": linked(".complete"),
-    "a link among the complete": linked(".complete/d"),
-    "a link to a file among the complete": linked(".complete/report.html", "../outside/victim.txt"),
+    "staged in a link": linked(".probewise-writing"),
+    "complete in a link": linked(".probewise-complete"),
+    "a link among the complete": linked(".probewise-complete/d"),
+    "a link to a file among the complete": linked(".probewise-complete/report.html", "../outside/victim.txt"),
     "a folder that is a link": through_link,
     "only the ending": complete(".outdated"),
     "an outdated folder": lambda out: [complete("sub.outdated")(out), (out / "sub").mkdir()],
-    "complete in itself": complete(".complete/a", ".writing/b", ".results.lock"),
+    "complete in itself": complete(".probewise-complete/a", ".probewise-writing/b", ".results.lock"),
     "a result that is a link": linked("report.html", "../outside/victim.txt"),
     "a lock that is a link": linked(".results.lock", "../outside/victim.txt"),
-    "a pipe": lambda out: os.mkfifo(out / ".complete"),
+    "a pipe": lambda out: os.mkfifo(out / ".probewise-complete"),
     "a pipe as a result": lambda out: os.mkfifo(out / "report.html"),
     "a circle of links": lambda out: [linked("report.html", "report.html")(out), linked("a.svg", "a.svg")(out)],
 }
@@ -142,6 +142,19 @@ def test_a_link_or_a_pipe_where_a_run_would_write_is_refused_before_it_begins(
     assert f"{out / name}: " in said
     assert says in said
     assert (tmp_path / "victim").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [("explore --max-readings 1", "frames/holiday.png"), ("investigate --plan paper --rounds 1", "rounds/1.csv")],
+)
+def test_a_persons_folder_of_the_name_of_a_runs_is_left_alone(words, name, sensor_file, tmp_path, capsys):
+    mine = tmp_path / "out" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    assert main([*words.split(), "--sensor", str(sensor_file), "--out", str(tmp_path / "out")]) == 2
+    assert f"{mine.parent}: " in capsys.readouterr().err
+    assert contents(tmp_path / "out") == {mine.parent.name: None, name: "mine"}
 
 
 def predict(sensor_file, recording_file, out):

@@ -30,6 +30,21 @@ def test_what_an_earlier_run_left_behind_goes_and_what_is_not_ours_stays(tmp_pat
     assert contents(tmp_path) == {"witness_level.svg": "new", "notes.txt": "old", "007.png": "old"}
 
 
+@pytest.mark.parametrize("main_file", ["", "main.json"])
+def test_a_persons_files_get_other_names_or_stay_where_no_run_has_written(main_file, tmp_path):
+    """A folder without the main file of a verb's results holds none, whatever the names in it."""
+    names = ("a.svg", "b.csv", "witness_time.svg", "report.html", "next.csv", ".writing", ".complete", ".a.svg.part")
+    for name in names:
+        (tmp_path / name).write_text(f"mine {name}")
+    made = Output(lambda stage: stage.write("b.csv", "new"), {"a.svg": lambda: b"new"}, lambda drawn: "new")
+    drawings = Drawings(tmp_path)
+    drawings.write_results(made._replace(outdated=("witness_*", "next.csv"), main=main_file))
+    found = contents(tmp_path)
+    assert {found.pop(name) for name in ("a.svg", "b.csv", "report.html")} == {"new"}
+    assert sorted(found.values()) == sorted(f"mine {name}" for name in names)
+    assert [note.rpartition("/")[2] for note in drawings.notes] == ["b_kept.csv", "a_kept.svg", "report_kept.html"]
+
+
 def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_path):
     csv, json = tmp_path / "plan.csv", tmp_path / "plan.json"
     for round_ in ("first", "second"):
@@ -56,6 +71,10 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
         ("fit.json", "investigate --plan paper"),
         ("diagnosis.json", "calibrate data.csv"),
         ("diagnosis.json", "audit data.csv"),
+        ("trials.jsonl", "study --concealed"),
+        ("cases.jsonl", "study"),
+        ("counts.svg", "challenge"),
+        ("answers.json", "calibrate data.csv"),
         *(("fit.json", words) for words in ("explore", "demo", "study", "challenge", "diagnose data.csv --each")),
         ("result.json", "fit data.csv --simulator heater.py"),
     ],
@@ -64,9 +83,8 @@ def test_results_of_two_verbs_do_not_mix_in_one_folder(held, words, tmp_path, ca
     (tmp_path / held).write_text("{}")
     assert main([*words.split(), "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert f"--out is '{tmp_path}'; allowed: another folder: this one holds a {held[:-5]} ({held})" in said.replace(
-        "a search", "a result"
-    )
+    assert f"--out is '{tmp_path}'; allowed: another folder: this one holds " in said
+    assert f" ({held}), with which these results would mix" in said
     assert [path.name for path in tmp_path.iterdir()] == [held]
 
 
@@ -80,7 +98,7 @@ def test_results_that_replace_those_of_an_earlier_run_say_so(tmp_path):
 
         tell = lambda *told: stages.append(told)  # noqa: E731
         drawings = Drawings(tmp_path)
-        drawings.write_results(Output(write, {}, lambda drawn: ""), progress=tell)
+        drawings.write_results(Output(write, {}, lambda drawn: "", main="a.json"), progress=tell)
         said.append(drawings.notes)
     assert said == [[], ["note: the results of an earlier run there were replaced"]]
     assert stages[0] == ("writing the results",)
@@ -224,7 +242,7 @@ def test_a_file_that_cannot_be_replaced_is_put_in_place_by_the_next_command(tmp_
         real(source, target)
 
     monkeypatch.setattr(os, "replace", held)
-    with pytest.raises(FileError, match=r"b: cannot be replaced \(Permission denied\).*next command"):
+    with pytest.raises(FileError, match=r"b: cannot be replaced \(Permission denied\).*next results"):
         write_abc(tmp_path)
     assert (tmp_path / "a").exists()
     monkeypatch.undo()

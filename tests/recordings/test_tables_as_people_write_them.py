@@ -140,6 +140,7 @@ REFUSED = {
     "two columns of one name": (table("{t},{y},{t}", "t_s,temp_c,t_s\n"), ["row 1, column t_s", "rename or delete"]),
     "row numbers twice": (table("{t},{t},{t},{y}", ",t_s,,temp_c\n"), ["row 1: two columns without a name"]),
     "another unit of time": (table("{t} min,{y}"), ["row 2, column t_s: '0 min'", 'times in s, or time_unit = "min"']),
+    "a row of another unit of time": (PLAIN.replace("\n", "\n[h],K\n", 1), ["row 2, column t_s: 'h'", "times in s"]),
     "no header": (table(head=""), ["row 1, column t_s: no such column; the header has '0', '20.00'"]),
     "no such column below a preamble": (
         "; a\n; b\n" + PLAIN.replace("t_s", "t"),
@@ -186,6 +187,27 @@ def test_a_long_table_is_read_to_its_end(tmp_path, end):
 def test_a_first_row_that_lacks_its_numbers_is_no_row_of_units(tmp_path):
     path = put(tmp_path, "run,x,y\na,#N/A,NULL\nb,1,2\nb,3,4\n")
     assert read_run_table(path, time=None, run="run").scan_names == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    ("times", "unit", "said"),
+    [
+        ([1795824000000 + 3000 * k for k in range(4)], "s", "milliseconds since 1970: divide by 1000"),
+        ([1795824000000 + 3000 * k for k in range(4)], "ms", ""),
+        (
+            [46354.52083 + k * 1e-5 for k in range(4)],
+            "s",
+            "days since 1900, of a spreadsheet: write 2026-11-28 12:30:00",
+        ),
+        ([46354.52083 + k * 1e-5 for k in range(4)], "d", ""),
+        ([46354.5 + 0.01 * k for k in range(4)], "s", ""),
+        ([46354 + k for k in range(4)], "s", ""),
+        (["2026-11-28"] * 4, "s", "from 2026-11-28, the time of all rows"),
+    ],
+)
+def test_times_that_look_like_others_are_noted(tmp_path, times, unit, said):
+    read = read_run_table(put(tmp_path, table(times=times)), time="t_s", run=None, reading="temp_c", time_unit=unit)
+    assert [said in note for note in read.notes] == [True] * bool(said)
 
 
 def test_dates_need_a_unit_of_time_with_a_length(tmp_path):

@@ -54,8 +54,11 @@ def say(arguments: argparse.Namespace, *lines: str) -> None:
 
 
 def finish(arguments: argparse.Namespace, drawings: Drawings, *lines: str) -> int:
-    """Print lines, unless --quiet; return the exit status, 0. Raises NotDrawnError if something was not drawn."""
-    say(arguments, *lines)
+    """Print lines, the last after the notes on what was replaced, unless --quiet; return the exit status, 0.
+
+    Raises NotDrawnError if something was not drawn.
+    """
+    say(arguments, *lines[:-1], *drawings.notes, lines[-1])
     drawings.raise_if_any_failed()
     return 0
 

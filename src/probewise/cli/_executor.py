@@ -49,6 +49,7 @@ def run_and_report(
 
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
+    main = table if (out / file).exists() else ""  # before the first run nothing there is of an earlier one
 
     def kept() -> str:
         if not (out / file).exists():
@@ -61,7 +62,7 @@ def run_and_report(
     drawings = Drawings(out)
     with reporting_what_is_kept(kept, results=True), progress_of(arguments) as progress:
         page = page_of(results)
-        made = Output(lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw))
+        made = Output(lambda stage: stage.write(table, page.table), {}, lambda _: page.html(drawings.draw), main=main)
         drawings.write_results(made, progress=progress)
     return finish(arguments, drawings, page.sentence, f"{said}written to {out}")
 

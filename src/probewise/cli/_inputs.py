@@ -18,6 +18,7 @@ from probewise.cli._executor import worker_pool
 from probewise.cli._options import SHIPPED
 from probewise.errors import FileError, ParameterError
 from probewise.progress import Progress, silent
+from probewise.recordings.io import parse_strict_json
 from probewise.recordings.table import read_table
 
 if TYPE_CHECKING:
@@ -39,9 +40,14 @@ def read_or_shipped_plan(text: str, *, progress: Progress = silent) -> recording
 
 
 def tables_and_descriptions(tables: Sequence[Path]) -> list[Path]:
-    """Return each file of a table followed by its description, the JSON beside it."""
-    named = [table for table in tables if table.name]  # not "." and "/"
-    return [path for table in named for path in (table, table.with_suffix(".json"))]
+    """Return each file of a table followed by its description, the JSON beside it, and the pictures that this names."""
+    files = []
+    for table in (table for table in tables if table.name):  # not "." and "/"
+        files += [table, table.with_suffix(".json")]
+        with contextlib.suppress(OSError, ValueError, AttributeError, TypeError, KeyError):  # whoever reads it says it
+            patterns = parse_strict_json(files[-1].read_bytes() if files[-1].is_file() else b"")["patterns"].values()
+            files += [table.parent / pattern["file"] for pattern in patterns if "file" in pattern]
+    return files
 
 
 def inputs_and_filled_in_plan(inputs: Sequence[Path], plan: Path, column: str = "reading") -> list[Path]:

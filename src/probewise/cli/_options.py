@@ -168,7 +168,7 @@ _FILE: dict[str, Any] = {"type": parse_path}
 _WORKERS: dict[str, Any] = {"type": _count_up_to(MOST_WORKERS), "default": 1}
 _SHARED: dict[str, tuple[str, dict[str, Any]]] = {
     "--out DIR": (
-        "directory for the results; made if missing, files of the same names are replaced",
+        "directory for the results; made if missing, results of an earlier run there are replaced",
         _FILE | {"required": True},
     ),
     "--seed N": (

@@ -38,6 +38,7 @@ from probewise.cli._options import SHIPPED, parse_place, refuse_options
 from probewise.emulator.bench import scene_text
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
+from probewise.recordings.files import pictures_to_write
 from probewise.recordings.patterns import have_same_albedo
 from probewise.scene import region_of
 
@@ -143,8 +144,9 @@ def _read_unfinished_recording(path: Path) -> Recording:
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, is_lego: bool) -> list[Reading]:
     """List the readings of an earlier session, from `out`, which was begun with this plan; none without `resume`."""
     if not resume:
-        if out.exists():
-            raise FileError(out, "the file exists already", "--resume to continue it, or another --out")
+        for path in (out, out.with_suffix(".json"), *pictures_to_write(plan.patterns, out.parent)):
+            if path.exists():
+                raise FileError(path, "the file exists already", "--resume to continue it, or another --out")
         return []
     before = _read_unfinished_recording(out)
     difference = next(_differences(before.plan, plan, _LEGO_OFF_PLAN_RAD if is_lego else _OFF_PLAN_RAD), None)

@@ -33,4 +33,4 @@ def run(arguments: argparse.Namespace) -> int:
             made = output_of(audit, source=arguments.plan.name)
             drawings.write_results(made, inputs=inputs, progress=progress)
     say(arguments, audit.summary(), *(f"note: {note}" for note in getattr(audit.plan, "notes", ())))
-    return 0 if drawings is None else finish(arguments, drawings, *drawings.notes, f"written to {drawings.out}")
+    return 0 if drawings is None else finish(arguments, drawings, f"written to {drawings.out}")

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         drawings.write_results(output_of(result, seed=arguments.seed), inputs=inputs, progress=progress)
     notes = (f"note: {note}" for note in recording.notes)
     summary = f"{result.sensor.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return finish(arguments, drawings, *notes, *drawings.notes, summary)
+    return finish(arguments, drawings, *notes, summary)
 
 
 def _require_enough_live_points(n_live: int, orders: Sequence[int]) -> None:

@@ -15,7 +15,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge; write its table and report; return the exit status."""
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")
-    checked_output_directory(arguments.out, "cases.jsonl", main="table.csv")
+    checked_output_directory(arguments.out, "cases.jsonl", main="cases.jsonl")
     work, score, of, options = partial(run_case, rounds=arguments.rounds), tables.score, "", list[str]()
     if arguments.systems:
         work, score, of, options = partial(run_system_case), tables.score_systems, "systems", ["--systems"]

@@ -107,7 +107,7 @@ def run_demo(
     figures, made = report.figure_drawers(found), output_of(diagnosis, seed=seed, source="concealed.csv")
     seconds = time.monotonic() - started
     in_its_folder = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
-    with staged_output(out, outdated=(*figures, PAGE, *in_its_folder)) as stage:
+    with staged_output(out, drawn=(*figures, PAGE, *in_its_folder), main="answers.json") as stage:
         write_sensor(sensor, stage / "sensor.json")
         (stage / DIAGNOSIS).mkdir()
         made.files(StagedFiles(stage / DIAGNOSIS))

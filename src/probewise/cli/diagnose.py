@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         inputs = inputs_and_filled_in_plan(read, drawings.out / advised, column)
         drawings.write_results(made, inputs=inputs, progress=progress)
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return finish(arguments, drawings, *(f"note: {n}" for n in notes), *drawings.notes, summary)
+    return finish(arguments, drawings, *(f"note: {n}" for n in notes), summary)
 
 
 def _read_inputs(
@@ -133,7 +133,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
     """
     from probewise.report import each as report
 
-    out = checked_output_directory(arguments.out, main="table.csv")
+    out = checked_output_directory(arguments.out, main="counts.svg")
     files = dict(zip(_device_names(arguments.recordings), arguments.recordings, strict=True))
     for name in files:
         checked_output_directory(out / name, main="diagnosis.json")
@@ -168,7 +168,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
                 if "repaired.json" in results:
                     advised, column = "next.csv", json.loads(results["repaired.json"])["simulator"]["reading"]
                 inputs = inputs_and_filled_in_plan(read, out / name / advised, column)
-                with staged_output(out / name, inputs=inputs, outdated=_OUTDATED) as stage:
+                with staged_output(out / name, inputs=inputs, outdated=_OUTDATED, main="diagnosis.json") as stage:
                     for file, content in results.items():
                         stage.write(file, content)
                 notes += [f"note: what was {path} is now {now}" for path, now in stage.kept.items()]
@@ -184,6 +184,7 @@ def _diagnose_each(arguments: argparse.Namespace) -> int:
         lambda stage: stage.write("table.csv", csv_text(report.columns_of(rows))),
         {"counts.svg": partial(report.counts_svg, rows)},
         partial(report.page_html, rows, seed=arguments.seed),
+        main="counts.svg",
     )
     drawings.write_results(made, inputs=arguments.recordings)
     return finish(arguments, drawings, *notes, report.summary(rows), f"seed {arguments.seed}; written to {out}")

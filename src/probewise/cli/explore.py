@@ -9,7 +9,6 @@ import webbrowser
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
     if journal.exists() and not arguments.resume:
         raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
+    written_as_it_goes = (out / name for name in ("frames", *["live.html"] * arguments.live))
+    for path in written_as_it_goes if not arguments.resume and not (out / "result.json").exists() else ():
+        if path.exists():
+            raise FileError(path, "it exists already, and no search is in that folder", "another --out, or none there")
     before = read_journal(journal) if arguments.resume else None
     instrument, about_truth = search.open_arm(() if before is None else before.readings)
     say(arguments, f"seed {arguments.seed}")
@@ -110,7 +113,7 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
         search.write_results(result, progress=progress)
     lines = search.closing_lines(result, journal)
-    return finish(arguments, search.drawings, *lines, *search.drawings.notes, f"written to {out}")
+    return finish(arguments, search.drawings, *lines, f"written to {out}")
 
 
 class Search:
@@ -232,18 +235,20 @@ class Search:
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
-        name = f"{step.number:03d}.png"
-        self.frames.append(self.drawings.draw(f"frames/{name}", partial(self._draw_frame, step, shadow)))
         if step.number == 1 and not step.replayed:
             remove_earlier_results(self.out, self.files)
-        folder, live = self.out / "frames", self.out / "live.html"
-        folder.mkdir(exist_ok=True)
-        if self.frames[-1]:
-            write_bytes_atomically(folder / name, self.frames[-1])
-        if self.arguments.live and (page := self.drawings.draw("live.html", partial(self._live_page, step))):
-            write_bytes_atomically(live, page)
-            if len(self.frames) == 1:
-                webbrowser.open(live.absolute().as_uri())
+
+        def written(name: str, content: bytes) -> bytes:
+            (self.out / name).parent.mkdir(exist_ok=True)
+            write_bytes_atomically(self.out / name, content)
+            return content
+
+        frame = f"frames/{step.number:03d}.png"  # a disk without room for it ends no search
+        self.frames.append(self.drawings.draw(frame, lambda: written(frame, self._draw_frame(step, shadow))))
+        if self.arguments.live:
+            page = self.drawings.draw("live.html", lambda: written("live.html", self._live_page(step)))
+            if page and len(self.frames) == 1:
+                webbrowser.open((self.out / "live.html").absolute().as_uri())
 
     def _live_page(self, step: Step) -> bytes:
         trust, earlier = self.experiment.trust, self.steps[:-1]
@@ -365,11 +370,13 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
 
 
 def remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
-    """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix."""
-    # Without a result.json, a sensor.json is none of these results, but perhaps somebody's calibration.
-    of_machine = ("result.json", "samples.csv", "sensor.json") if (out / "result.json").exists() else ()
+    """Remove the results of an earlier run from `out`, but none of `files`, so that two runs do not mix.
+
+    Without a result.json there are none, but perhaps somebody's calibration or files of such names.
+    """
     spared = {os.path.realpath(path) for path in files}
-    for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", *of_machine):
+    names = ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", "samples.csv", "sensor.json", "result.json")
+    for pattern in names if (out / "result.json").exists() else ():
         for path in out.glob(pattern):
             if os.path.realpath(path) not in spared:
                 path.unlink()

@@ -26,4 +26,4 @@ def run(arguments: argparse.Namespace) -> int:
         inputs = [*arguments.tables, arguments.simulator]
         drawings.write_results(output_of(fitted, seed=arguments.seed), inputs=inputs, progress=progress)
     summary = f"{fitted.summary()}\nseed {arguments.seed}; written to {drawings.out}"
-    return finish(arguments, drawings, *drawings.notes, summary)
+    return finish(arguments, drawings, summary)

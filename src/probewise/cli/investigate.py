@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
         drawings.write_results(made, inputs=inputs_and_filled_in_plan(read, out / NEXT_PLAN), progress=progress)
     known = [] if concealed is None else [f"concealed    {', '.join(concealed) or 'nothing'}"]
-    return finish(arguments, drawings, found.summary(), *known, *drawings.notes, f"written to {out}")
+    return finish(arguments, drawings, found.summary(), *known, f"written to {out}")
 
 
 def _first_plan(arguments: argparse.Namespace, chosen: benches.ArmName) -> Plan:

@@ -8,7 +8,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._writing import checked_output_file
 from probewise.cli._common import CommandError, note_if_replaced, say
-from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan
+from probewise.cli._inputs import read_or_shipped_geometry, read_or_shipped_plan, tables_and_descriptions
 from probewise.cli._options import refuse_options
 from probewise.errors import ParameterError, require
 from probewise.recordings import write_bytes_atomically
@@ -25,7 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     paper = arguments.paper
     require(paper in sheets.PAPERS_MM, "--paper", paper, " or ".join(sheets.PAPERS_MM))
     named = Path(arguments.what)
-    out = checked_output_file(arguments.out, *([named] if named.is_file() else []))
+    read = tables_and_descriptions([named, named.with_suffix(".csv")] if named.is_file() else [])
+    out = checked_output_file(arguments.out, arguments.geometry, *read)
     to_draw = _sheets_to_draw(arguments)
     drawn = sheets_pdf(to_draw, paper=paper, title=f"probewise sheets: {named.name}")
     earlier = note_if_replaced(out)

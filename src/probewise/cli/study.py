@@ -20,7 +20,8 @@ _OF_CONCEALED = ("clean", "seed", "size", "varied")
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks; write its table and report; return the exit status."""
-    checked_output_directory(arguments.out, "trials.jsonl", "concealed.jsonl", main="table.csv")
+    file = "concealed.jsonl" if arguments.concealed else "trials.jsonl"
+    checked_output_directory(arguments.out, file, main=file)
     command = _command_line(arguments)
     if arguments.concealed:
         _require_none(arguments, (*_FACTORS, "quoted", "beside_paper"), "--concealed")
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
             **({} if arguments.seed is None else {"seed": arguments.seed}),
         )
         page_of = partial(pages.concealed_page, command=command)
-        return run_and_report(hiding, page_of, arguments, "concealed.jsonl", "concealed.csv")
+        return run_and_report(hiding, page_of, arguments, file, "concealed.csv")
     for name, value in _given(arguments, _OF_CONCEALED).items():
         raise ParameterError(f"--{name}", value, "only with --concealed")
     rows = _configuration_rows(arguments)
@@ -41,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     numbers[rows[0]] = arguments.quoted or arguments.circles
     require(max(numbers.values()) >= 2, "--circles", arguments.circles, "2 or more: one circle gives no standard error")
     plain = study(numbers, max_readings=arguments.max_readings)
-    return run_and_report(plain, partial(pages.study_page, command=command), arguments, "trials.jsonl")
+    return run_and_report(plain, partial(pages.study_page, command=command), arguments, file)
 
 
 def _given(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:

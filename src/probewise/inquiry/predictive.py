@@ -35,6 +35,7 @@ _ALLOWED_SD = (
 )
 _PER_SD = 2.0  # levels of the predicted reading per noise sd, given a reading
 _LEAST = 1e-12
+_LEAST_SD = 1e-150  # and one over it the greatest: squares of numbers beyond overflow
 _LOG_2PI = math.log(2 * math.pi)
 _N_LEVELS = 256  # of a reading without noise: near a goal they are finer than a sample's error
 _N_SDS = 8  # groups of samples where the sd of the noise is unknown
@@ -76,7 +77,7 @@ class ReadingNoise:
     def __post_init__(self) -> None:
         require(not isinstance(self.sd, type | str | bytes), "noise sd", self.sd, _ALLOWED_SD)
         is_number = not (self.is_sd_inferred or callable(self.sd))
-        if is_number and not 0 < checked_number("noise sd", self.sd, _ALLOWED_SD) < math.inf:
+        if is_number and not _LEAST_SD < checked_number("noise sd", self.sd, _ALLOWED_SD) < 1 / _LEAST_SD:
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
         if self.is_sd_inferred and not np.min(self.sd.from_unit(np.array([1e-9, 0.5]))) > 0:  # type: ignore[union-attr]
             raise ParameterError("noise sd", self.sd, "a prior of numbers greater than 0, such as LogUniform(0.1, 10)")

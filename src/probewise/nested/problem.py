@@ -489,6 +489,7 @@ def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bo
         made = cast(Prior, _TransformPrior(given, prior, vectorized))
     else:
         raise ParameterError("prior", prior, _ALLOWED_PRIOR)
+    require(made.names, "prior", prior, "one parameter or more")
     require(len(set(made.names)) == len(made.names), "names of the prior", made.names, "each name once")
     require(given is None or given == made.names, "names", names, f"those of the prior, {made.names}, or none")
     return made

@@ -209,6 +209,11 @@ def require_unit_of_time(name: str, unit: str, wanted: str) -> None:
         raise UnclearCellError(0, f'times in {wanted}, or time_unit = "{unit}"', name=name)
 
 
+def is_other_unit_of_time(unit: str, wanted: str) -> bool:
+    """Return whether a text is a unit of time, and another than is wanted."""
+    return unit.lower() in _SECONDS and _SECONDS[unit.lower()] != _SECONDS.get(wanted.lower())
+
+
 def are_other_days(days: Sequence[str], clocks: Sequence[str]) -> bool:
     """Return whether cells are dates alone, not all the same, that change where clocks in the same rows do not."""
     if not (looks_like_time(days[0]) and _CLOCK_ALONE.fullmatch(clocks[0])):
@@ -285,7 +290,8 @@ def texts_to_times(name: str, cells: Sequence[str], unit: str) -> tuple[FloatArr
 def _in_unit(name: str, seconds: FloatArray, first: str, unit: str) -> tuple[FloatArray, str]:
     if unit.lower() not in _SECONDS:
         raise UnclearCellError(0, f'numbers, or time_unit = "s", "ms", "min", "h" or "d" in place of "{unit}"')
-    return seconds / _SECONDS[unit.lower()], f"{name} counted in {unit} from {first}"
+    same = ", the time of all rows" if len(seconds) > 1 and not seconds.any() else ""
+    return seconds / _SECONDS[unit.lower()], f"{name} counted in {unit} from {first}{same}"
 
 
 def _seconds_of_clocks(parts: Sequence[dict[str, Any]]) -> tuple[FloatArray, str]:

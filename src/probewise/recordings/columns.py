@@ -228,8 +228,10 @@ def how_to_describe_pattern(name: str, known: Sequence[str]) -> str:
 
 def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> list[str]:
     """Return one name per reading, stripped; ShapeError for another number, ParameterError if one is missing."""
-    require(isinstance(values, Iterable), name, values, "a text, or one per reading")
-    cells = list(values)
+    try:
+        cells = list(values)
+    except Exception as error:  # an array without an axis, or an object of a user, which may raise anything
+        raise ParameterError(name, values, "a text, or one per reading") from error
     if len(cells) != n_points:
         raise ShapeError(f"{name} has {len(cells)} names; allowed: {n_points}, one per reading, or a single text")
     for k, cell in enumerate(cells):

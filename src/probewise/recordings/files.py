@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -311,14 +312,26 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
     if unknown := sorted({name for name, _ in plan.rows_by_pattern()} - set(plan.patterns)):
         raise ParameterError("pattern", unknown[0], "a pattern that plan.patterns describes")
     text = description_text(plan.instrumentation, plan.patterns)
-    images = _images_by_file(plan.patterns)
-    contents = [(path.parent / file, image_bytes(image.albedo, Path(file).suffix)) for file, image in images.items()]
+    pictures = pictures_to_write(plan.patterns, path.parent)
     # The CSV comes last: if it exists, everything it needs exists too.
     if not is_device_or_pipe(path):  # nothing lies beside one
-        for image_path, content in contents:
-            write_bytes_atomically(image_path, content, named=False)
+        for picture, content in pictures.items():
+            write_bytes_atomically(picture, content, named=False)
         write_text_atomically(path.with_suffix(".json"), text, named=False)
     write_text_atomically(path, csv_text(columns))
+
+
+def pictures_to_write(patterns: Mapping[str, Pattern], folder: Path) -> dict[Path, bytes]:
+    """Return by path the pictures of patterns, but for those that are in the folder as they are."""
+    content = {}
+    for file, image in _images_by_file(patterns).items():
+        picture = folder / file
+        with contextlib.suppress(FileError):  # something else is there
+            there = read_image(picture)
+            if not picture.is_symlink() and there.shape == image.albedo.shape and np.allclose(there, image.albedo):
+                continue
+        content[picture] = image_bytes(image.albedo, picture.suffix)
+    return content
 
 
 def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:

@@ -25,6 +25,7 @@ from probewise.recordings.cells import (
     are_other_days,
     first_cell_without_number,
     is_missing,
+    is_other_unit_of_time,
     looks_like_number,
     looks_like_time,
     parsed_numbers,
@@ -295,6 +296,10 @@ def read_table(
     progress(f"reading {path.name}", len(rows), len(rows))
     if not header:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
+    for row, cells in enumerate(layout.units, layout.at + 2):
+        unit = dict(zip(header, cells, strict=False)).get(time or "", "").strip("[(]) ")
+        if is_other_unit_of_time(unit, time_unit):
+            raise FileError(path, shown(unit), f'times in {time_unit}, or time_unit = "{unit}"', row=row, column=time)
     notes = layout.notes()
     if left_out:
         notes.append(f"{count_with_noun(len(left_out), 'row')} without readings left out (first: row {min(left_out)})")

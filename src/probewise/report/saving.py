@@ -34,7 +34,7 @@ def page_of(value: object, *, seed: int | None) -> str:
 def save(value: object, folder: str | Path, *, seed: int | None) -> Path:
     """Write a result into a folder, made if missing, and return it; errors as of `probewise._display.Reported.save`."""
     made, out = _output_of(value, seed), checked_path("folder", folder)
-    drawings = Drawings(checked_output_directory(out, main=made.main))
+    drawings = Drawings(checked_output_directory(out, main=made.main, option="folder"))
     drawings.write_results(made)
     drawings.raise_if_any_failed()
     return out

@@ -16,7 +16,16 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, data_frame, floats, read_only_floats, rounding_error
+from probewise._arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    array_or_none,
+    data_frame,
+    floats,
+    read_only_floats,
+    rounding_error,
+)
 from probewise._kinds import checked_path, require_kind
 from probewise.errors import FileError, ParameterError, ShapeError, require
 from probewise.recordings import Instrumentation, Recording
@@ -87,9 +96,8 @@ class RunTable:
             if name == self.run and 0 < np.count_nonzero(columns[name] == "") < len(columns[name]):
                 cure = "where an empty cell repeats the one above, fill it in"
                 notes += [f"the rows without a name in column {name} are taken for one run; {cure}"]
-            if name == self.time and name != self.run and _are_dates_without_marks(columns[name]):
-                cure = "write 2026-11-28 for 20261128"
-                notes += [f"column {name} is taken as plain numbers, though all look like dates: {cure}"]
+            if name == self.time and name != self.run and (like := _other_times(columns[name], self.time_unit)):
+                notes += [f"column {name} is taken as plain numbers, though all look like {like}"]
         require(columns, "columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
         for name, values in columns.items():
@@ -301,19 +309,30 @@ def column_error(
     return ParameterError(f"{column} in row {k + first}", str(cells[k]), allowed)
 
 
-def _are_dates_without_marks(values: NDArray[Any]) -> bool:
-    """Return whether a column of numbers, not all the same, looks like 20261128, or 20261128235959 with a clock."""
+def _other_times(values: NDArray[Any], unit: str) -> str:
+    """Return what a column of numbers, not all the same, looks like if not times in `unit`, and the cure; "": nothing.
+
+    Such as 20261128, or 20261128235959 with a clock; 1795824000000, milliseconds since 1970; 46354.52083, days since
+    1900, of a spreadsheet: all of this century, and the days less than half an hour apart and no thousandths.
+    """
     if values.dtype != np.float64 or not np.isfinite(values).all() or not values.size or not np.ptp(values):
-        return False
+        return ""
     dates = np.floor(values / 1e6 if values.min() > 1e13 else values)
     year, month, day = dates // 10_000, dates // 100 % 100, dates % 100
-    return bool(((year > 1899) & (year < 2101) & (month > 0) & (month < 13) & (day > 0) & (day < 32)).all())
+    if ((year > 1899) & (year < 2101) & (month > 0) & (month < 13) & (day > 0) & (day < 32)).all():
+        return "dates: write 2026-11-28 for 20261128"
+    if unit != "ms" and values.min() > 9e11 and values.max() < 5e12:
+        return 'milliseconds since 1970: divide by 1000, or time_unit = "ms"'
+    apart, parts = np.median(np.abs(np.diff(values))), 1e3 * values
+    if unit == "s" and values.min() > 36524 and values.max() < 73415 and apart < 0.02 and (parts % 1 > 0).any():
+        return "days since 1900, of a spreadsheet: write 2026-11-28 12:30:00"
+    return ""
 
 
 def _checked_column(name: str, values: Any, *, are_names: bool) -> NDArray[Any]:
     if isinstance(values, np.ma.MaskedArray):  # what is masked is missing
         values = np.ma.filled(values.astype(np.object_), np.nan if values.dtype.kind in "biufO" else "")
-    array = np.asarray(values)
+    array = floats(values, f"column {name!r}") if (given := array_or_none(values)) is None else given
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
     if are_names and array.dtype.kind == "U" and not array.flags.writeable:

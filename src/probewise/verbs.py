@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from probewise.arm import Instrument, Measures
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis, PlanAudit, SystemFit
-    from probewise.experiment import Exploration, MethodName, Model, Step, Truth
+    from probewise.experiment import Exploration, MethodName, ModelName, Step, Truth
     from probewise.inference import Naive
     from probewise.inquiry import Utility
     from probewise.nested import NestedStop
@@ -42,7 +42,7 @@ CalibrationMethod: TypeAlias = Literal["quick", "full", "paper"]
 CALIBRATION: CalibrationMethod = "quick"
 SHAPE = "circle"
 SHAPES = ("circle", "ellipse", "rectangle", "triangle", "hexagon")  # those of `scene.SHAPES`, without its imports
-MODEL: Model = "ssf"
+MODEL: ModelName = "ssf"
 METHOD: MethodName = "particles"
 UTILITY = "finishing"
 MAX_READINGS = 100
@@ -193,7 +193,7 @@ def explore(
     truth: Truth | None = None,
     arm: Instrument | Measures | None = None,
     field: scene.Field | None = None,
-    model: Model = MODEL,
+    model: ModelName = MODEL,
     method: MethodName = METHOD,
     nested_stop: NestedStop | None = None,
     levels: Recording | None = None,
@@ -287,7 +287,7 @@ def explore(
     _kinds.require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     require_fitted_sensor(sensor, "in the order explore(sensor, ...)")
     _kinds.require_flag("learn_sensor", learn_sensor)
-    for name, value, known in (("method", method, experiment.MethodName), ("model", model, experiment.Model)):
+    for name, value, known in (("method", method, experiment.MethodName), ("model", model, experiment.ModelName)):
         _kinds.require_one_of(name, value, get_args(known))
     _kinds.require_kind("cards", cards, (tuple, list), "cards, of probewise.scene, in a list")
     lies = experiment.as_shape(shape, field)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from exploring import run
 
-from probewise.experiment.method import SequentialMonteCarlo
-from probewise.experiment.stopping import (
+from probewise.experiment.judgement import (
     probability_of_length_off,
     shape_moments_and_probabilities,
     with_aligned_angles,
 )
+from probewise.experiment.method import SequentialMonteCarlo
 from probewise.nested import Weighted
 from probewise.scene import AnyOf, Circle, Field, Rectangle
 
@@ -76,7 +76,7 @@ def test_a_run_that_trusts_its_sensor_looks_for_lost_modes_before_it_ends(small)
     asked = []
     experiment = small.experiment(method=Counted(600, 40, (asked,)))
     result = run(small.arm(), experiment, rng=np.random.default_rng(5))
-    assert result.reached
+    assert result.target_reached
     assert asked == [len(result.steps)]
     plain = run(small.arm(), replace(experiment, method=None), rng=np.random.default_rng(5))
     assert len(plain.steps) == len(result.steps)

@@ -17,7 +17,7 @@ from probewise.arm.geometry import (
     place_jacobian,
 )
 from probewise.errors import ParameterError
-from probewise.experiment import FittedArm, found_shape, result_json, samples_csv
+from probewise.experiment import FittedArm, estimated_shape, result_json, samples_csv
 from probewise.experiment.arm_error import arm_error_in_posterior
 from probewise.inquiry import Grid
 
@@ -48,7 +48,9 @@ def with_arm_error(exploration, geometry):
     experiment = dataclasses.replace(exploration.experiment, fitted_arm=FittedArm(geometry, LEVELS))
     of = (experiment, exploration.readings, last.posterior.theta[:, experiment.shape_columns])
     moments = {name: getattr(last, name) for name in ("mean", "sd", "likely_shape")}
-    error = arm_error_in_posterior(*of, last.kinds.with_raised_fault_odds(), **moments, rng=np.random.default_rng(1))
+    error = arm_error_in_posterior(
+        *of, last.by_kind.with_raised_left_out_odds(), **moments, rng=np.random.default_rng(1)
+    )
     return dataclasses.replace(exploration, steps=(*exploration.steps[:-1], dataclasses.replace(last, arm_error=error)))
 
 
@@ -100,7 +102,7 @@ def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found)
     np.testing.assert_allclose(claimed.posterior.sd(), claimed.sd, rtol=0.05)
     np.testing.assert_allclose(claimed.posterior.mean(), found.last.mean, atol=0.1)
     of_file = {p["name"]: p for p in json.loads(result_json(claimed))["shape"]["parameters"]}
-    for k, parameter in enumerate(found_shape(claimed).parameters):
+    for k, parameter in enumerate(estimated_shape(claimed).parameters):
         assert parameter.sd == of_file[parameter.name]["sd"] == pytest.approx(claimed.sd[k])
         assert parameter.arm_sd == of_file[parameter.name]["arm_sd"] == pytest.approx(claimed.arm_error.sd[k])
         low, high = parameter.interval95
@@ -110,7 +112,7 @@ def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found)
     assert np.sqrt(weight @ (x_mm - weight @ x_mm) ** 2) == pytest.approx(claimed.sd[0], rel=0.06)
     assert "its own error makes up x_mm" in claimed.summary()
     assert claimed.stop_reason.endswith(f"with the arm's own error the widest is known to {claimed.sd.max():.1f} mm")
-    assert [p.arm_sd for p in found_shape(found).parameters] == [None] * 3
+    assert [p.arm_sd for p in estimated_shape(found).parameters] == [None] * 3
     assert found.last.sd.max() < claimed.sd.max()
 
 
@@ -176,7 +178,7 @@ def test_a_run_reads_on_until_the_lengths_are_known_arm_included(claimed_by):
     assert np.hypot(included.last.sd, included.arm_error.sd).max() < 1.0
     assert np.hypot(included.steps[-2].sd, included.steps[-2].arm_error.sd).max() >= 1.0
     assert included.stop_reason == "every length is known to better than 1 mm, the arm's own error included"
-    assert included.reached
+    assert included.target_reached
 
 
 def test_a_run_whose_arm_alone_leaves_too_much_says_so_and_reads_no_further(claimed_by):
@@ -184,5 +186,5 @@ def test_a_run_whose_arm_alone_leaves_too_much_says_so_and_reads_no_further(clai
     assert len(beyond.readings) == len(alone.readings) < 25
     assert beyond.stop_reason.startswith("the readings know every length to better than 1 mm, but the arm's own error")
     assert "leaves 1.5 mm, which no reading lowers" in beyond.stop_reason
-    assert not beyond.reached
+    assert not beyond.target_reached
     assert beyond.sd.max() > 1.5

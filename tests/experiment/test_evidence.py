@@ -139,10 +139,12 @@ def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_pri
     recording = journal(doubting, 3)
     now = method.updated(prior_posterior(kinds, 1000, rng=rng), recording.take(np.arange(1)), rng=rng)
     leader, other = now.particles
-    other = replace(other, weighted=replace(other.weighted, log_z=leader.log_z - behind), lost_log_z=0.0, asleep=True)
+    other = replace(
+        other, weighted=replace(other.weighted, log_z=leader.log_z - behind), lost_log_z=0.0, suspended=True
+    )
     two = recording.take(np.arange(2))
     found = method.updated(replace(now, particles=(leader, other)), two, rng=rng).particles[1]
-    assert found.asleep == sleeps
+    assert found.suspended == sleeps
     if sleeps:
         np.testing.assert_array_equal(found.weighted.theta, other.weighted.theta)
         assert found.log_z == pytest.approx(other.log_z + kinds[1].problem(two).perfect_log_likelihood)
@@ -163,7 +165,7 @@ def test_before_a_run_ends_a_kind_is_solved_again_that_could_matter_by_a_mode_th
         replace(own, weighted=f, ancestor=np.arange(len(f.theta)), lost_log_z=-math.inf)
         for own, f in zip(start.particles, found, strict=True)
     ]
-    now = replace(start, particles=tuple(parts)).with_raised_fault_odds()
+    now = replace(start, particles=tuple(parts)).with_raised_left_out_odds()
     poor = replace(found[1], log_z=found[1].log_z - 7.0)
     lost_log_z = now.log_z + least - now.kinds[1].log_prior
     now = replace(start, particles=(parts[0], replace(parts[1], weighted=poor, lost_log_z=lost_log_z)))

@@ -13,11 +13,11 @@ from scipy.stats import multivariate_normal
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import arm_over, begin, explore, inquire, loop, read_journal, step
+from probewise.experiment.judgement import is_target_reached, p_value_and_worst_reading
 from probewise.experiment.paper import OneScan
-from probewise.experiment.stopping import p_value_and_worst_reading
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, PerSecond, ReadingEntropy, UtilityMap, prior_entropy
-from probewise.inquiry.entropy import best_places_mask
+from probewise.inquiry.entropy import best_designs_mask
 from probewise.inquiry.smc import prior_particles
 from probewise.recordings import Disc
 from probewise.scene import AnyOf, Circle, Field, Rectangle
@@ -51,7 +51,7 @@ def test_the_robot_finds_the_circle_to_the_precision_it_states(found):
     """Each parameter within five of its posterior sds: a right program fails once in a million."""
     result, small = found
     truth = np.array(small["QuickArm"]().truth)
-    assert result.reached
+    assert result.target_reached
     assert (result.last.sd < 4.0).all()
     assert (np.abs(result.last.mean - truth) < 5 * result.last.sd).all()
     assert result.stop_reason == "every length is known to better than 4 mm"
@@ -66,7 +66,7 @@ def test_each_step_holds_what_its_reading_taught(found):
         assert 0 <= info.map.highest_utility <= math.log2(50)
         assert np.isfinite([info.bits, info.log_z, info.p_value, info.posterior.log_z_error]).all()
         assert info.p_value > 1e-6
-        best = info.map.grid.places_mm[best_places_mask(info.map.values, info.map.reachable)]
+        best = info.map.grid.places_mm[best_designs_mask(info.map.values, info.map.reachable)]
         assert info.next_pose is None or [info.next_pose.x_mm, info.next_pose.y_mm] in best.tolist()
     last = result.last  # whose samples are drawn from the posterior: within five standard errors
     assert (np.abs(last.samples.mean(axis=0) - last.mean) < 5 * last.sd / math.sqrt(20)).all()
@@ -97,7 +97,7 @@ def test_the_summary_gives_bits_and_the_papers_count(found):
 
 def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
     naive = run(small.arm(sensor=small.sensor(0.0)), small.experiment(blur_mm=0.0), rng=rng(), max_readings=60)
-    assert naive.reached
+    assert naive.target_reached
     assert all(info.map.highest_utility <= 1.0 + 1e-5 for info in naive.steps)  # single precision
     assert len(naive.steps) > len(found[0].steps)
 
@@ -357,7 +357,7 @@ def test_of_a_set_of_shapes_the_robot_finds_which_and_where(small):
     experiment = real_experiment(small, shape, n_live=200, stop_sd_mm=6.0)
     only = real_experiment(small, shape.shapes["rectangle"])
     result = run(ChainArm(only.model, (210.0, 140.0, 150.0, 90.0, 0.4)), experiment, rng=rng(), max_readings=60)
-    assert result.reached
+    assert result.target_reached
     assert result.last.likely_shape == "rectangle"
     assert result.last.shapes["rectangle"] > 0.95
     assert "rectangle (p = " in result.last.summary()
@@ -378,9 +378,9 @@ def test_a_set_of_shapes_stops_on_the_lengths_of_the_most_probable(small):
     assert np.isfinite(info.mean).nonzero()[0].tolist() == sorted(shape.prior.columns_by_shape[likely].tolist())
     assert sum(info.shapes.values()) == pytest.approx(1.0)
     known = np.where(np.isfinite(info.sd), 1.0, np.nan)
-    assert experiment.may_stop(known, {"circle": 0.99, "rectangle": 0.01})
-    assert not experiment.may_stop(known, {"circle": 0.6, "rectangle": 0.4})
-    assert not experiment.may_stop(known * 5, {"circle": 0.99, "rectangle": 0.01})
+    assert is_target_reached(experiment, known, {"circle": 0.99, "rectangle": 0.01})
+    assert not is_target_reached(experiment, known, {"circle": 0.6, "rectangle": 0.4})
+    assert not is_target_reached(experiment, known * 5, {"circle": 0.99, "rectangle": 0.01})
 
 
 @pytest.mark.slow
@@ -390,8 +390,8 @@ def test_a_run_that_nothing_explains_does_not_call_itself_known(small):
     result = run(blurred, small.experiment(stop_sd_mm=1.0, grid=COARSE), rng=rng(), max_readings=40)
     said = [info.number for info in result.steps if any("no hypothesis explains" in note for note in info.notes)]
     assert said
-    assert not result.reached
-    assert result.experiment.may_stop(result.last.sd, result.last.shapes)
+    assert not result.target_reached
+    assert is_target_reached(result.experiment, result.last.sd, result.last.shapes)
     assert "is not to be trusted" in result.stop_reason
     assert f"p = {result.last.p_value:.1g}" in result.stop_reason
 
@@ -477,7 +477,7 @@ def test_a_run_that_nothing_within_reach_can_advance_stops_and_says_so(small):
     result = run(arm, small.experiment(blur_mm=0.0, grid=COARSE), rng=rng(), max_readings=20)
     assert "every reading within reach promises the same" in result.stop_reason
     assert len(result.steps) <= 4
-    assert not result.reached
+    assert not result.target_reached
 
 
 ONE_PLACE = Grid(400.0, 300.0, 3, 3)  # of which (200, 0) is the only one within 30 mm of the arm

@@ -7,12 +7,12 @@ import pytest
 
 from probewise.arm import Pose, Reading
 from probewise.experiment.kinds import prior_posterior
-from probewise.experiment.rivals import EACH_S, EffectInPacedTime, Pace, gain_loss, rivals_of
+from probewise.experiment.rivals import PACED_S_PER_READING, EffectInPacedTime, Pace, gain_loss, rivals_of
 from probewise.proof.study import REFERENCE, experiment_of
 
 
-def readings(each_s, start_s=0.0):
-    return [Reading(20.0, Pose(100.0 * k, 50.0 * (k % 3), 0.0), start_s + each_s * k) for k in range(8)]
+def readings(s_per_reading, start_s=0.0):
+    return [Reading(20.0, Pose(100.0 * k, 50.0 * (k % 3), 0.0), start_s + s_per_reading * k) for k in range(8)]
 
 
 def rivals(name):
@@ -35,14 +35,14 @@ def test_a_fast_instrument_drifts_over_as_many_readings_as_a_slow_one(name):
 def test_parameters_are_told_by_the_clock():
     (step,) = rivals("ambient_step")
     pace = Pace.from_readings(readings(2.0))
-    assert pace.each_s == pytest.approx(2.0)
-    np.testing.assert_allclose(pace.in_seconds(step, np.array([5.0, 4 * EACH_S])), [5.0, 8.0])
+    assert pace.s_per_reading == pytest.approx(2.0)
+    np.testing.assert_allclose(pace.in_seconds(step, np.array([5.0, 4 * PACED_S_PER_READING])), [5.0, 8.0])
     (drift,) = rivals("offset_drift")
     np.testing.assert_allclose(pace.in_seconds(drift, np.array([1.0])), [4.0])
 
 
 def test_one_reading_has_the_usual_pace():
-    assert Pace.from_readings(readings(2.0)[:1]).each_s == EACH_S
+    assert Pace.from_readings(readings(2.0)[:1]).s_per_reading == PACED_S_PER_READING
     assert Pace.from_readings([]) == Pace()
 
 

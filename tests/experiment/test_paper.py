@@ -22,7 +22,7 @@ from probewise.experiment import (
 from probewise.experiment.paper import OneScan, student_t_likelihood
 from probewise.inference import Naive
 from probewise.inquiry import Grid, InformationGain, ReadingEntropy
-from probewise.inquiry.entropy import best_places_mask
+from probewise.inquiry.entropy import best_designs_mask
 from probewise.nested import EvidenceChange, RemainingEvidence
 from probewise.recordings import Disc, HalfPlane, Plan, Recording
 from probewise.recordings import Uniform as UniformPattern
@@ -124,7 +124,7 @@ def test_the_robot_asks_fifty_circles_and_goes_where_their_answers_differ_most(s
             counts = np.unique(answers[:, place], return_counts=True)[1] / 50
             assert step.map.values[place] == pytest.approx(-(counts * np.log2(counts)).sum())
     chosen = steps[0].next_pose
-    assert [chosen.x_mm, chosen.y_mm] in places[best_places_mask(steps[0].map.values, steps[0].map.reachable)].tolist()
+    assert [chosen.x_mm, chosen.y_mm] in places[best_designs_mask(steps[0].map.values, steps[0].map.reachable)].tolist()
 
 
 def same(a, b):

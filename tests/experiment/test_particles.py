@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.evidence import sampled_about_points
-from probewise.experiment.stopping import information_nats
+from probewise.experiment.judgement import information_nats
 from probewise.inquiry.smc import (
     THOROUGH,
     LocalKernels,

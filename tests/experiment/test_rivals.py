@@ -32,21 +32,21 @@ from probewise.experiment import (
 )
 from probewise.experiment.arm_error import arm_error_in_posterior
 from probewise.experiment.inquire import (
-    ENDS,
+    ENDS_RUN_LABEL,
     ENOUGH_BITS,
-    INFORMATION,
-    NAMES,
+    INFORMATION_LABEL,
+    LEFT_OUT_LABEL,
     ArmReachAndTravel,
-    expected_bits_about_left_out_effect,
+    expected_bits_about_left_out,
     far_side,
     predict_readings_and_utilities,
     utilities_near_end,
 )
-from probewise.experiment.kinds import Posterior, prior_posterior
+from probewise.experiment.judgement import trend_of_residuals
+from probewise.experiment.kinds import PosteriorByKind, prior_posterior
 from probewise.experiment.method import SequentialMonteCarlo
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.experiment.rivals import rivals_of
-from probewise.experiment.stopping import trend_of_residuals
 from probewise.inference import Rounded
 from probewise.inquiry import Readout
 from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
@@ -188,11 +188,11 @@ def leading(info, name):
     """The step as if one rival led."""
     weighted = [
         replace(p.weighted, log_z=0.0 if kind.left_out == name else -40.0)
-        for kind, p in zip(info.kinds.kinds, info.kinds.particles, strict=True)
+        for kind, p in zip(info.by_kind.kinds, info.by_kind.particles, strict=True)
     ]
-    particles = tuple(replace(p, weighted=w) for p, w in zip(info.kinds.particles, weighted, strict=True))
-    kinds = replace(info.kinds, particles=particles)
-    return replace(info, kinds=kinds)
+    particles = tuple(replace(p, weighted=w) for p, w in zip(info.by_kind.particles, weighted, strict=True))
+    by_kind = replace(info.by_kind, particles=particles)
+    return replace(info, by_kind=by_kind)
 
 
 def test_what_leads_is_said_with_its_numbers(stepped):
@@ -218,10 +218,10 @@ def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):
     for name, log_z in (("dropouts", 0.0), ("halo", -2.5)):
         particles = tuple(
             replace(p, weighted=replace(p.weighted, log_z=log_z)) if kind.left_out == name else p
-            for kind, p in zip(last.kinds.kinds, last.kinds.particles, strict=True)
+            for kind, p in zip(last.by_kind.kinds, last.by_kind.particles, strict=True)
         )
-        last = replace(last, kinds=replace(last.kinds, particles=particles))
-    share = 0.1 / (len({kind.left_out for kind in last.kinds.kinds}) - 1)
+        last = replace(last, by_kind=replace(last.by_kind, particles=particles))
+    share = 0.1 / (len({kind.left_out for kind in last.by_kind.kinds}) - 1)
     plain, wary = share / (0.9 + share), 14.0 * share / (0.9 + 14.0 * share)
     said = left_out_after_step(last, 0.9)
     assert said.probability["dropouts"] == pytest.approx(plain, rel=0.01)
@@ -236,7 +236,7 @@ def test_a_reading_tells_names_by_what_they_predict():
     alike = np.tile(20.0 + 3.0 * even, 2)
     apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
     near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
-    bits = expected_bits_about_left_out_effect(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
+    bits = expected_bits_about_left_out(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
     at = np.linspace(-20.0, 60.0, 20_001)
     given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
     both = 0.5 * (given[0] + given[1])
@@ -250,7 +250,7 @@ def test_a_reading_tells_names_by_what_they_predict():
 def test_the_fit_is_tested_where_the_declared_noise_leads(doubting, stepped, monkeypatch, name, tested):
     """Chi-square is of that noise alone."""
     index = [kind.left_out for kind in doubting.kinds].index(name)
-    monkeypatch.setattr(Posterior, "most_probable_kind_index", index)
+    monkeypatch.setattr(PosteriorByKind, "most_probable_kind_index", index)
     rng = np.random.default_rng(4)
     with arm_of(Trial(REFERENCE, 0)) as arm:
         state = begin(doubting, arm, rng=rng)
@@ -276,8 +276,8 @@ def utilities_near_end_of_kind(experiment, left_out, sd_mm):
     posterior = replace(posterior, particles=(replace(particles, weighted=weighted),))
     readings = (Reading(35.0, Pose(500.0, 170.0), 8.0), Reading(35.0, Pose(500.0, 350.0), 16.0))
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmReachAndTravel.from_instrument(arm, experiment.grid)
-    of = predict_readings_and_utilities(experiment, weighted, theta[:20], field, at=readings[-1], goal=experiment.goal)
+        reach = ArmReachAndTravel.from_instrument(arm, experiment.grid)
+    of = predict_readings_and_utilities(experiment, weighted, theta[:20], reach, at=readings[-1], goal=experiment.goal)
     return of[1], utilities_near_end(experiment, posterior, *of, readings, rng=rng)
 
 
@@ -285,12 +285,12 @@ def utilities_near_end_of_kind(experiment, left_out, sd_mm):
 def test_far_from_the_end_the_plain_sensor_chooses_until_it_is_surely_incomplete(doubting, left_out):
     plain, there = utilities_near_end_of_kind(doubting, left_out, (90.0, 90.0, 9.0))
     assert (there is plain) == (left_out == "")
-    assert there.label == (INFORMATION if left_out else plain.label)
+    assert there.label == (INFORMATION_LABEL if left_out else plain.label)
 
 
 @pytest.mark.parametrize(
     ("sd_mm", "what"),
-    [((30.0, 30.0, 9.0), INFORMATION), ((6.0, 1.0, 1.0), ENDS)],
+    [((30.0, 30.0, 9.0), INFORMATION_LABEL), ((6.0, 1.0, 1.0), ENDS_RUN_LABEL)],
     ids=["far from the end", "near the end"],
 )
 def test_near_the_end_repeats_are_worth_more_than_one_reading(doubting, sd_mm, what):
@@ -326,8 +326,8 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
         return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
-    np.testing.assert_allclose(last.arm_error.slopes, slopes(last.kinds.with_raised_fault_odds()))
-    assert not np.allclose(last.arm_error.slopes, slopes(last.kinds))
+    np.testing.assert_allclose(last.arm_error.slopes, slopes(last.by_kind.with_raised_left_out_odds()))
+    assert not np.allclose(last.arm_error.slopes, slopes(last.by_kind))
 
 
 @pytest.mark.parametrize(("angles_deg", "asked_deg"), [((0, 20, 40), 200), ((0, 120, 240), None), ((0, 180), None)])
@@ -340,23 +340,21 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     inside = Reading(60.0, Pose(x - 0.6 * radius, y), 0.0)
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
-    utility_input, _ = predict_readings_and_utilities(
-        doubting, joined, joined.theta[:20], field, at=inside, goal=doubting.goal
+        reach = ArmReachAndTravel.from_instrument(arm, doubting.grid)
+    inputs, _ = predict_readings_and_utilities(
+        doubting, joined, joined.theta[:20], reach, at=inside, goal=doubting.goal
     )
     missing = [
         replace(r, value=math.nan, pose=Pose(2 * x - r.pose.x_mm, 2 * y - r.pose.y_mm)) for r in on_edge
     ]  # on the far side, without a value
-    far, shows_it = far_side(
-        utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge, *missing)
-    )
+    far, shows_it = far_side(inputs, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge, *missing))
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
     tried = np.concatenate([opposite, [[x, y]]])
     assert shows_it(tried).tolist() == ([True, False, False] if asked_deg else [True, True, True])
     if asked_deg is None:
         assert far is None
         return
-    place = doubting.grid.places_mm[utility_input.rows[far] % doubting.grid.n_places]
+    place = doubting.grid.places_mm[inputs.rows[far] % doubting.grid.n_places]
     asked = x + radius * math.cos(math.radians(asked_deg)), y + radius * math.sin(math.radians(asked_deg))
     assert np.hypot(*(place - asked)) < 12.0
 
@@ -388,7 +386,7 @@ def test_an_effect_that_a_diagnosis_left_open_is_held_once_a_run_finds_it(sensor
     mended = repaired_sensor(open_, info, rng=np.random.default_rng(1))
     assert mended.effects == ("nonlinearity", "saturation")
     assert not mended.absent
-    found = info.kinds.particles[[kind.left_out for kind in info.kinds.kinds].index("saturation")].weighted
+    found = info.by_kind.particles[[kind.left_out for kind in info.by_kind.kinds].index("saturation")].weighted
     assert mended.mean()["saturation.level"] == pytest.approx(found.mean()[-2], rel=0.1)
     assert type(sensor).from_json(mended.to_json()).effects == mended.effects
 
@@ -424,7 +422,7 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     ]
     known = [step.number for step in steps if step.largest_sd_mm < 4.0 and step.chance_off < 0.01]
     assert [step.number for step in steps if step.checks_sensor] == known[:-1]
-    assert steps[-1].map.label == NAMES
+    assert steps[-1].map.label == LEFT_OUT_LABEL
     assert steps[-1].map.highest_utility < ENOUGH_BITS
     assert left_out_after_step(steps[-1], 0.9).credible_set == ("ambient_step",)
     assert np.abs(steps[-1].mean - trial.true_circle_in_arm_frame).max() < 2.0
@@ -579,9 +577,9 @@ def test_play_of_each_axis_is_so_after_the_file_of_the_repaired_sensor_too(doubt
     kept = np.array([kind.left_out != "backlash" or k == of_axes for k, kind in enumerate(doubting.kinds)])
     particles = tuple(
         replace(p, weighted=replace(p.weighted, log_z=p.weighted.log_z if keep else -40.0))
-        for p, keep in zip(info.kinds.particles, kept, strict=True)
+        for p, keep in zip(info.by_kind.particles, kept, strict=True)
     )
-    info = replace(info, kinds=replace(info.kinds, particles=particles))
+    info = replace(info, by_kind=replace(info.by_kind, particles=particles))
     write_sensor(repaired_sensor(sensor, info, rng=np.random.default_rng(1)), tmp_path / "sensor.json")
     read = read_sensor(tmp_path / "sensor.json")
     plan = Plan.from_arrays(x_mm=[0.0, 3.0], y_mm=[0.0, 4.0], patterns=Uniform(0.5), unit="LEGO")
@@ -596,15 +594,15 @@ def test_play_of_each_axis_is_so_after_the_file_of_the_repaired_sensor_too(doubt
 def test_what_changed_since_the_calibration_is_in_the_levels_of_the_repaired_sensor(sensor, stepped):
     for name, dark, bright in (("dark_level", 4.0, 4.0), ("gain", 0.0, -4.7)):
         info = leading(stepped[-1], name)
-        which = [kind.left_out for kind in info.kinds.kinds].index(name)
-        found = info.kinds.particles[which].weighted
+        which = [kind.left_out for kind in info.by_kind.kinds].index(name)
+        found = info.by_kind.particles[which].weighted
         theta = found.theta.copy()
         theta[:, -1] = 4.0 if name == "dark_level" else -0.1
         particles = [
             replace(p, weighted=replace(found, theta=theta)) if k == which else p
-            for k, p in enumerate(info.kinds.particles)
+            for k, p in enumerate(info.by_kind.particles)
         ]
-        info = replace(info, kinds=replace(info.kinds, particles=tuple(particles)))
+        info = replace(info, by_kind=replace(info.by_kind, particles=tuple(particles)))
         before, after = sensor.mean(), repaired_sensor(sensor, info, rng=np.random.default_rng(1)).mean()
         assert after["I_min"] - before["I_min"] == pytest.approx(dark)
         assert after["I_max"] - before["I_max"] == pytest.approx(bright, rel=0.02)

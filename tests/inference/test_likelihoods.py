@@ -13,7 +13,7 @@ from scipy.stats import norm, rankdata
 
 from probewise._arrays import logsumexp
 from probewise.errors import ParameterError, ShapeError
-from probewise.experiment.stopping import mean_ranks
+from probewise.experiment.judgement import mean_ranks
 from probewise.inference import (
     GaussianKnown,
     Naive,

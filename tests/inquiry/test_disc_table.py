@@ -115,12 +115,12 @@ def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
     bits = []
     for scale, noise_sd in ((1.0, 0.05), (1000.0, 0.5)):
         model = Chain(mixture, FixedLevels(10.0 * scale, 60.0 * scale), HypothesisScene(circle))
-        utility_input = UtilityInput(
+        inputs = UtilityInput(
             forecast_of(model), Readout(noise_sd), theta, np.full(200, 1 / 200), theta, Designs(grid),
             Designs(grid).plan("field"), np.arange(grid.n_places), np.ones(grid.n_places),
         )  # fmt: skip
-        assert len(utility_input.predictive.levels) == MOST_LEVELS
-        bits.append(utility_input.information(utility_input.weight))
+        assert len(inputs.predictive.levels) == MOST_LEVELS
+        bits.append(inputs.information(inputs.weight))
     # A hundred times less noise tells no less anywhere, and what 200 circles can tell bounds both.
     assert (bits[1] > bits[0] - 0.05).all()
     assert bits[1].max() <= np.log2(200)

@@ -23,7 +23,7 @@ from probewise.inquiry import (
     utility_map,
     utility_named,
 )
-from probewise.inquiry.utilities import _probability_of_ending
+from probewise.inquiry.utilities import _probability_of_reaching_target
 
 APART = [[0.0, 0.0, 0.0], [0.0, 40.0, 40.0], [0.0, 0.0, 80.0], [0.0, 40.0, 120.0]]
 """Four hypotheses: the first place tells nothing, the second one bit, the third all two."""
@@ -48,8 +48,8 @@ def test_predictions_nearer_than_the_noise_tell_what_quadrature_says(made):
 
 def test_repeats_tell_more_and_never_more_than_all_there_is(made):
     table = np.random.default_rng(4).normal(0.0, 1.0, (30, 6))
-    utility_input = made.listed(table, step=None, repeats=(1, 4, 16))
-    once, four, sixteen = InformationGain()(utility_input).reshape(3, 6)
+    inputs = made.listed(table, step=None, repeats=(1, 4, 16))
+    once, four, sixteen = InformationGain()(inputs).reshape(3, 6)
     assert (once < four).all()
     assert (four < sixteen).all()
     assert (sixteen <= log2(30)).all()
@@ -64,9 +64,9 @@ def test_information_about_a_label_leaves_the_rest_out(made):
 
 
 def test_worth_a_second_prefers_the_near_place(made):
-    utility_input = made.listed(APART, cost_s=[1.0, 1.0, 4.0])
-    np.testing.assert_allclose(PerSecond()(utility_input), InformationGain()(utility_input) / [1.0, 1.0, 4.0])
-    assert int(np.argmax(PerSecond()(utility_input))) == 1
+    inputs = made.listed(APART, cost_s=[1.0, 1.0, 4.0])
+    np.testing.assert_allclose(PerSecond()(inputs), InformationGain()(inputs) / [1.0, 1.0, 4.0])
+    assert int(np.argmax(PerSecond()(inputs))) == 1
     with pytest.raises(ParameterError, match="cost_s"):
         PerSecond()(made.listed(APART, cost_s=[0.0, 1.0, 1.0]))
 
@@ -108,7 +108,7 @@ class Given:
     values: np.ndarray
     label: str = "given"
 
-    def __call__(self, utility_input):
+    def __call__(self, inputs):
         return self.values
 
 
@@ -146,19 +146,19 @@ def test_unknown_names_list_those_that_are_known(made):
 def narrow(made, goal, *, sd=6.0, seed=0):
     """An input near the end: a disc known to a few millimetres."""
     theta = np.array([500.0, 250.0, 80.0]) + sd * np.random.default_rng(seed).standard_normal((600, 3))
-    utility_input = made.over_discs(made.chain(20), theta, grid=Grid(n_x=131, n_y=65))
-    return replace(utility_input, goal=goal)
+    inputs = made.over_discs(made.chain(20), theta, grid=Grid(n_x=131, n_y=65))
+    return replace(inputs, goal=goal)
 
 
 def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
     """Only the radius is asked for, and it is unknown by little more than allowed."""
     goal = Goal((2,), 5.0)
-    utility_input = narrow(made, goal)
-    chance = Finishing()(utility_input)
+    inputs = narrow(made, goal)
+    chance = Finishing()(inputs)
     assert chance.max() > 0.25
     assert chance.max() <= 1.0
     best = int(chance.argmax())
-    assert chance[best] == pytest.approx(by_importance(made, utility_input, goal, best), abs=0.06)
+    assert chance[best] == pytest.approx(by_importance(made, inputs, goal, best), abs=0.06)
 
 
 def test_four_readings_end_a_run_as_one_of_half_the_noise_does(made):
@@ -166,18 +166,20 @@ def test_four_readings_end_a_run_as_one_of_half_the_noise_does(made):
     each = replace(near, readout=Readout(2.0), designs=replace(near.designs, repeats=(4,)))
     designs = np.arange(0, len(near.rows), 500)
     np.testing.assert_allclose(
-        _probability_of_ending(each, each.goal, designs), _probability_of_ending(near, near.goal, designs), atol=1e-9
+        _probability_of_reaching_target(each, each.goal, designs),
+        _probability_of_reaching_target(near, near.goal, designs),
+        atol=1e-9,
     )
 
 
-def by_importance(made, utility_input, goal, design, n=4000):
+def by_importance(made, inputs, goal, design, n=4000):
     """Draw readings from every hypothesis, reweigh all by each, count how often the sds are small enough."""
-    level = made.chain(20).predict(utility_input.theta, utility_input.plan.take(np.array([design])))[:, 0]
+    level = made.chain(20).predict(inputs.theta, inputs.plan.take(np.array([design])))[:, 0]
     rng = np.random.default_rng(1)
     reading = rng.choice(level, n) + rng.standard_normal(n)
     weight = np.exp(-0.5 * (reading[:, None] - level) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    lengths = utility_input.theta[:, goal.columns]
+    lengths = inputs.theta[:, goal.columns]
     spread = weight @ lengths**2 - (weight @ lengths) ** 2
     return (spread < goal.sd**2).all(axis=1).mean()
 

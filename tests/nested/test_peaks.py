@@ -133,7 +133,7 @@ def test_the_top_of_a_bent_peak_is_met_to_a_hundredth_of_a_nat() -> None:
     start = peak_of_last_live_points(run, evaluate)
     top = climb_to_top(start, evaluate, max_calls=run.n_calls, rng=np.random.default_rng(2))
     best = known.log_likelihood(np.ones((1, 2)))[0]
-    assert best - 0.01 < top.height <= best + 1e-9
+    assert best - 0.01 < top.log_likelihood <= best + 1e-9
     assert evaluate.n_calls < run.n_calls / 5
 
 

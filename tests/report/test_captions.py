@@ -18,8 +18,8 @@ from probewise.calibration import predict
 from probewise.experiment import (
     Experiment,
     Exploration,
+    estimated_shape,
     explore,
-    found_shape,
     probability_of_length_off,
     result_json,
     samples_csv,
@@ -118,7 +118,7 @@ def test_the_page_of_a_search_names_no_colour_that_is_not_there(run, frames):
 def test_the_page_of_a_search_gives_the_shape_with_its_errors_and_what_it_cost(run, frames):
     page = exploration.page_html(run, frames, seed=4, model="ssf", truth={"x_mm": 600.0, "y_mm": 260.0})
     text = re.sub("<[^>]+>", " ", page)
-    found = found_shape(run)
+    found = estimated_shape(run)
     for parameter in found.parameters:
         assert parameter.name.removesuffix("_mm") in text
     assert f"{run.seconds:.0f} s of arm time" in text

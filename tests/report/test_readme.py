@@ -12,6 +12,7 @@ from probewise import experiment
 from probewise.cli import main
 from probewise.diagnosis import diagnose, generators_of_diagnosis
 from probewise.experiment import loop
+from probewise.experiment.judgement import is_target_reached
 from probewise.recordings import read_recording, shipped
 from probewise.report.words import typeset_numbers
 
@@ -44,7 +45,7 @@ def test_the_printed_loop_is_the_one_that_the_robot_runs(monkeypatch):
     taken = [(r.pose, r.value) for r in printed["state"].readings]
     assert [(s.reading.pose, s.reading.value) for s in steps] == taken[:4]
     last = printed["info"]
-    assert printed["asked"].may_stop(last.sd, last.shapes)
+    assert is_target_reached(printed["asked"], last.sd, last.shapes)
     assert abs((last.mean - [600.0, 260.0, 90.0]) / last.sd).max() < 4
 
 

@@ -1,4 +1,4 @@
-"""Instruments that take readings: one interface, a simulated arm and the LEGO arm (paper, "Robotic Arm Test Bed")."""
+"""Instruments that take readings: one interface, a simulated arm and the LEGO arm (paper, section 2.1)."""
 
 from probewise.arm.carry_out import RequestToPerson, carry_out, readings_of_recording, recording_of_readings
 from probewise.arm.geometry import Geometry, Joint

@@ -1,10 +1,10 @@
-"""Execution of a plan by an arm, row by row; a person turns the sensor and changes the pattern."""
+"""Execution of a plan by an arm, row by row, with a person who turns the sensor and changes the pattern; recordings."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,13 @@ from probewise.arm.lego import LegoArm
 from probewise.arm.own import Measures, OwnInstrument, as_instrument
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
-from probewise.recordings.patterns import Uniform, where_white_in_words
-from probewise.recordings.plan import Plan, Recording
+from probewise.recordings.patterns import Pattern, Uniform, where_white_in_words
+from probewise.recordings.plan import Instrumentation, Plan, Recording
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
 BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
+PATTERN = "field"  # under readings of no plan
 
 
 class RequestToPerson(str):
@@ -148,15 +149,15 @@ def _measure_row(
 def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """Build a recording of the plan's first rows, with the readings' own places, orientations, times and covariates.
 
-    `readings` are those of its first rows, one or more, as `carry_out` yields them. A covariate that a reading lacks is
-    the planned one, or NaN if none is planned. `Plan.sessions` is left out.
+    `readings` are those of its first rows, as `carry_out` yields them. The height of a pose is the covariate
+    `height_mm`, unless the reading has its own. A covariate that a reading lacks is the planned one, or NaN if none is
+    planned. `Plan.sessions` is left out.
     """
-    rows = plan.take(np.arange(len(readings)))
+    rows, known = plan.take(np.arange(len(readings))), [covariates_with_height(reading) for reading in readings]
     covariates = dict(rows.covariates)
-    for name in sorted({name for reading in readings for name in reading.covariates}):
+    for name in sorted({name for own in known for name in own}):
         planned = rows.covariates.get(name, np.full(len(readings), math.nan)).tolist()
-        own = [reading.covariates.get(name, usual) for reading, usual in zip(readings, planned, strict=True)]
-        covariates[name] = np.array(own)
+        covariates[name] = np.array([own.get(name, usual) for own, usual in zip(known, planned, strict=True)])
     there: dict[str, Any] = {
         name: np.array([getattr(reading.pose, name) for reading in readings])
         for name in ("x_mm", "y_mm", "orientation_rad")
@@ -164,6 +165,30 @@ def recording_of_readings(plan: Plan, readings: Sequence[Reading]) -> Recording:
     time_s = np.array([reading.time_s for reading in readings])
     taken = dataclasses.replace(rows, **there, time_s=time_s, covariates=covariates, sessions=())
     return Recording(taken, np.array([reading.value for reading in readings]))
+
+
+def recording_of(
+    readings: Sequence[Reading],
+    *,
+    patterns: Mapping[str, Pattern] | None = None,
+    instrumentation: Instrumentation | None = None,
+    source: str = "",
+) -> Recording:
+    """Convert readings of no plan, in order of time, to a recording of one scan over the pattern "field".
+
+    Covariates are as by `recording_of_readings`. `patterns` is the pattern on the field, {"field": ...}, if known;
+    otherwise hypotheses take its place. `source` names the readings in messages.
+    """
+    none, zeros = np.zeros(len(readings)), np.zeros(len(readings), dtype=np.int64)
+    under, of_sensor = patterns or {}, instrumentation or Instrumentation()
+    plan = Plan(none, none, none, none, zeros, (PATTERN,), zeros, (PATTERN,), under, instrumentation=of_sensor)
+    return dataclasses.replace(recording_of_readings(plan, readings), source=source)
+
+
+def covariates_with_height(reading: Reading) -> Mapping[str, float]:
+    """Return a reading's covariates; `height_mm` is the pose's, if the pose has one and the covariates have none."""
+    height_mm = reading.pose.height_mm
+    return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}
 
 
 def readings_of_recording(recording: Recording) -> list[Reading]:

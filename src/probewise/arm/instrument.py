@@ -1,4 +1,4 @@
-"""Instruments: poses, readings, interface, places within reach (paper, section "Robotic Arm Test Bed")."""
+"""Instruments: poses, readings, interface, places within reach (paper, section 2.1)."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Instrument(Protocol):
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,).
+        """Return the orientation at places, (n_places, 2), of a sensor that is not turned: (n_places,).
 
         For an arm that turns its sensor only with its base, this is the only possible orientation.
         """
@@ -146,7 +146,7 @@ class Workspace(ReachablePlaces, Protocol):
         """Rest position (x, y) of the sensor."""
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the sensor's own orientation at places, (n_places, 2), to which a design's is added: (n_places,)."""
+        """Return the orientation at places, (n_places, 2), of a sensor that is not turned: (n_places,)."""
 
 
 def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:

@@ -1,8 +1,7 @@
 """Calibrate a sensor's spatial sensitivity function (SSF) from a recording.
 
-The evidence gives its number of Gaussians N (the order), the posterior mean its field. Paper, sections "Estimating SSF
-MoG Model Parameters" and "Light Sensor SSF MoG Model": eqs. "Evidence1" and "studentT", the table of log evidences, and
-the weighted mean of sampled SSF fields.
+The evidence gives its number of Gaussians N (the order), the posterior mean its field. Paper, sections 2.7
+(evidence, eq. 18; likelihood, eq. 19 and 20; weighted mean of sampled SSF fields) and 3.1 (table of log evidences).
 """
 
 from probewise.calibration.fields import (

@@ -1,6 +1,6 @@
 """What a posterior says of the spatial sensitivity function (SSF): its moments, and its mean as a field.
 
-Paper, section on MoG estimation: the weighted mean of sampled SSF fields.
+Paper, section 2.7: the weighted mean of sampled SSF fields.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ def calibrate(
     refined: bool = True,
     executor: Executor | None = None,
 ) -> Calibration:
-    """Fit SSFs of several orders to a recording and compare their evidences (paper, section on MoG estimation).
+    """Fit SSFs of several orders to a recording and compare their evidences (paper, section 2.7).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Predict the readings of any plan with a fitted sensor (paper, eq. "modelI" and its figure of predicted readings)."""
+"""Predict the readings of any plan with a fitted sensor (paper, eq. 7 and its figure of predicted readings)."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class FittedSensor(NamedSamples):
     noise_sd
         Noise sd of a reading in a new scan for each sample, pooled over scans, (n_samples,).
     field
-        Posterior mean of the SSF fields: the paper's discrete SSF (eq. "discreteR"). The robot uses `mean_mixture()`.
+        Posterior mean of the SSF fields: the paper's discrete SSF (eq. 9). The robot uses `mean_mixture()`.
     effects
         Names of the effects in the model, in the order of their columns.
     forms, patterns

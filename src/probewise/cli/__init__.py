@@ -1,6 +1,6 @@
 """The command line `probewise`: the options of all verbs are in `_options`, what a verb does in the file of its name.
 
-The steps of the paper as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
+The steps of the paper as commands: `calibrate` (section 2.7, the SSF from a recording), `explore`
 (sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can detect), `diagnose` (what the model leaves out),
 `predict` (eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once. Beyond the paper:
 `investigate` takes the readings that a diagnosis advises, `fit` fits a user's simulator, `study` and `challenge`

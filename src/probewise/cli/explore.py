@@ -26,7 +26,7 @@ from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descripti
 from probewise.cli._options import parse_numbers
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
-from probewise.experiment import Experiment, Exploration, HiddenShape, Model, Step, read_journal
+from probewise.experiment import Experiment, Exploration, HiddenShape, ModelName, Step, read_journal
 from probewise.inference import Naive
 from probewise.progress import Progress
 from probewise.recordings import read_recording, shipped, write_bytes_atomically
@@ -148,7 +148,7 @@ class Search:
         cards = parse_cards(arguments.reference, self.field)
         levels = self._naive_levels()
 
-        def pose(model: Model, **more: Any) -> Experiment:
+        def pose(model: ModelName, **more: Any) -> Experiment:
             return experiments.experiment_for(
                 self.sensor,
                 shape,
@@ -164,7 +164,7 @@ class Search:
                 **more,
             )
 
-        self.model: Model = arguments.model
+        self.model: ModelName = arguments.model
         self.experiment = pose(
             self.model,
             learn_sensor=arguments.learn_sensor,
@@ -176,7 +176,7 @@ class Search:
         if self.as_built is not None and self.as_built.accuracy is not None:
             fitted_arm = experiments.FittedArm.from_geometry_and_sensor(self.as_built, self.sensor)
             self.experiment = replace(self.experiment, fitted_arm=fitted_arm)
-        self.other_model: Model = "naive" if self.model == "ssf" else "ssf"
+        self.other_model: ModelName = "naive" if self.model == "ssf" else "ssf"
         self.other = pose(self.other_model, trust=1.0) if arguments.both_models else None
 
     def _shipped_sensor(self) -> FittedSensor:

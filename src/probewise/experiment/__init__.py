@@ -1,5 +1,6 @@
 """The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
+from probewise.arm.carry_out import recording_of
 from probewise.experiment.from_sensor import (
     TRUST,
     MethodName,
@@ -7,7 +8,8 @@ from probewise.experiment.from_sensor import (
     naive_levels_from_recording,
     naive_levels_from_world,
 )
-from probewise.experiment.journal import Journal, JournalWriter, read_journal, recording_of
+from probewise.experiment.journal import Journal, JournalWriter, read_journal
+from probewise.experiment.judgement import least_readings, probability_of_length_off
 from probewise.experiment.loop import begin, explore, run_from_place, shadow_run, step
 from probewise.experiment.method import Method, NestedSampling, SequentialMonteCarlo
 from probewise.experiment.paper import find_shape
@@ -15,7 +17,7 @@ from probewise.experiment.result import (
     CLEAN,
     Exploration,
     Step,
-    found_shape,
+    estimated_shape,
     left_out_after_step,
     repaired_sensor,
     result_json,
@@ -24,7 +26,7 @@ from probewise.experiment.result import (
 from probewise.experiment.setup import Experiment, FittedArm
 from probewise.experiment.simulated import (
     HiddenShape,
-    Model,
+    ModelName,
     RandomStreams,
     Truth,
     arm_over,
@@ -35,7 +37,6 @@ from probewise.experiment.simulated import (
     with_cards,
     world_like,
 )
-from probewise.experiment.stopping import least_readings, probability_of_length_off
 
 __all__ = [
     "CLEAN",
@@ -48,7 +49,7 @@ __all__ = [
     "JournalWriter",
     "Method",
     "MethodName",
-    "Model",
+    "ModelName",
     "NestedSampling",
     "RandomStreams",
     "SequentialMonteCarlo",
@@ -57,10 +58,10 @@ __all__ = [
     "arm_over",
     "as_shape",
     "begin",
+    "estimated_shape",
     "experiment_for",
     "explore",
     "find_shape",
-    "found_shape",
     "geometry_entry",
     "least_readings",
     "left_out_after_step",

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.arm.geometry import FITTED, Accuracy, Geometry, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.errors import require
-from probewise.experiment.kinds import HypothesisKind, Posterior
+from probewise.experiment.kinds import HypothesisKind, PosteriorByKind
 from probewise.experiment.setup import Experiment
 from probewise.inference.problem import checked_log_prob
 from probewise.recordings.plan import Recording
@@ -56,7 +56,7 @@ def arm_error_in_posterior(
     experiment: Experiment,
     readings: Sequence[Reading],
     theta: FloatArray,
-    kinds: Posterior,
+    by_kind: PosteriorByKind,
     *,
     mean: FloatArray,
     sd: FloatArray,
@@ -65,7 +65,7 @@ def arm_error_in_posterior(
 ) -> ArmError | None:
     """Compute by how much the error of the arm's geometry moves and widens the posterior of the shape; None: not known.
 
-    `theta` (n_samples, n_params) are samples of the shape given the readings, `kinds` the same posterior kind by kind;
+    `theta` (n_samples, n_params) are samples of the shape given the readings, `by_kind` is the same posterior by kind;
     `mean`, `sd` (n_params,) and `likely_shape` are as in `Step`. ParameterError if the arm does not reach a reading.
     """
     arm = experiment.fitted_arm
@@ -85,7 +85,7 @@ def arm_error_in_posterior(
     # From here on what the light does stands for the height: the share by which light above black rises.
     off[:, 2] *= -falls
     slopes = _posterior_mean_shifts(
-        experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
+        experiment, by_kind, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
     )
     shifts = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
@@ -115,7 +115,7 @@ def _covariance_factor(covariance: FloatArray) -> FloatArray:
 
 def _posterior_mean_shifts(
     experiment: Experiment,
-    posterior: Posterior,
+    by_kind: PosteriorByKind,
     recording: Recording,
     off: FloatArray,
     dark: float,
@@ -127,19 +127,19 @@ def _posterior_mean_shifts(
     """Return the shift of the likely shape's posterior mean by each error of one sd, (n_params, n_errors)."""
     n_sensor = int(experiment.shape_columns[0])
     likely, columns = shape_and_columns(experiment.shape, likely_shape)
-    own = np.arange(n_sensor, n_sensor + len(columns))
+    of_shape = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
-    kinds = zip(posterior.kinds, posterior.particles, posterior.probability.tolist(), strict=True)
+    kinds = zip(by_kind.kinds, by_kind.particles, by_kind.probability.tolist(), strict=True)
     for kind, particles, probability in kinds:
         if probability < _LEAST or kind.shape not in ("", likely_shape):
             continue
         some = particles.weighted.weight > 0
         theta = particles.weighted.theta[some].copy()
-        theta[:, own] = with_angles_near(likely, theta[:, own], mean[columns])
-        thetas.append(theta[:, own])
+        theta[:, of_shape] = with_angles_near(likely, theta[:, of_shape], mean[columns])
+        thetas.append(theta[:, of_shape])
         weights.append(probability * particles.weighted.weight[some])
         by_error.append(_log_likelihood_slopes_by_error(kind, theta, recording, off, dark))
-        by_shape.append(_log_likelihood_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
+        by_shape.append(_log_likelihood_slopes_by_shape(kind, theta, recording, of_shape, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
     theta, slope, known = (each - weight @ each for each in map(np.concatenate, (thetas, by_error, by_shape)))

@@ -20,7 +20,7 @@ from probewise.experiment.method import NestedSampling
 from probewise.experiment.paper import least_sd, student_t_likelihood
 from probewise.experiment.rivals import OF_MOTION, DescribedEffect, FromRest
 from probewise.experiment.setup import Experiment
-from probewise.experiment.simulated import Model, scale_of
+from probewise.experiment.simulated import ModelName, scale_of
 from probewise.inference import Naive, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import Finishing, Grid, ReadingEntropy, Utility, utility_named
@@ -50,7 +50,7 @@ MethodName: TypeAlias = Literal["particles", "paper"]
 TRUST = 0.9
 """Default prior probability that a sensor model is complete."""
 
-_METHODS, _MODELS = get_args(MethodName), get_args(Model)
+_METHODS, _MODELS = get_args(MethodName), get_args(ModelName)
 _NO_HEIGHT = "none with this sensor: its description does not say at which height_mm it was calibrated"
 _CELLS_PER_SD = 8.0  # cells per noise sd for unrounded readings
 _PAPER_GAUSSIANS = 32  # of the mean of the sampled fields
@@ -70,7 +70,7 @@ def experiment_for(
     field: Field,
     *,
     method: MethodName = "particles",
-    model: Model = "ssf",
+    model: ModelName = "ssf",
     utility: str | Utility | None = None,
     learn_sensor: bool = False,
     batch: int = 1,
@@ -201,7 +201,7 @@ def _model_and_likelihood(
     scale: ReadingScale,
     naive: Naive | None,
     *,
-    model: Model,
+    model: ModelName,
     paper: bool,
     learn_sensor: bool,
     doubted: bool,

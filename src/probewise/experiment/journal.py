@@ -1,6 +1,6 @@
 """The journal of a run: one JSON line per measurement, on disk before the next one is taken.
 
-Format "journal/1". The first line holds the settings: field, shape, model, likelihood, fingerprint of the sensor, seed,
+Format "journal/1". The first line holds the settings: field, shape, model, likelihood, digest of the sensor, seed,
 options. Every further line is a measurement: index, pose, time, reading and covariates, then the posterior after it
 (mean and sd of each parameter, bits gained) and the next pose.
 
@@ -28,20 +28,20 @@ import numpy as np
 
 from probewise._kinds import checked_path
 from probewise._writing import hold_lock, write_and_sync, write_text_atomically
+from probewise.arm.carry_out import recording_of
 from probewise.arm.instrument import Pose, Reading
 from probewise.effects import Effect, NoiseEffect
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.io import parse_json_file_text, read_bytes
 from probewise.recordings.patterns import Pattern
-from probewise.recordings.plan import Instrumentation, Plan, Recording
+from probewise.recordings.plan import Instrumentation, Recording
 
 FORMAT = "journal/1"
-PATTERN = "field"
 _SUMMARY_KEY = ', "belief": '
 # Settings in which a resumed run may differ: files may have moved, and an arm may have another name.
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
-# Settings that journals of earlier versions lack.
-_LATER = frozenset({"geometry_sha256"})
+# Settings that are compared only if the journal has them.
+_OPTIONAL = frozenset({"geometry_sha256"})
 _EFFECT, _WITH_EFFECTS = b"<effect>", "effects-"
 _DIGESTED = {
     "sensor": "another sensor model, or other cards",
@@ -97,44 +97,6 @@ class Journal:
     ) -> Recording:
         """Convert the readings to a recording over the pattern "field"; see `recording_of`."""
         return recording_of(self.readings, patterns=patterns, instrumentation=instrumentation, source=self.path)
-
-
-def recording_of(
-    readings: Sequence[Reading],
-    *,
-    patterns: Mapping[str, Pattern] | None = None,
-    instrumentation: Instrumentation | None = None,
-    source: str = "",
-) -> Recording:
-    """Convert readings, in order of time, to a recording of one scan over the pattern "field".
-
-    The height of a pose is the covariate `height_mm`, unless the reading has its own; a covariate that some readings
-    lack is NaN there. `patterns` is the pattern on the field, {"field": ...}, if known; otherwise hypotheses take its
-    place. `source` names the readings in messages.
-    """
-    covariates = [covariates_with_height(reading) for reading in readings]
-    names = sorted({name for known in covariates for name in known})
-    zeros = np.zeros(len(readings), dtype=np.int64)
-    plan = Plan(
-        x_mm=np.array([reading.pose.x_mm for reading in readings]),
-        y_mm=np.array([reading.pose.y_mm for reading in readings]),
-        orientation_rad=np.array([reading.pose.orientation_rad for reading in readings]),
-        time_s=np.array([reading.time_s for reading in readings]),
-        scan=zeros,
-        scan_names=(PATTERN,),
-        pattern=zeros,
-        pattern_names=(PATTERN,),
-        patterns={} if patterns is None else patterns,
-        covariates={name: np.array([known.get(name, math.nan) for known in covariates]) for name in names},
-        instrumentation=Instrumentation() if instrumentation is None else instrumentation,
-    )
-    return Recording(plan, np.array([reading.value for reading in readings]), source)
-
-
-def covariates_with_height(reading: Reading) -> Mapping[str, float]:
-    """Return a reading's covariates; `height_mm` is the pose's, if the pose has one and the covariates have none."""
-    height_mm = reading.pose.height_mm
-    return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}
 
 
 def read_journal(path: str | Path) -> Journal:
@@ -255,12 +217,11 @@ def _pose_as_json(pose: Pose) -> dict[str, float]:
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
     """Raise FileError with every setting in which a journal differs from the run that would resume it.
 
-    Version, arm, spawn key and the name of the sensor's file may differ. The arm's geometry is compared only if the
-    journal has it, since those of earlier versions do not. Nor do they name effects in the digest of a model with some:
-    then the sensor's file, which a journal names by its own digest, and all other settings have to be the same.
+    Version, arm, spawn key and the name of the sensor's file may differ. The arm's geometry, and the digest of a model
+    with effects, are compared only if the journal has them; without the latter the digest of the sensor's file counts.
     """
     there, here = _flattened_settings(journal.settings), _flattened_settings(json.loads(json.dumps(settings)))
-    compared = {*there, *here} - _FREE - {name for name in _LATER if name not in there}
+    compared = {*there, *here} - _FREE - {name for name in _OPTIONAL if name not in there}
     with_effects = {name for name, value in here.items() if str(value).startswith(_WITH_EFFECTS)}
     compared -= {name for name in with_effects if not str(there.get(name)).startswith(_WITH_EFFECTS)}
     different = sorted(name for name in compared if there.get(name) != here.get(name))
@@ -268,7 +229,7 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
         different = [name for name in different if name not in _OF_SENSOR]
     if different:
         plain = (f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
-        words = (_DIGESTED.get(name, told) for name, told in zip(different, plain, strict=True))
+        words = (_DIGESTED.get(name, text) for name, text in zip(different, plain, strict=True))
         raise FileError(
             journal.path,
             f"a run with other settings: {'; '.join(dict.fromkeys(words))}",
@@ -327,8 +288,8 @@ class JournalWriter:
             try:
                 file = FileIO(journal.path, "r+b")
             except OSError as error:
-                told = f"cannot be written ({error.strerror})"
-                raise FileError(journal.path, told, "a file you may write to") from error
+                found = f"cannot be written ({error.strerror})"
+                raise FileError(journal.path, found, "a file you may write to") from error
             with file:
                 if file.seek(0, os.SEEK_END) != journal.n_bytes + journal.n_torn:
                     raise FileError(journal.path, "another process has written to it", "to resume it once more")

@@ -1,7 +1,7 @@
 """The kinds of hypotheses that a run compares, and the posterior: a mixture of kinds, each with samples and evidence.
 
-A kind is a shape, with an effect that the sensor model leaves out or none. Its probability is proportional to its prior
-times its evidence. Improbable kinds are kept with fewer samples, so that later readings can revive them.
+A kind is a shape together with at most one effect that the sensor model leaves out. Its probability is proportional to
+its prior times its evidence. Improbable kinds are kept with fewer samples, so that later readings can revive them.
 """
 
 from __future__ import annotations
@@ -27,41 +27,43 @@ from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 
 IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
-_FEWER = 3  # times
-SUSPECTED = ((0.2, 2), (0.02, 4), (0.0, 6))  # probability from which on a rival has which fraction of the samples
+_IMPROBABLE_DIVISOR = 3  # of its number of samples
+SUSPECTED_PROBABILITY = 0.02  # of a left-out effect, below which its samples are few and moved only briefly
+# Least probability of a left-out effect, and the divisor of its number of samples.
+_SAMPLE_DIVISORS = ((0.2, 2), (SUSPECTED_PROBABILITY, 4), (0.0, 6))
 _LEAST_SAMPLES = 100
 
-FAULT_ODDS_FACTOR = 14.0
+LEFT_OUT_ODDS_FACTOR = 14.0
 """Factor on the odds that the sensor model is incomplete, wherever something is concluded: choice of readings, stopping
-rule, reported shape and its error, credible set. By the plain odds a fault that a dozen readings can hardly show would
-be right one time in ten, and whatever is concluded of a run that has it would miss."""
+rule, reported shape and its error, credible set. By the plain odds an effect that a dozen readings can hardly show
+would be left out in one run of ten, and every conclusion of such a run would miss it."""
 
 
 class KindProblem(SensorProblem):
     """The problem of one kind, for nested sampling and, reading by reading, for `inquiry.smc`."""
 
-    def predict(self, theta: FloatArray) -> FloatArray:
+    def evaluate(self, theta: FloatArray) -> FloatArray:
         """Predict all readings, (n_samples, n_params) -> (n_samples, n_points)."""
         return self.model.predict(theta, self.recording.plan)
 
-    def log_likelihoods(self, predicted: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-        """Return log likelihoods, (n_samples,), without (zero where `share` is 1) and with the last reading."""
+    def log_likelihoods(self, evaluated: FloatArray, power: float) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods, (n_samples,), without (zero where `power` is 1) and with the last reading."""
         usable, readings = self.recording.usable, self.recording.readings
-        earlier = usable & (share < 1.0)
+        earlier = usable & (power < 1.0)
         earlier[-1:] = False
         without, with_last = (
-            checked_log_prob(self.likelihood, readings[rows], predicted[:, rows])
+            checked_log_prob(self.likelihood, readings[rows], evaluated[:, rows])
             if rows.any()
-            else np.zeros(len(predicted))
+            else np.zeros(len(evaluated))
             for rows in (earlier, usable)
         )
         return without, with_last
 
-    def least_misfit_nats(self, predicted: FloatArray) -> float:
+    def least_misfit_nats(self, evaluated: FloatArray) -> float:
         """Return by how many nats the best prediction of the last reading misses it; 0 if that reading is missing."""
         if not self.recording.usable[-1]:
             return 0.0
-        best = checked_log_prob(self.likelihood, self.recording.readings[-1:], predicted[:, -1:]).max()
+        best = checked_log_prob(self.likelihood, self.recording.readings[-1:], evaluated[:, -1:]).max()
         return float(self.perfect_log_likelihood - best)
 
     @property
@@ -73,18 +75,18 @@ class KindProblem(SensorProblem):
 
 @dataclass(frozen=True, eq=False)
 class HypothesisKind:
-    """A model with its own parameters and evidence; one of several that a run compares.
+    """A shape together with at most one left-out effect; its samples and evidence are in `PosteriorByKind.particles`.
 
     Attributes
     ----------
     member
-        The model's shape, one of a set or the single one.
+        The shape, one of a set or the single one.
     left_out
         Name of the effect that the sensor model leaves out; "" if none.
     log_prior
-        Natural log of the model's prior probability.
+        Natural log of the kind's prior probability.
     prior, model, likelihood
-        Prior, model and likelihood of the model's own parameters.
+        Prior, sensor model and likelihood of the parameters of shape and effect.
     effect
         The effect left out, if it acts on the noise-free reading; its parameters are the last ones.
     """
@@ -99,27 +101,27 @@ class HypothesisKind:
 
     @property
     def shape(self) -> str:
-        """Name of the model's shape in a set of shapes; "" for a single shape."""
+        """Name of the shape in a set of shapes; "" for a single shape."""
         return self.member.label
 
     def at_pace(self, particles: Particles, before_s: float, now_s: float) -> Particles:
         """Return the samples of the same hypotheses where a paced second stands for another time.
 
-        `before_s` and `now_s` are the mean seconds per reading. The prior, which is of paced time, weighs them anew.
+        `before_s` and `now_s` are the mean seconds per reading. The prior, which is of paced time, reweights them.
         """
         powers = powers_of_s(self.effect)
         if before_s == now_s or not powers.any() or particles.log_z == -math.inf:
             return particles
-        had, factors = particles.weighted, (before_s / now_s) ** powers
-        theta = had.theta.copy()
+        weighted, factors = particles.weighted, (before_s / now_s) ** powers
+        theta = weighted.theta.copy()
         theta[:, -len(powers) :] *= factors
-        alive = np.isfinite(had.log_weight)
-        before, after = (np.where(alive, self.prior.log_prob(own), 0.0) for own in (had.theta, theta))
-        log_weight = had.log_weight + after - before + np.log(factors).sum()
+        alive = np.isfinite(weighted.log_weight)
+        before, after = (np.where(alive, self.prior.log_prob(values), 0.0) for values in (weighted.theta, theta))
+        log_weight = weighted.log_weight + after - before + np.log(factors).sum()
         gained = float(logsumexp(log_weight))
         if gained == -math.inf:
             return particles
-        moved = replace(had, theta=theta, log_weight=log_weight - gained, log_z=had.log_z + gained)
+        moved = replace(weighted, theta=theta, log_weight=log_weight - gained, log_z=weighted.log_z + gained)
         return replace(particles, weighted=moved)
 
     def problem(self, recording: Recording) -> KindProblem:
@@ -178,16 +180,16 @@ def _kind(
 
 
 def _prior_and_model_with_estimated_effects(
-    own: Prior, chain: SensorModel, quick: SensorModel
+    prior: Prior, chain: SensorModel, quick: SensorModel
 ) -> tuple[Prior, SensorModel]:
     """Return prior and model with parameters for the effects that a repair of the sensor estimated, if any."""
     estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
     if not estimated or not isinstance(chain, Chain):
-        return own, quick
+        return prior, quick
     informed = [effect.informed for effect in estimated]
     known = tuple(effect for effect in chain.effects if not isinstance(effect, Estimated))
     acting = replace(chain, effects=(*known, *informed))
-    both = Joint((own, *(_PrefixedPrior(effect.name, effect.prior) for effect in informed)))
+    both = Joint((prior, *(_PrefixedPrior(effect.name, effect.prior) for effect in informed)))
     return both, TabulatedChain.of(acting, quick) or acting
 
 
@@ -208,7 +210,7 @@ class _MemberShape:
     n_sensor: int
 
     def to_whole_theta(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return the experiment's parameters for own ones, (n, n_own); draw those missing, drop the effect's."""
+        """Return the experiment's parameters for the shape's, (n, n_own); draw those missing, drop the effect's."""
         if self.number is None:
             return theta[:, : len(self.columns)]
         u = rng.random((len(theta), len(self.whole.names)))
@@ -230,15 +232,15 @@ class _MemberShape:
 
 
 def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_MemberShape]:
-    """Return the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
+    """Return the shapes of a set, or the single shape, each with the sensor's parameters before the shape's."""
     if not isinstance(shape, AnyOf):
         return [_MemberShape("", 1.0, prior, prior, np.arange(len(prior.names)), number=None, n_sensor=0)]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
     parts = []
     for k, (name, member) in enumerate(shape.shapes.items()):
         columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns_by_shape[k]])
-        own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
-        parts.append(_MemberShape(name, shape.weights[k], own, prior, columns, number=k, n_sensor=n_sensor))
+        of_member = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
+        parts.append(_MemberShape(name, shape.weights[k], of_member, prior, columns, number=k, n_sensor=n_sensor))
     return parts
 
 
@@ -262,24 +264,24 @@ class _PrefixedPrior:
     """An effect's prior with parameter names as in a chain, "effect.parameter"."""
 
     effect: str
-    own: Prior
+    prior: Prior
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(f"{self.effect}.{name}" for name in self.own.names)
+        return tuple(f"{self.effect}.{name}" for name in self.prior.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        return self.own.from_unit_cube(u)
+        return self.prior.from_unit_cube(u)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        return self.own.to_unit_cube(theta)
+        return self.prior.to_unit_cube(theta)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        return self.own.log_prob(theta)
+        return self.prior.log_prob(theta)
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class PosteriorByKind:
     """The kinds of hypotheses and, in the same order, their weighted samples with the evidence."""
 
     kinds: tuple[HypothesisKind, ...]
@@ -320,11 +322,11 @@ class Posterior:
         """Index of the most probable kind."""
         return int(self.log_odds.argmax())
 
-    def with_raised_fault_odds(self) -> Posterior:
-        """Return the posterior with the odds of a left-out effect multiplied by `FAULT_ODDS_FACTOR`."""
+    def with_raised_left_out_odds(self) -> PosteriorByKind:
+        """Return the posterior with the odds of left-out effects multiplied by `LEFT_OUT_ODDS_FACTOR`."""
         if not self.doubts_sensor:
             return self
-        raised = math.log(FAULT_ODDS_FACTOR)
+        raised = math.log(LEFT_OUT_ODDS_FACTOR)
         log_prior = np.array([k.log_prior + (raised if k.left_out else 0.0) for k in self.kinds])
         log_prior -= logsumexp(log_prior)
         kinds = tuple(replace(k, log_prior=p) for k, p in zip(self.kinds, log_prior.tolist(), strict=True))
@@ -336,36 +338,36 @@ class Posterior:
             return self.particles[0].weighted
         probability = self.probability
         some = [k for k, p in enumerate(probability) if p > 0]
-        own = [self.particles[k].weighted for k in some]
-        theta = np.concatenate(
-            [self.kinds[k].member.to_whole_theta(w.theta, rng) for k, w in zip(some, own, strict=True)]
-        )
-        log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
+        parts = [self.particles[k].weighted for k in some]
+        members = [self.kinds[k].member for k in some]
+        theta = np.concatenate([m.to_whole_theta(w.theta, rng) for m, w in zip(members, parts, strict=True)])
+        log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, parts, strict=True)])
         weight = np.exp(log_weight)
         errors = np.array([self.particles[k].log_z_error for k in some])
         return Weighted(
             self.kinds[0].member.whole.names,
             theta,
-            log_likelihood=np.concatenate([w.log_likelihood for w in own]),
+            log_likelihood=np.concatenate([w.log_likelihood for w in parts]),
             log_weight=log_weight,
             log_z=self.log_z,
             log_z_error=float(np.sqrt(probability[some] ** 2 @ errors**2)),
             n_eff=float(weight.sum() ** 2 / (weight @ weight)),
             n_calls=sum(p.weighted.n_calls for p in self.particles),
-            pareto_k=max(w.pareto_k for w in own),
+            pareto_k=max(w.pareto_k for w in parts),
             run=self.particles[self.most_probable_kind_index].weighted.run,
         )
 
 
-def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
+def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: np.random.Generator) -> PosteriorByKind:
     """Return the posterior without readings: samples of every kind's prior, fewer for improbable kinds and rivals."""
     sizes = [n_samples_of_kind(kind, math.exp(kind.log_prior), n_particles) for kind in kinds]
     drawn = (prior_particles(kind.prior, n, rng=rng) for kind, n in zip(kinds, sizes, strict=True))
-    return Posterior(tuple(kinds), tuple(drawn))
+    return PosteriorByKind(tuple(kinds), tuple(drawn))
 
 
 def n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: int) -> int:
-    """Return the number of samples of a kind: fewer if improbable; for rivals at most half, but 100 or more."""
+    """Return a kind's number of samples: fewer if improbable; with a left-out effect at most half, but 100 or more."""
     if kind.left_out:
-        return max(n_particles // next(part for least, part in SUSPECTED if probability >= least), _LEAST_SAMPLES)
-    return n_particles if probability >= IMPROBABLE else n_particles // _FEWER
+        divisor = next(divisor for least, divisor in _SAMPLE_DIVISORS if probability >= least)
+        return max(n_particles // divisor, _LEAST_SAMPLES)
+    return n_particles if probability >= IMPROBABLE else n_particles // _IMPROBABLE_DIVISOR

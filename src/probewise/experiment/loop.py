@@ -1,4 +1,4 @@
-"""The loop of a run: measure, infer, judge, inquire, until the target precision is reached (paper, section 2).
+"""The loop of a run: measure, infer, judge, inquire, until the target sd is reached (paper, sections 2.2, 2.3).
 
 `step` processes one reading; `explore` is the loop around it, a generator, so that the command line, notebooks and
 reports see the same steps. `run_from_place` and `shadow_run` are the same loop from a given first place, and on the
@@ -18,6 +18,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_path, checked_whole, require_kind, require_rng
+from probewise.arm.carry_out import covariates_with_height
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.own import Measures, as_instrument, require_measures
 from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
@@ -32,46 +33,45 @@ from probewise.experiment.journal import (
     Journal,
     JournalWriter,
     PosteriorSummary,
-    covariates_with_height,
     read_journal,
     require_same_settings,
 )
-from probewise.experiment.kinds import Posterior, prior_posterior
-from probewise.experiment.result import Exploration, Step
-from probewise.experiment.rivals import Pace
-from probewise.experiment.setup import Experiment
-from probewise.experiment.stopping import (
+from probewise.experiment.judgement import (
     MOST_MISSING,
     information_nats,
     judge,
-    may_stop_and_chance_off,
     n_missing_at_end,
     sensor_moments,
     stop_reason,
+    target_reached_and_chance_off,
     with_aligned_angles,
     with_arm_error,
 )
+from probewise.experiment.kinds import PosteriorByKind, prior_posterior
+from probewise.experiment.result import Exploration, Step
+from probewise.experiment.rivals import Pace
+from probewise.experiment.setup import Experiment
 from probewise.inquiry import bits_gained, prior_entropy
 from probewise.nested import Weighted
 from probewise.recordings.plan import Recording
 from probewise.sensor.commanded import require_possible_commands
 
-_MOST_OFF = 0.01  # share of the calibrated height, which changes the signal by 2 %
+_HEIGHT_TOLERANCE = 0.01  # share of the calibrated height, which changes the signal by 2 %
 
 
 @dataclass(frozen=True, eq=False)
 class ExplorationState:
     """The current state of a run.
 
-    `readings` so far, the `posterior` given them, the next pose, and the poses `planned` after it in a batch; the reach
-    of the arm, and the differential entropy of the prior in bits.
+    `readings` so far, their posterior `by_kind`, the next pose, and the poses `planned` after it in a batch; the arm's
+    reach, and the differential entropy of the prior in bits.
     """
 
     readings: tuple[Reading, ...]
-    posterior: Posterior
+    by_kind: PosteriorByKind
     next_pose: Pose
     planned: tuple[Pose, ...]
-    field: ArmReachAndTravel
+    reach: ArmReachAndTravel
     prior_bits: float
 
 
@@ -82,12 +82,12 @@ def begin(experiment: Experiment, instrument: Instrument, *, rng: np.random.Gene
     ReachError if the instrument, already entered, reaches no place; ParameterError if the prior has no mass, or no
     place is more informative than others.
     """
-    field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
+    reach = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
     prior_bits = prior_entropy(experiment.prior, rng=rng)
-    posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
-    joined = posterior.joined(rng=rng)
+    by_kind = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
+    joined = by_kind.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
-    given, utilities = predict_readings_and_utilities(experiment, joined, drawn, field, at=None, goal=experiment.goal)
+    inputs, utilities = predict_readings_and_utilities(experiment, joined, drawn, reach, at=None, goal=experiment.goal)
     if utilities.is_flat:
         raise ParameterError(
             "utility",
@@ -95,8 +95,8 @@ def begin(experiment: Experiment, instrument: Instrument, *, rng: np.random.Gene
             "one that differs between places: as it is, no reading within reach is expected to tell anything; "
             "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
         )
-    pose, *planned = next_poses(experiment, given, utilities, rng=rng)
-    return ExplorationState((), posterior, pose, tuple(planned), field, prior_bits)
+    pose, *planned = next_poses(experiment, inputs, utilities, rng=rng)
+    return ExplorationState((), by_kind, pose, tuple(planned), reach, prior_bits)
 
 
 @own_arithmetic
@@ -118,14 +118,14 @@ def step(
     readings = (*state.readings, reading)
     n_readings, n_missing = len(readings), n_missing_at_end(readings)
     recording = experiment.problem(readings).recording
-    kinds, joined, posterior, drawn = infer(experiment, state.posterior, recording, rng=rng)
-    judged = judge(experiment, kinds, posterior, readings, rng=rng)
-    given, utilities = inquire(experiment, kinds, posterior, drawn, judged, state.field, readings, rng=rng)
+    by_kind, joined, posterior, drawn = infer(experiment, state.by_kind, recording, rng=rng)
+    judged = judge(experiment, by_kind, posterior, readings, rng=rng)
+    inputs, utilities = inquire(experiment, by_kind, posterior, drawn, judged, state.reach, readings, rng=rng)
     all_missing = max_missing is not None and n_missing >= max_missing
     all_taken = max_readings is not None and n_readings >= max_readings
-    checks = must_continue(utilities, kinds) and not all_taken
+    checks = must_continue(utilities, by_kind) and not all_taken
     if judged.arm_error is None and (utilities.is_flat or all_missing or all_taken):
-        judged = with_arm_error(judged, experiment, kinds, posterior, readings, rng=rng)
+        judged = with_arm_error(judged, experiment, by_kind, posterior, readings, rng=rng)
     reason = stop_reason(
         experiment,
         judged,
@@ -138,49 +138,49 @@ def step(
     # A reading for which the run goes on, though the shape is known, is not one of those planned before. Nor is one
     # after a missing reading, since those planned may be at the same place.
     planned_before = () if checks or n_missing else state.planned
-    pose, *planned = planned_before or next_poses(experiment, given, utilities, readings, rng=rng)
+    pose, *planned = planned_before or next_poses(experiment, inputs, utilities, readings, rng=rng)
     log_prior = experiment.prior.log_prob(joined.theta)
     info = Step(
         **vars(judged),
         number=n_readings,
         reading=reading,
         names=experiment.shape.prior.names,
-        samples=given.drawn[:, experiment.shape_columns],
+        samples=inputs.drawn[:, experiment.shape_columns],
         map=utilities,
         next_pose=None if reason else pose,
         bits=bits_gained(information_nats(joined), log_prior, joined.weight, state.prior_bits),
         posterior=posterior,
         sensor=sensor_moments(experiment, posterior),
-        kinds=kinds,
+        by_kind=by_kind,
         stop_reason=reason,
         pace=Pace.from_readings(readings),
-        checks_sensor=judged.may_stop and checks,
+        checks_sensor=judged.target_reached and checks,
     )
-    return replace(state, readings=readings, posterior=kinds, next_pose=pose, planned=tuple(planned)), info
+    return replace(state, readings=readings, by_kind=by_kind, next_pose=pose, planned=tuple(planned)), info
 
 
 def infer(
-    experiment: Experiment, previous: Posterior, recording: Recording, *, rng: np.random.Generator
-) -> tuple[Posterior, Weighted, Weighted, FloatArray]:
+    experiment: Experiment, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator
+) -> tuple[PosteriorByKind, Weighted, Weighted, FloatArray]:
     """Update the posterior with the last reading of a recording; before the run may end, reconsider it.
 
     Returns
     -------
-    The posterior kind by kind; its samples joined, with raised odds of faults; the same with aligned angles; and a few
-    hypotheses drawn from it, (n_samples, n_params).
+    The posterior by kind; its samples joined, with raised odds of left-out effects; the same with aligned angles; and a
+    few hypotheses drawn from it, (n_samples, n_params).
     """
     method = experiment.inference_method
     with warnings.catch_warnings():
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        kinds = method.updated(previous, recording, rng=rng)
-    joined = kinds.with_raised_fault_odds().joined(rng=rng)
+        by_kind = method.updated(previous, recording, rng=rng)
+    joined = by_kind.with_raised_left_out_odds().joined(rng=rng)
     posterior = with_aligned_angles(experiment, joined)
-    if may_stop_and_chance_off(experiment, posterior)[0]:
-        kinds = method.reconsidered(kinds, recording, rng=rng)
-        joined = kinds.with_raised_fault_odds().joined(rng=rng)
+    if target_reached_and_chance_off(experiment, posterior)[0]:
+        by_kind = method.reconsidered(by_kind, recording, rng=rng)
+        joined = by_kind.with_raised_left_out_odds().joined(rng=rng)
         posterior = with_aligned_angles(experiment, joined)
-    return kinds, joined, posterior, method.drawn(kinds, posterior, recording, experiment.n_samples, rng=rng)
+    return by_kind, joined, posterior, method.drawn(by_kind, posterior, recording, experiment.n_samples, rng=rng)
 
 
 def explore(
@@ -192,7 +192,7 @@ def explore(
     journal: str | Path | Journal | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Generator[Step, None, None]:
-    """Let the robot find the shape: yield one `Step` per reading until the target precision (paper, section 2).
+    """Let the robot find the shape: yield one `Step` per reading until the target sd is reached (paper, section 2.3).
 
     `Exploration(experiment, tuple(explore(...)))` is the whole run. A generator that is not exhausted keeps its journal
     locked until the generator is closed. A `DoubtfulResultWarning` says once, and the notes of every step after that
@@ -330,7 +330,7 @@ def _doubt_about_height(experiment: Experiment, height_mm: float | None) -> str 
     calibrated_mm = experiment.calibrated_height_mm
     if experiment.heights_mm or calibrated_mm is None or height_mm is None:
         return None
-    if not abs(height_mm - calibrated_mm) > _MOST_OFF * calibrated_mm:  # NaN: the height is not known
+    if not abs(height_mm - calibrated_mm) > _HEIGHT_TOLERANCE * calibrated_mm:  # NaN: the height is not known
         return None
     return (
         f"the arm reads {height_mm:g} mm above the surface, and the sensor was calibrated at {calibrated_mm:g} mm: "

@@ -11,8 +11,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import can_sleep_mask, with_evidence_from_prior
-from probewise.experiment.kinds import IMPROBABLE, SUSPECTED, HypothesisKind, Posterior, n_samples_of_kind
+from probewise.experiment.evidence import can_suspend_mask, with_evidence_from_prior
+from probewise.experiment.kinds import (
+    IMPROBABLE,
+    SUSPECTED_PROBABILITY,
+    HypothesisKind,
+    PosteriorByKind,
+    n_samples_of_kind,
+)
 from probewise.experiment.paper import N_LIVE, N_STEPS
 from probewise.experiment.rivals import Pace
 from probewise.inquiry.smc import (
@@ -37,20 +43,20 @@ class Method(Protocol):
         """Short name for reports."""
         ...
 
-    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+    def updated(self, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Update the posterior with the last reading of a recording; NotConvergedError if no hypothesis allows it."""
         ...
 
-    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+    def reconsidered(self, now: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Return the posterior with kinds sampled again whose samples may have lost the truth, before a run ends."""
         ...
 
     def drawn(
-        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+        self, by_kind: PosteriorByKind, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
         """Draw the `n` hypotheses that figures show and the paper's utility uses, (n, n_params).
 
-        `posterior` holds the samples of each kind, `joined` the weighted samples of all kinds.
+        `by_kind` holds the samples of each kind, `joined` the weighted samples of all kinds.
         """
         ...
 
@@ -70,25 +76,26 @@ class SequentialMonteCarlo:
         """Short name for reports."""
         return f"sequential Monte Carlo, {self.n_particles} samples carried from reading to reading"
 
-    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+    def updated(self, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Reweight, resample and move the samples of every kind by the last reading."""
         problems = [kind.problem(recording) for kind in previous.kinds]
         if len(problems) == 1:
             from_scratch = partial(nested_sampling_from_scratch, problems[0], n_live=self.n_live, rng=rng)
             found = update(previous.particles[0], problems[0], rng=rng, fall_back=from_scratch)
             return replace(previous, particles=(found,))
-        usual, unsuspected = STEADY if previous.doubts_sensor else THOROUGH, SUSPECTED[1][0]
+        usual = STEADY if previous.doubts_sensor else THOROUGH
         updated = list(previous.particles)
-        probability, can_sleep = previous.probability, can_sleep_mask(previous)
-        each_s = [Pace.from_times(times).each_s for times in (recording.plan.time_s[:-1], recording.plan.time_s)]
-        for k, (kind, own, problem) in enumerate(zip(previous.kinds, previous.particles, problems, strict=True)):
+        probability, can_suspend = previous.probability, can_suspend_mask(previous)
+        time_s = recording.plan.time_s
+        s_per_reading = [Pace.from_times(times).s_per_reading for times in (time_s[:-1], time_s)]
+        for k, (kind, carried, problem) in enumerate(zip(previous.kinds, previous.particles, problems, strict=True)):
             perfect = problem.perfect_log_likelihood
-            if can_sleep[k]:
-                found = own.asleep_with(perfect)
+            if can_suspend[k]:
+                found = carried.suspended_with(perfect)
             else:
-                effort = BRIEF if kind.left_out and probability[k] < unsuspected else usual
-                found = update(kind.at_pace(own, *each_s), problem, rng=rng, effort=effort)
-            updated[k] = replace(found, lost_log_z=own.lost_log_z + perfect)
+                effort = BRIEF if kind.left_out and probability[k] < SUSPECTED_PROBABILITY else usual
+                found = update(kind.at_pace(carried, *s_per_reading), problem, rng=rng, effort=effort)
+            updated[k] = replace(found, lost_log_z=carried.lost_log_z + perfect)
         now = replace(previous, particles=tuple(updated))
         now = with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=False, rng=rng)
         if not np.isfinite(now.log_odds).any():
@@ -96,20 +103,20 @@ class SequentialMonteCarlo:
         particles = list(now.particles)
         for k, (kind, p) in enumerate(zip(now.kinds, now.probability, strict=True)):
             n = n_samples_of_kind(kind, p, self.n_particles)
-            if not particles[k].asleep and (n > len(particles[k].ancestor) or p < IMPROBABLE):
+            if not particles[k].suspended and (n > len(particles[k].ancestor) or p < IMPROBABLE):
                 effort = BRIEF if kind.left_out else THOROUGH
                 particles[k] = resample_and_move(particles[k], n, problems[k], rng=rng, effort=effort)
         return replace(now, particles=tuple(particles))
 
-    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+    def reconsidered(self, now: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Return the posterior with kinds sampled again whose samples may have lost the truth."""
-        problems = [kind.problem(recording) for kind in posterior.kinds]
-        # From a generator of its own: if no mode was lost, the run goes on as without the search.
+        problems = [kind.problem(recording) for kind in now.kinds]
+        # From another generator: if no mode was lost, the run goes on as without the search.
         search = rng.spawn(1)[0]
-        return with_evidence_from_prior(posterior, problems, self.n_particles, self.n_live, at_end=True, rng=search)
+        return with_evidence_from_prior(now, problems, self.n_particles, self.n_live, at_end=True, rng=search)
 
     def drawn(
-        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+        self, by_kind: PosteriorByKind, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
         """Resample `n` hypotheses from the joined posterior, (n, n_params)."""
         return joined.samples(n, rng=rng)
@@ -117,7 +124,7 @@ class SequentialMonteCarlo:
 
 @dataclass(frozen=True)
 class NestedSampling:
-    """Nested sampling on all readings after each one, with diversified samples (paper, machine learning system).
+    """Nested sampling on all readings after each one, with diversified samples (paper, section 2.3).
 
     The paper has 300 live points, stops nested sampling at a change of ln Z below 1e-8, and moves each drawn sample by
     about 1000 Metropolis-Hastings steps.
@@ -133,36 +140,36 @@ class NestedSampling:
         """Short name for reports."""
         return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
 
-    def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+    def updated(self, previous: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Infer from all readings by a new nested sampling run for each kind of hypotheses."""
         found = tuple(
-            self._nested_samples(had, kind, recording, rng)
-            for kind, had in zip(previous.kinds, previous.particles, strict=True)
+            self._nested_samples(before, kind, recording, rng)
+            for kind, before in zip(previous.kinds, previous.particles, strict=True)
         )
         now = replace(previous, particles=found)
         if not np.isfinite(now.log_odds).any():
             raise NotConvergedError("no hypothesis of any kind could have given these readings")
         return now
 
-    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+    def reconsidered(self, now: PosteriorByKind, recording: Recording, *, rng: np.random.Generator) -> PosteriorByKind:
         """Return the posterior as it is: nested sampling starts again at every reading, so no samples lose a mode."""
-        return posterior
+        return now
 
     def drawn(
-        self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
+        self, by_kind: PosteriorByKind, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
         """Draw `n` hypotheses, (n, n_params), each moved by `n_steps` steps, since a run's samples may be copies."""
-        which = resampled_rows(posterior.probability, n, rng)
+        which = resampled_rows(by_kind.probability, n, rng)
         drawn = []
-        for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
-            if n_own := int((which == k).sum()):
-                start = particles.weighted.samples(n_own, rng=rng)
+        for k, (kind, particles) in enumerate(zip(by_kind.kinds, by_kind.particles, strict=True)):
+            if n_of_kind := int((which == k).sum()):
+                start = particles.weighted.samples(n_of_kind, rng=rng)
                 moved = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
                 drawn.append(kind.member.to_whole_theta(moved, rng))
         return np.concatenate(drawn)
 
     def _nested_samples(
-        self, had: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
+        self, before: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
     ) -> Particles:
         """Sample one kind by nested sampling; its evidence is zero if none of its hypotheses is possible."""
         try:
@@ -175,9 +182,9 @@ class NestedSampling:
                 max_cost=1.0,  # the robot waits
             )
         except NotConvergedError:  # no hypothesis of this kind could have given the readings
-            return had.with_zero_evidence()
+            return before.with_zero_evidence()
         names = ("names", "theta", "log_likelihood", "log_weight", "log_z", "log_z_error", "n_eff")
         same = {name: getattr(result, name) for name in names}
-        n_calls = had.weighted.n_calls + result.n_calls
+        n_calls = before.weighted.n_calls + result.n_calls
         found = Weighted(**same, n_calls=n_calls, pareto_k=-math.inf, run=result)
         return Particles(found, np.arange(len(found.theta)))

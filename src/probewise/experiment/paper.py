@@ -1,9 +1,9 @@
 """The paper's robot: a nested sampling run after every reading, fifty samples, entropy of their predictions.
 
-Paper, "The Machine Learning System". `find_shape` is its loop; its inference, as one method of `explore`, is
-`method.NestedSampling`. Ambiguities and errors of the paper are resolved as in the rest of the package
-(docs/explanation/errata.md): the Student-t's sigma has proper bounds, the SSF is the mean of the sampled fields in
-closed form.
+`find_shape` is the paper's loop (section 2.3, eq. 5); `explore --method paper` takes the same steps through
+`method.NestedSampling`. The sensor model is given: for `explore`, the mean of the sampled SSFs merged into 32 Gaussians
+(`from_sensor`). Unlike the paper: sigma has proper bounds, and half of the live points are replaced at a time; the sds
+that end a run are those of all weighted samples (more in docs/explanation/errata.md).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Instrument, Pose, Reading
+from probewise.arm.carry_out import PATTERN, recording_of
 from probewise.errors import require
-from probewise.experiment.journal import PATTERN, recording_of
 from probewise.inference.likelihoods import StudentT
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import Grid, choose, entropy_map
@@ -43,7 +43,7 @@ def find_shape(
     stop_sd_mm: float = 4.0,
     rng: np.random.Generator,
 ) -> Generator[tuple[tuple[Reading, ...], NestedResult, FloatArray], None, None]:
-    """Let the arm find a shape (paper, "The Machine Learning System"): measure, infer, inquire.
+    """Let the arm find a shape (paper, section 2.3): measure, infer, inquire.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ def find_shape(
     lengths = [k for k, name in enumerate(shape.prior.names) if name.endswith("_mm")]
     readings: tuple[Reading, ...] = ()
     shapes = shape.prior.from_unit_cube(rng.random((N_SAMPLES, len(shape.prior.names))))
-    known = False
-    while not known:
+    target_reached = False
+    while not target_reached:
         entropy = entropy_map(model, shapes, grid, plan, reachable=reachable, bin_width=bin_width)
         place = choose(entropy.values, reachable, rng=rng)
         x_mm, y_mm = places_mm[place].tolist()
@@ -82,12 +82,12 @@ def find_shape(
         posterior = run(problem, n_live=N_LIVE, stop=EvidenceChange(), move=KernelMove(), max_cost=1.0, rng=rng)
         shapes = diversify(posterior.samples(N_SAMPLES, rng=rng), problem, n_steps=N_STEPS, rng=rng)
         yield readings, posterior, shapes
-        known = bool((posterior.sd()[lengths] < stop_sd_mm).all())
+        target_reached = bool((posterior.sd()[lengths] < stop_sd_mm).all())
 
 
 @dataclass(frozen=True)
 class OneScan:
-    """Student-t likelihood of any number of readings that share one unknown noise sd (paper, SSF likelihood).
+    """Student-t likelihood of any number of readings that share one unknown noise sd (paper, eq. 11).
 
     `sd_floor` and `sd_ceiling` bound the sd, in the sensor's unit; its prior is 1/sigma between them.
     """

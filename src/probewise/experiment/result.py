@@ -14,16 +14,16 @@ from probewise._arrays import FloatArray
 from probewise._display import Reported, ShowsItself
 from probewise._kinds import require_kind
 from probewise._words import count_with_noun
+from probewise.arm.carry_out import recording_of
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration import FittedSensor
 from probewise.effects import SINCE_CALIBRATION, spoken_name
 from probewise.experiment.arm_error import ArmError
-from probewise.experiment.journal import recording_of
-from probewise.experiment.kinds import HypothesisKind, Posterior
+from probewise.experiment.judgement import Judgement, is_target_reached, largest_sd_mm, probability_of_length_off
+from probewise.experiment.kinds import HypothesisKind, PosteriorByKind
 from probewise.experiment.rivals import Pace
-from probewise.experiment.setup import Experiment, largest_sd_mm
+from probewise.experiment.setup import Experiment
 from probewise.experiment.simulated import HiddenShape
-from probewise.experiment.stopping import Judgement, probability_of_length_off
 from probewise.inquiry import UtilityMap
 from probewise.nested import Weighted
 from probewise.nested.weights import weighted_quantiles
@@ -36,7 +36,7 @@ PAPER_BITS = 25.0
 
 FORMAT = "exploration/1"
 
-OFF_MM = 12.0
+WRONG_MM = 12.0
 """Three times the 4 mm of the stopping rule: a larger error counts as wrong."""
 
 _POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octagon"}
@@ -70,10 +70,10 @@ class Step(Judgement, ShowsItself):
         the information about the effect left out and its parameters is added, so this exceeds that about the shape.
     posterior
         Weighted posterior of all parameters, with the evidence; the odds of a left-out effect are raised, see
-        `kinds.FAULT_ODDS_FACTOR`.
+        `kinds.LEFT_OUT_ODDS_FACTOR`.
     sensor
         Posterior mean and sd of the sensor's parameters by name, if they are inferred too.
-    kinds
+    by_kind
         The posterior of every kind of hypotheses; the odds of a left-out effect are not raised.
     replayed, pace
         Whether the reading comes from a journal; pace of the run so far.
@@ -90,7 +90,7 @@ class Step(Judgement, ShowsItself):
     bits: float
     posterior: Weighted
     sensor: Mapping[str, tuple[float, float]]
-    kinds: Posterior
+    by_kind: PosteriorByKind
     stop_reason: str | None
     replayed: bool = False
     pace: Pace = field(default_factory=Pace)
@@ -99,7 +99,7 @@ class Step(Judgement, ShowsItself):
     @property
     def left_out(self) -> Mapping[str, float]:
         """Probability of each effect that the sensor model may leave out, by name; "" is none."""
-        return self.kinds.left_out
+        return self.by_kind.left_out
 
     @property
     def log_z(self) -> float:
@@ -175,12 +175,12 @@ class Exploration(Reported):
     @property
     def posterior(self) -> Weighted:
         """The weighted posterior after the last reading, with the arm's own error if that is known."""
-        found = self.last.posterior
+        posterior = self.last.posterior
         if self.arm_error is None:
-            return found
-        theta = found.theta.copy()
+            return posterior
+        theta = posterior.theta.copy()
         theta[:, self.experiment.shape_columns] += self.arm_error.shifts
-        return replace(found, theta=theta)
+        return replace(posterior, theta=theta)
 
     @property
     def sd(self) -> FloatArray:
@@ -197,10 +197,10 @@ class Exploration(Reported):
         return f"{reason}; with the arm's own error the widest is known to {widest:.1f} mm"
 
     @property
-    def reached(self) -> bool:
-        """Whether the target precision was reached, arm included, with a hypothesis that explains the readings."""
+    def target_reached(self) -> bool:
+        """Whether the stopping rule is met, arm included, by a hypothesis that explains the readings."""
         trusted = not self.experiment.fit_is_doubtful(self.last.p_value) and not self.last.unexplained
-        return trusted and self.experiment.may_stop(self.sd, self.last.shapes, self.last.chance_off)
+        return trusted and is_target_reached(self.experiment, self.sd, self.last.shapes, self.last.chance_off)
 
     @property
     def seconds(self) -> float:
@@ -229,7 +229,7 @@ class Exploration(Reported):
     def summary(self) -> str:
         """Describe the run in plain text."""
         last, paper = self.last, ""
-        if self.reached:
+        if self.target_reached:
             paper = f" (the paper's count: {PAPER_BITS:g} bits, {self.paper_bits_per_reading:.2f} per reading)"
         lines = [
             f"readings     {len(self.steps)}",
@@ -267,7 +267,7 @@ def _number(name: str, value: float, *, more: int = 0) -> str:
 
 
 @dataclass(frozen=True)
-class FoundParameter:
+class ParameterEstimate:
     """A parameter of the shape: its name, which ends in its unit, and its posterior mean, sd and 95 % interval.
 
     `arm_sd` is the part of the sd that is due to the arm's own error; None if that error is unknown and not included.
@@ -281,15 +281,15 @@ class FoundParameter:
 
 
 @dataclass(frozen=True)
-class FoundShape:
+class ShapeEstimate:
     """The most probable shape, its probability, and its parameters given that shape."""
 
     name: str
     probability: float
-    parameters: tuple[FoundParameter, ...]
+    parameters: tuple[ParameterEstimate, ...]
 
 
-def found_shape(run: Exploration) -> FoundShape:
+def estimated_shape(run: Exploration) -> ShapeEstimate:
     """Summarise the posterior after the last reading: the most probable shape and its parameters."""
     shape, last = run.experiment.shape, run.last
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
@@ -297,11 +297,11 @@ def found_shape(run: Exploration) -> FoundShape:
     if isinstance(shape, RegularPolygon):
         name = _POLYGONS.get(shape.n_sides, f"regular polygon of {shape.n_sides} sides")
     if isinstance(shape, AnyOf):
-        own = shape.shape_index(theta) == shape.shape_names.index(name)
-        theta, weight = theta[own], weight[own]
+        of_shape = shape.shape_index(theta) == shape.shape_names.index(name)
+        theta, weight = theta[of_shape], weight[of_shape]
     low, high = weighted_quantiles(theta, weight, [0.025, 0.975])
     parameters = tuple(
-        FoundParameter(
+        ParameterEstimate(
             last.names[k].removeprefix(f"{name}."),
             float(last.mean[k]),
             float(run.sd[k]),
@@ -311,7 +311,7 @@ def found_shape(run: Exploration) -> FoundShape:
         for k in np.flatnonzero(np.isfinite(last.mean)).tolist()
         if last.names[k] != "shape"
     )
-    return FoundShape(name, last.shapes.get(name, 1.0), parameters)
+    return ShapeEstimate(name, last.shapes.get(name, 1.0), parameters)
 
 
 def result_json(run: Exploration) -> str:
@@ -321,9 +321,9 @@ def result_json(run: Exploration) -> str:
         "format": FORMAT,
         "readings": len(run.steps),
         "stop_reason": run.stop_reason,
-        "known": run.reached,
-        "shape": asdict(found_shape(run)),
-        "chance_off_12mm": probability_of_length_off(run.experiment, run.posterior, OFF_MM),
+        "known": run.target_reached,
+        "shape": asdict(estimated_shape(run)),
+        "chance_off_12mm": probability_of_length_off(run.experiment, run.posterior, WRONG_MM),
         "left_out": left_out_after_step(run.last, run.experiment.trust).as_json(),
         "notes": list(run.notes),
         "bits": run.last.bits,
@@ -361,7 +361,7 @@ def samples_csv(run: Exploration) -> str:
 class LeftOutEffects:
     """Probability of each effect that the sensor model may leave out, most probable first ("clean": none); a sentence.
 
-    `raised` holds the same probabilities with the odds of every effect multiplied by 14 (`kinds.FAULT_ODDS_FACTOR`).
+    `raised` holds the same probabilities with the odds of every effect multiplied by 14 (`kinds.LEFT_OUT_ODDS_FACTOR`).
     """
 
     probability: Mapping[str, float]
@@ -394,7 +394,7 @@ class LeftOutEffects:
 def left_out_after_step(last: Step, trust: float) -> LeftOutEffects:
     """Summarise the probabilities of left-out effects after a step, in a run with this `Experiment.trust`."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
-    raised = {name or CLEAN: p for name, p in last.kinds.with_raised_fault_odds().left_out.items()}
+    raised = {name or CLEAN: p for name, p in last.by_kind.with_raised_left_out_odds().left_out.items()}
     if last.unexplained:  # what leads fails its check: none of the names is more than a part of the answer
         shares = [(UNKNOWN_SHARE, UNKNOWN), *((p * (1.0 - UNKNOWN_SHARE), name) for p, name in shares)]
         raised |= {UNKNOWN: 1.0}
@@ -419,9 +419,9 @@ def left_out_after_step(last: Step, trust: float) -> LeftOutEffects:
 
 def _best_kind_with(last: Step, name: str) -> tuple[HypothesisKind, Weighted]:
     """Return the most probable kind with a left-out effect, and its samples."""
-    kinds = [k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name]
-    best = max(kinds, key=lambda k: last.kinds.log_odds[k])
-    return last.kinds.kinds[best], last.kinds.particles[best].weighted
+    kinds = [k for k, kind in enumerate(last.by_kind.kinds) if kind.left_out == name]
+    best = max(kinds, key=lambda k: last.by_kind.log_odds[k])
+    return last.by_kind.kinds[best], last.by_kind.particles[best].weighted
 
 
 def _effect_sentence(last: Step, name: str) -> str:
@@ -429,8 +429,8 @@ def _effect_sentence(last: Step, name: str) -> str:
     kind, samples = _best_kind_with(last, name)
     if kind.effect is None:
         return spoken_name(name)
-    own = slice(-len(kind.effect.prior.names), None)
-    mean, sd = (last.pace.in_seconds(kind.effect, moment[own]) for moment in (samples.mean(), samples.sd()))
+    of_effect = slice(-len(kind.effect.prior.names), None)
+    mean, sd = (last.pace.in_seconds(kind.effect, moment[of_effect]) for moment in (samples.mean(), samples.sd()))
     # A change is said by the clock of the readings, while paced time begins at the first of them.
     is_a_time = np.array([parameter == "at_s" for parameter in kind.effect.prior.names])
     return kind.effect.sentence(mean + last.pace.start_s * is_a_time, sd)

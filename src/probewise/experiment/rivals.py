@@ -37,10 +37,10 @@ from probewise.effects.reading import gain_drift
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import DeclaredNoise, noise_likelihoods
 from probewise.inference.problem import Likelihood
-from probewise.inquiry import cards_of
 from probewise.priors import LogUniform, Prior, Product, Uniform
-from probewise.recordings.plan import Instrumentation, Plan, Recording
+from probewise.recordings.plan import Instrumentation, Plan
 from probewise.sensor import Chain, FixedLevels
+from probewise.sensor.chain import cards_of
 from probewise.sensor.stages import AnyEffect, Poses, SensorModel, Stage
 
 ON_FIELD = {
@@ -70,7 +70,7 @@ WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
 OF_MOTION = frozenset({"backlash", "hysteresis"})
 """Effects of the direction from which the arm comes."""
 
-EACH_S = 8.0
+PACED_S_PER_READING = 8.0
 """Seconds of paced time that each reading takes on average."""
 
 _IN_TIME = frozenset({"ambient_step", "offset_drift", "gain_drift", "lag"})
@@ -82,7 +82,7 @@ _POWERS_OF_S = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 _SCALE_SAYS = (
     "the arm moves {} % too far along {}, or as much too short along {}: the shape is in the arm's own lengths"
 )
-_CHANGE_POINT = LogUniform(0.5 * EACH_S, 100.0 * EACH_S)
+_CHANGE_POINT = LogUniform(0.5 * PACED_S_PER_READING, 100.0 * PACED_S_PER_READING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,23 +111,23 @@ def rivals_of(
         )
     dark, bright = model.levels.i_min, model.levels.i_max
     carried = {effect.name for effect in model.effects}
-    found = []
+    rivals = []
     for name, wide in ({**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD).items():
         plan = _plan_there_and_back(math.hypot(*field_mm) if wide else _SCAN_MM, height_mm)
         extent = Extent(min(dark, bright), max(dark, bright), plan)
         effect = VOCABULARY[name].for_extent(extent)
         if effect is not None and name not in carried:
-            found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
+            rivals += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, extent, field_mm)]
     extent = Extent(min(dark, bright), max(dark, bright), _plan_there_and_back(_SCAN_MM, height_mm))
     forms = [form for form in (SINCE_CALIBRATION if cards_of(model) else ONLY_IN_RUNS) if form.name not in carried]
     in_any_run = [effect for form in forms if (effect := form.for_extent(extent)) is not None]
-    found += [SensorModelRival(form.name, effect=EffectWithRunPrior(form, field_mm)) for form in in_any_run]
+    rivals += [SensorModelRival(form.name, effect=EffectWithRunPrior(form, field_mm)) for form in in_any_run]
     noise = DeclaredNoise.from_likelihood(likelihood)
     if noise is not None:
-        found += [
+        rivals += [
             SensorModelRival(name, likelihood=law) for name, law in noise_likelihoods(noise, (dark, bright)).items()
         ]
-    return tuple(found)
+    return tuple(rivals)
 
 
 def _forms_of_effect_in_run(effect: Effect, extent: Extent, field_mm: tuple[float, float]) -> list[DescribedEffect]:
@@ -148,7 +148,7 @@ def _forms_of_effect_in_run(effect: Effect, extent: Extent, field_mm: tuple[floa
 
 def _plan_there_and_back(length_mm: float, height_mm: float | None) -> Plan:
     """Return a plan of one scan of `length_mm` there and back over 150 s, from which effects take their scales."""
-    n = 2 * int(_DURATION_S / EACH_S / 2) + 1
+    n = 2 * int(_DURATION_S / PACED_S_PER_READING / 2) + 1
     zeros = np.zeros(n, dtype=np.int64)
     return Plan(
         x_mm=length_mm * (1.0 - np.abs(np.linspace(-1.0, 1.0, n))),
@@ -240,14 +240,14 @@ class EffectWithRunPrior(_WrappedDescribedEffect):
     @cached_property
     def prior(self) -> Prior:
         """The effect's prior for a run."""
-        own = self.effect.prior
-        if isinstance(own, PatchPrior):
-            size = HeavyTailedPrior(own.typical, smallest=_SMALLEST)
+        prior = self.effect.prior
+        if isinstance(prior, PatchPrior):
+            size = HeavyTailedPrior(prior.typical, smallest=_SMALLEST)
             x, y = (Uniform(0.0, length) for length in self.field_mm)
-            return Product({own.size: size, "x": x, "y": y, "r": own.radius_prior})
-        if not isinstance(own, Product):
-            return own
-        marginals = dict(own.marginals)
+            return Product({prior.size: size, "x": x, "y": y, "r": prior.radius_prior})
+        if not isinstance(prior, Product):
+            return prior
+        marginals = dict(prior.marginals)
         for name, marginal in marginals.items():
             if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
                 marginals[name] = replace(marginal, smallest=_SMALLEST)
@@ -264,8 +264,8 @@ class EffectInPacedTime(_WrappedDescribedEffect):
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effect in paced time, or in recorded time if the plan has no paced time."""
-        own = paced_time_s(plan)
-        return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
+        time_s = paced_time_s(plan)
+        return np.asarray(self.effect.apply(value, theta, plan if time_s is None else replace(plan, time_s=time_s)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,8 +277,8 @@ class FromRest(_WrappedDescribedEffect):
     def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
         """Apply the effect to all readings but the run's first."""
         moved = self.effect.apply(value, theta, plan)
-        own = paced_time_s(plan)
-        if own is None or not (first := own <= 0.0).any():
+        time_s = paced_time_s(plan)
+        if time_s is None or not (first := time_s <= 0.0).any():
             return moved
         if not isinstance(value, Poses):
             return np.where(first, value, moved)
@@ -291,7 +291,7 @@ class Pace:
     """Start time of a run in seconds, and mean seconds per reading."""
 
     start_s: float = 0.0
-    each_s: float = EACH_S
+    s_per_reading: float = PACED_S_PER_READING
 
     @classmethod
     def from_times(cls, time_s: FloatArray) -> Self:
@@ -307,16 +307,12 @@ class Pace:
 
     def plan_with_paced_time(self, plan: Plan) -> Plan:
         """Return the plan with a column of paced time."""
-        own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
-        return replace(plan, covariates={**plan.covariates, _PACED: own})
-
-    def recording_with_paced_time(self, recording: Recording) -> Recording:
-        """Return the recording with a column of paced time in its plan."""
-        return replace(recording, plan=self.plan_with_paced_time(recording.plan))
+        paced_s = (plan.time_s - self.start_s) * (PACED_S_PER_READING / self.s_per_reading)
+        return replace(plan, covariates={**plan.covariates, _PACED: paced_s})
 
     def in_seconds(self, effect: AnyEffect, theta: FloatArray) -> FloatArray:
         """Return an effect's parameters, (..., n_params), in seconds, those of an `EffectInPacedTime` converted."""
-        return np.asarray(theta * (self.each_s / EACH_S) ** powers_of_s(effect))
+        return np.asarray(theta * (self.s_per_reading / PACED_S_PER_READING) ** powers_of_s(effect))
 
 
 def powers_of_s(effect: AnyEffect | None) -> FloatArray:

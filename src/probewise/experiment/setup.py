@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import IntArray
 from probewise._kinds import checked_number, require_callable, require_kind
 from probewise._version import __version__
+from probewise.arm.carry_out import recording_of
 from probewise.arm.geometry import Geometry, place_jacobian
 from probewise.arm.instrument import Reading
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.errors import ParameterError, require
-from probewise.experiment.journal import recording_of, value_digest
+from probewise.experiment.journal import value_digest
 from probewise.experiment.kinds import HypothesisKind, KindProblem, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.rivals import Pace, SensorModelRival, rivals_of
 from probewise.inference.problem import Likelihood, require_likelihood, require_model
-from probewise.inquiry import Designs, Finishing, Goal, Grid, InformationGain, Readout, Utility, cards_of, forecast_of
+from probewise.inquiry import Designs, Finishing, Goal, Grid, InformationGain, Readout, Utility, forecast_of
 from probewise.inquiry.forecast import Forecast
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Instrumentation
 from probewise.scene import Card
 from probewise.scene.shapes import AnyOf, Shape, require_shape
 from probewise.sensor import Chain
+from probewise.sensor.chain import cards_of
 from probewise.sensor.stages import SensorModel
 
 
@@ -97,10 +99,6 @@ _MOST_BATCH = 100
 _LEAST_PARTICLES = 100
 _MOST_LIFTED = 10.0
 """Largest factor between reading height and calibrated height, either way."""
-
-MOST_OFF = 0.01
-"""Probability of a wrong length below which a run with doubt in its sensor may end."""
-
 
 _SETTINGS_OF_RUN = (
     "batch",
@@ -278,7 +276,7 @@ class Experiment:
 
     @cached_property
     def goal(self) -> Goal | None:
-        """The stopping rule on sds of lengths; None for a set of shapes, whose parameters are not known in advance."""
+        """The target sd of the lengths; None for a set of shapes, whose parameters are not known in advance."""
         if isinstance(self.shape, AnyOf):
             return None
         names = zip(self.shape_columns.tolist(), self.shape.prior.names, strict=True)
@@ -307,13 +305,13 @@ class Experiment:
     def problem(self, readings: Sequence[Reading]) -> KindProblem:
         """Return the inference problem for these readings; with `trust` below 1, its times are paced (see `Pace`)."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
+        plan = recording.plan
         if not self.heights_mm and self.calibrated_height_mm is not None:
             # All readings count as ones at the declared height, as the designs do.
-            covariates = {name: column for name, column in recording.plan.covariates.items() if name != "height_mm"}
-            recording = replace(recording, plan=replace(recording.plan, covariates=covariates))
+            plan = replace(plan, covariates={k: v for k, v in plan.covariates.items() if k != "height_mm"})
         if self.trust < 1:
-            recording = Pace.from_readings(readings).recording_with_paced_time(recording)
-        return KindProblem(self.prior, self.forecast.model, self.likelihood, recording)
+            plan = Pace.from_readings(readings).plan_with_paced_time(plan)
+        return KindProblem(self.prior, self.forecast.model, self.likelihood, replace(recording, plan=plan))
 
     @property
     def _rivals(self) -> tuple[SensorModelRival, ...]:
@@ -328,17 +326,6 @@ class Experiment:
         return kinds_of(
             self.shape, self.sensor_prior, self.prior, models, self.likelihood, trust=self.trust, rivals=rivals
         )
-
-    def may_stop(self, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0) -> bool:
-        """Return whether the stopping rule is met: the shape is known to the target precision.
-
-        `sd` and `shapes` are posterior sds of the shape's parameters and the shapes' probabilities, `chance_off` the
-        probability that a length is off by three times the target sd. With `trust` below 1, that must be below 1 %,
-        since the posterior then has tails that sds do not show.
-        """
-        likely = max(shapes.values(), default=1.0)
-        sure = self.trust == 1 or chance_off < MOST_OFF
-        return largest_sd_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
 
     def fit_is_doubtful(self, p_value: float | None) -> bool:
         """Return whether the p-value of the best hypothesis says that none explains the readings; None: not tested."""
@@ -372,8 +359,3 @@ class Experiment:
                 **{name: getattr(self, name) for name in _SETTINGS_OF_RUN},
             },
         }
-
-
-def largest_sd_mm(names: tuple[str, ...], sd: FloatArray) -> float:
-    """Return the largest sd among the parameters whose names end in _mm; NaN is ignored."""
-    return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))

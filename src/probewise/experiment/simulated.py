@@ -32,7 +32,7 @@ from probewise.scene import (
 from probewise.scene.shapes import require_shape
 from probewise.world import CoveredSurface, Oval, Spot, Surface, World
 
-Model: TypeAlias = Literal["ssf", "naive"]
+ModelName: TypeAlias = Literal["ssf", "naive"]
 _USUAL_HEIGHT_MM = 14.0  # height of the paper's sensor above the surface
 _PAINTED_VERTICES = 512  # vertices of a curved outline that is not an ellipse: within 0.01 mm of a circle of 150 mm
 
@@ -170,11 +170,11 @@ class HiddenShape:
         values = floats(theta, called)
         if values.shape != (len(prior.names),):
             raise ParameterError(called, theta, f"{len(prior.names)} numbers, {', '.join(prior.names)}")
-        own = np.eye(len(values), dtype=np.bool_)
+        one = np.eye(len(values), dtype=np.bool_)
         with np.errstate(invalid="ignore"):  # of a ratio of infinities
             given = prior.to_unit_cube(values[None])
         # The least and greatest value that the prior allows each parameter, given the others.
-        low, high = (np.diagonal(prior.from_unit_cube(np.where(own, end, given))) for end in (0.0, 1.0))
+        low, high = (np.diagonal(prior.from_unit_cube(np.where(one, end, given))) for end in (0.0, 1.0))
         for k, value in enumerate(values.tolist()):
             if not low[k] <= value <= high[k]:
                 option = called.partition(" ")[0]

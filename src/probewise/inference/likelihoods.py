@@ -1,4 +1,4 @@
-"""Likelihoods of readings (paper, sections "The Naive Likelihood" and "SSF Likelihood": Student-t and its product).
+"""Likelihoods of readings (paper, eq. 6: naive; eq. 11 and 19: Student-t; eq. 20: its product over data sets).
 
 `Naive` is the paper's sensor of two levels. The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal
 density has (2 pi sigma^2)^(-1/2) and a negative one.
@@ -41,7 +41,7 @@ def residuals(readings: FloatArray, predicted: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Naive:
-    """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd (paper, "The Naive Likelihood").
+    """Likelihood of a sensor with two levels, each with Gaussian noise of its own sd (paper, eq. 6).
 
     Mean and sd of readings over black and over white, in units of the reading; the means differ, else ParameterError.
     """
@@ -208,7 +208,7 @@ def _log_upper_gamma(a: FloatArray, t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class StudentT:
-    """Student-t likelihood: Gaussian noise, the sd of each data set integrated out (paper, eq. studentT and product).
+    """Student-t likelihood: Gaussian noise, the sd of each data set integrated out (paper, eq. 19 and 20).
 
     The paper gives S^(-(N-1)/2), from a prior uniform in an unbounded sigma. Here sigma's prior is 1/sigma between a
     floor and a ceiling: it is proper, tends to S^(-N/2) for wide bounds, and keeps all constants.

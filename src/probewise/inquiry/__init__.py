@@ -1,4 +1,4 @@
-"""The choice of the next measurement (paper, the machine learning system, figures 2 and 8).
+"""The choice of the next measurement (paper, section 2.3, figures 2 and 8).
 
 Samples of the posterior predict a reading at every place of a fine grid; a reading where the predictions differ most is
 the most informative. A utility of readings is a `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses;
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from probewise.inquiry.any_instrument import Inquiry
     from probewise.inquiry.disc_table import DiscForecast, TabulatedChain, forecast_of
     from probewise.inquiry.entropy import UtilityMap, choose, entropy_map
-    from probewise.inquiry.forecast import DirectForecast, cards_of
+    from probewise.inquiry.forecast import DirectForecast
     from probewise.inquiry.grid import Designs, Grid
     from probewise.inquiry.predictive import ReadingNoise
     from probewise.inquiry.readout import Readout, bits_gained, prior_entropy
@@ -56,7 +56,6 @@ __all__ = [
     "UtilityMap",
     "WhichShape",
     "bits_gained",
-    "cards_of",
     "choose",
     "choose_several",
     "entropy_map",

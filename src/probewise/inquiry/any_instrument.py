@@ -1,9 +1,8 @@
 """The choice of the next setting of any instrument, from a model of its readings, a prior, settings and noise.
 
 The paper's machine learning system without a field of shapes: readings update weighted samples of the posterior
-(`inquiry.smc`), and the next setting maximises an acquisition function
-(`Inquiry.utility`): expected information (Lindley 1956) or, near a goal, the expected decrease of the posterior sds
-towards the goal.
+(`inquiry.smc`), and the next setting maximises an acquisition function (`Inquiry.utility`): expected information
+(Lindley 1956) or, near a goal, the expected decrease of the posterior sds towards the goal.
 """
 
 from __future__ import annotations
@@ -47,15 +46,15 @@ _ALLOWED = (
 _BLOCK = 2_000_000  # densities held, or readings predicted, at a time
 _LOST_NATS = 3.0  # prior samples overrate the evidence by as much in 5 % of cases at most (Markov's inequality)
 _N_PROBED = 3
-_N_ASKED = 500  # samples whose predictions value the settings
-_FEWER_ASKED = 200  # of a model that is called for one sample at a time
+_N_PREDICTED = 500  # samples whose predictions value the settings
+_FEWER_PREDICTED = 200  # of a model that is called for one sample at a time
 _TIE = 1e-9  # utilities closer than this differ by rounding only
-_N_ROUGH = 120  # samples that pick the settings worth a closer look, far from a goal
+_N_ROUGH = 120  # samples that choose the settings for a closer look, far from a goal
 _N_BEST = 32  # settings that get it
 _FEW_SETTINGS = 64  # all of which get it
 _N_IMAGINED = 8
 _DOUBT_P = 1e-6
-_NEAR_GOAL = 3.0  # times the sds that are asked for
+_NEAR_GOAL = 3.0  # times the target sds
 _BITS = "expected information (bits)"
 _NEARER = "expected fall of the sum of ln(sd / goal)"
 
@@ -115,10 +114,10 @@ class Settings:
 
     def __getitem__(self, row: int) -> Any:
         """Return one setting: a number or a name, an array (n_knobs,), or a dict by name."""
-        own = {n: str(c[row]) if isinstance(c[row], str) else float(c[row]) for n, c in self.columns.items()}
+        knobs = {n: str(c[row]) if isinstance(c[row], str) else float(c[row]) for n, c in self.columns.items()}
         if self.form == "one":
-            return own["setting"]
-        return np.array(list(own.values())) if self.form == "several" else own
+            return knobs["setting"]
+        return np.array(list(knobs.values())) if self.form == "several" else knobs
 
     def checked_setting(self, setting: Any) -> Settings:
         """Parse one setting given in the form of `self[row]` as Settings of length 1; it need not be one of these.
@@ -130,8 +129,8 @@ class Settings:
             one = Settings.of({name: [value] for name, value in setting.items()} if by_name else [setting])
         except ParameterError:
             one = Settings({}, self.form)
-        kinds, own = ({name: column.dtype.kind for name, column in of.columns.items()} for of in (one, self))
-        require(one.form == self.form and kinds == own, "setting", setting, f"one like those given, such as {self[0]}")
+        kinds, here = ({name: column.dtype.kind for name, column in of.columns.items()} for of in (one, self))
+        require(one.form == self.form and kinds == here, "setting", setting, f"one like those given, such as {self[0]}")
         return one
 
 
@@ -198,7 +197,7 @@ class InstrumentModel:
         remembered = lru_cache(max(_BLOCK // len(settings), 1))(one)
 
         def one_by_one(theta: FloatArray, at: Settings) -> FloatArray:
-            return np.array([remembered(own[: len(names)].tobytes(), at) for own in theta])
+            return np.array([remembered(sample[: len(names)].tobytes(), at) for sample in theta])
 
         return cls(one_by_one, False, prior, noise)
 
@@ -246,7 +245,7 @@ def _called(function: Callable[..., Any], parameters: Any, settings: Any, shape:
 
 def _repeatable(one: Callable[[bytes, Settings], FloatArray], theta: FloatArray, at: Settings) -> FloatArray:
     """Return the readings, (n_samples, n_settings), of calls for one sample; ParameterError if they are of no use."""
-    alone = np.array([one(own.tobytes(), at) for own in theta])
+    alone = np.array([one(sample.tobytes(), at) for sample in theta])
     sound = np.isfinite(alone).any(axis=1)
     if not sound.any():
         found = f"not finite at any of the {sound.size} points of the prior that were tried"
@@ -287,24 +286,24 @@ class ReadingsProblem:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
-        return np.asarray(self.predict(theta).sum(axis=1))
+        return np.asarray(self.evaluate(theta).sum(axis=1))
 
-    def predict(self, theta: FloatArray) -> FloatArray:
+    def evaluate(self, theta: FloatArray) -> FloatArray:
         """Return the log density of every reading, (n_samples, n_params) -> (n_samples, n_readings)."""
         predicted = self.model.predict(theta, self.settings)
         scale = self.model.scale(theta, predicted)
         return self.model.noise.log_density(self.values, predicted[:, self.row], scale[:, self.row])
 
-    def log_likelihoods(self, predicted: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-        """Return log likelihoods without and with the last reading, (n_samples,) each, from `predict`."""
-        return predicted[:, :-1].sum(axis=1), predicted.sum(axis=1)
+    def log_likelihoods(self, evaluated: FloatArray, power: float) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihoods without and with the last reading, (n_samples,) each, from `evaluate`."""
+        return evaluated[:, :-1].sum(axis=1), evaluated.sum(axis=1)
 
-    def least_misfit_nats(self, predicted: FloatArray) -> float:
+    def least_misfit_nats(self, evaluated: FloatArray) -> float:
         """Return by how many nats the best density of the last reading misses its largest; 0 if the sd is unknown."""
         noise, last = self.model.noise, self.values[-1:]
         if noise.is_sd_inferred:  # wide enough, it explains any reading
             return 0.0
-        return float(noise.log_density(last, last, noise.scale(last[None], None)[0])[0] - predicted[:, -1].max())
+        return float(noise.log_density(last, last, noise.scale(last[None], None)[0])[0] - evaluated[:, -1].max())
 
     def p_value_and_worst_reading(self, theta: FloatArray) -> tuple[float, int]:
         """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
@@ -380,10 +379,8 @@ class Inquiry(ShowsItself):
         self._rng = rng
         self._goal = _checked_goal(goal, self._model.prior.names)
         self._cost_s = cost_s
-        self._n_samples, self._n_live = (
-            checked_whole("n_samples", n_samples, least=400, most=1_000_000),
-            checked_whole("n_live", n_live),
-        )
+        self._n_samples = checked_whole("n_samples", n_samples, least=400, most=1_000_000)
+        self._n_live = checked_whole("n_live", n_live)
         self._particles = prior_particles(self._model.prior, self._n_samples, rng=rng)
         self._prior_theta = self.posterior.theta
         self._prior_log_likelihood, self._lost_nats = np.zeros(self._n_samples), 0.0
@@ -498,7 +495,7 @@ class Inquiry(ShowsItself):
         at = self._settings.checked_setting(self._next if setting is None else setting)
         last = ReadingsProblem(self._model, at, np.array([0]), np.array([value]))
         readings = last if self._readings is None else self._readings.with_reading(last)
-        of_prior = self._prior_log_likelihood + last.predict(self._prior_theta)[:, 0]
+        of_prior = self._prior_log_likelihood + last.evaluate(self._prior_theta)[:, 0]
         by_prior = float(np.logaddexp.reduce(of_prior)) - math.log(self._n_samples)
         search = partial(nested_sampling_from_scratch, readings, n_live=self._n_live, rng=self._rng)
         found = update(self._particles, readings, rng=self._rng, fall_back=search, effort=LIGHT)
@@ -543,15 +540,15 @@ class Inquiry(ShowsItself):
     @own_arithmetic
     def summary(self) -> str:
         """Describe the posterior in plain text."""
-        found = self.posterior
-        width = max(9, *(len(name) for name in found.names))
-        low, high = found.interval(0.95)
+        posterior = self.posterior
+        width = max(9, *(len(name) for name in posterior.names))
+        low, high = posterior.interval(0.95)
         lines = [
-            f"{len(self._taken)} readings, log Z {found.log_z:.2f} ± {found.log_z_error:.2f}, "
-            f"effective sample size {found.n_eff:.0f} of {len(found.theta)}",
+            f"{len(self._taken)} readings, log Z {posterior.log_z:.2f} ± {posterior.log_z_error:.2f}, "
+            f"effective sample size {posterior.n_eff:.0f} of {len(posterior.theta)}",
             f"{'parameter':<{width}}  {'mean':>11}  {'sd':>11}  95 % interval",
         ]
-        for name, mean, sd, a, b in zip(found.names, found.mean(), found.sd(), low, high, strict=True):
+        for name, mean, sd, a, b in zip(posterior.names, posterior.mean(), posterior.sd(), low, high, strict=True):
             goal = f", asked for {self._goal[name]:.3g}" if name in self._goal else ""
             lines.append(f"{name:<{width}}  {mean:>11.5g}  {sd:>11.3g}  {a:.5g} to {b:.5g}{goal}")
         return "\n".join([*lines, *([] if self.doubt is None else [f"doubtful: {self.doubt}"])])
@@ -574,7 +571,7 @@ class Inquiry(ShowsItself):
 
     def _draw_hypotheses(self, weight: FloatArray) -> FloatArray:
         """Draw equally weighted samples from those of the posterior with these weights, copies of one sample apart."""
-        n = _N_ASKED if self._model.broadcasts else _FEWER_ASKED
+        n = _N_PREDICTED if self._model.broadcasts else _FEWER_PREDICTED
         rows: IntArray = self._rng.permutation(resampled_rows(weight, n, self._rng))
         return np.asarray(self.posterior.theta[rows])
 

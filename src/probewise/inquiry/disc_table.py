@@ -19,12 +19,11 @@ from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Known
 from probewise.errors import ParameterError
 from probewise.inquiry.forecast import (
-    MOST_ASKED,
+    MOST_PREDICTED,
     DirectForecast,
     Forecast,
     PredictiveDistributions,
-    cards_of,
-    footprint_share_by_card,
+    footprint_reach_mm,
     predict_where_visible,
     resampled_rows_and_weights,
     rows_by_combination,
@@ -35,14 +34,15 @@ from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.scene.scenes import mean_albedo_with_cards
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
+from probewise.sensor.chain import RegionsAndPoses, cards_of, response
 from probewise.sensor.commanded import led_state
-from probewise.sensor.stages import AnyEffect, SensorModel, Stage, View, require_theta_columns
+from probewise.sensor.stages import AnyEffect, Poses, SensorModel, Stage, View, require_theta_columns
 
 NAMES = ("x_mm", "y_mm", "radius_mm")
 
 _ROWS = 3  # of a grid per batch, to fit the cache
 _PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
-_N_ASKED = 200  # hypotheses of other shapes, without effects: with twice as many a map is no better and takes longer
+_N_PREDICTED = 200  # hypotheses of other shapes, without effects: with twice as many a map is no better but slower
 _COARSE_MM = 0.5  # spacing of distances at which the model is evaluated, for a cubic spline
 _FINE_MM = 0.125  # spacing of entries
 _PROBE_MM = 80.0  # largest distance from the edge that is evaluated
@@ -106,11 +106,11 @@ class DiscTable:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
         fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
-        asked = np.stack(
+        readings = np.stack(
             [_readings_around_disc(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)]
         )
-        asked = np.concatenate([asked, asked[:, :1]], axis=1)
-        levels = np.ascontiguousarray(CubicSpline(coarse, asked, axis=-1)(fine))  # so that it is flat for free
+        readings = np.concatenate([readings, readings[:, :1]], axis=1)
+        levels = np.ascontiguousarray(CubicSpline(coarse, readings, axis=-1)(fine))  # so that it is flat for free
         return cls(dark, bright, margin, bends, read_only_floats(levels))
 
     @property
@@ -188,7 +188,7 @@ class DiscTable:
             y_mm = _in_single_precision(grid.y_mm[start : start + _ROWS])
             every_up = y_mm[:, None] - y
             row, disc = np.nonzero(np.abs(every_up) <= radius + np.float32(margin))
-            middle, up, size, own = x[disc], every_up[row, disc], radius[disc], weight[disc]
+            middle, up, size, share = x[disc], every_up[row, disc], radius[disc], weight[disc]
             first, last = _columns_within(grid, middle, up, size + np.float32(margin))
             inner_first, inner_last = _columns_within(grid, middle, up, np.maximum(size - np.float32(margin), 0.0))
             none = np.flatnonzero(inner_first > inner_last)
@@ -204,10 +204,10 @@ class DiscTable:
                 entry = self._nearest_entry_index(away_x, up[crossing], size[crossing], turn_there, place)
                 level = nearest.reshape(-1)[entry]
             n_places, width = len(y_mm) * n_x, n_x + 1
-            near = np.bincount(place * n_levels + level, own[crossing], n_places * n_levels)
+            near = np.bincount(place * n_levels + level, share[crossing], n_places * n_levels)
             part = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # integers if there are no pairs
-            begins = np.bincount(row * width + inner_first, own, minlength=len(y_mm) * width)
-            ends = np.bincount(row * width + inner_last + 1, own, minlength=len(y_mm) * width)
+            begins = np.bincount(row * width + inner_first, share, minlength=len(y_mm) * width)
+            ends = np.bincount(row * width + inner_last + 1, share, minlength=len(y_mm) * width)
             inside = np.cumsum((begins - ends).reshape(len(y_mm), width), axis=1)[:, :-1].ravel()
             outside = weight.sum() - inside - part.sum(axis=1)
             part[:, bright] += inside
@@ -363,8 +363,8 @@ def _distance_to_constant_reading_mm(
     margin = _COARSE_MM
     for radius in (low_mm, high_mm):
         distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
-        asked = _readings_around_disc(model, radius, directions, distance)
-        off = np.abs(asked - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
+        readings = _readings_around_disc(model, radius, directions, distance)
+        off = np.abs(readings - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
         margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
     return margin
 
@@ -392,7 +392,7 @@ class DiscForecast:
         turns_rad = plan.orientation_rad.reshape(-1, grid.n_places)
         at_cards = self._rows_at_cards(plan.take(rows))
         if at_cards.size:
-            chosen, share = resampled_rows_and_weights(weight, MOST_ASKED)
+            chosen, share = resampled_rows_and_weights(weight, MOST_PREDICTED)
             predicted = self.model.predict(theta[chosen], plan.take(rows[at_cards]))
             index, stands_for = nearest_level_index(predicted, levels).clip(0, len(levels) - 1), share / weight[chosen]
 
@@ -405,9 +405,9 @@ class DiscForecast:
                     stood, mass = turn, table.level_histogram(theta[some], weight[some], grid, levels, turn)
                 here = mass if len(places) == len(mass) else mass[places]
                 if at_cards.size:
-                    _, own, asked = np.intersect1d(at, at_cards, return_indices=True)
+                    _, here_rows, card_rows = np.intersect1d(at, at_cards, return_indices=True)
                     here = here.copy()
-                    here[own] = weight_by_level(index[:, asked], weight[chosen] * stands_for, len(levels))
+                    here[here_rows] = weight_by_level(index[:, card_rows], weight[chosen] * stands_for, len(levels))
                 yield at, here
 
         return PredictiveDistributions(levels, level_weights)
@@ -416,7 +416,7 @@ class DiscForecast:
         """Return the rows of a plan at which cards show."""
         if not isinstance(self.model, TabulatedChain) or not cards_of(self.model.chain):
             return np.empty(0, dtype=np.int64)
-        shares = footprint_share_by_card(self.model.chain, self.model.chain.poses(np.empty((1, 0)), plan), plan)
+        shares = self.model.footprint_share_by_card(self.model.chain.poses(np.empty((1, 0)), plan), plan)
         return np.flatnonzero(sum(share[0] for share in shares) > _SHOWS)
 
 
@@ -453,10 +453,29 @@ class TabulatedChain:
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
         if cards := cards_of(self.chain):
-            seen = mean_albedo_with_cards(seen, cards, footprint_share_by_card(self.chain, poses, plan))
+            seen = mean_albedo_with_cards(seen, cards, self.footprint_share_by_card(poses, plan))
         edged = any(effect.stage == Stage.SEEN for effect in self.chain.effects)  # others need no regions from here on
         view = View(np.asarray(seen), poses, self.chain.scene.regions(disc) if edged else {})
         return self.chain.readings_from_simulated_view(view, theta, plan)
+
+    def footprint_share_by_card(self, poses: Poses, plan: Plan) -> list[FloatArray]:
+        """Return for each card the share of the footprint of a known mixture on it, (n_samples or 1, n_points)."""
+        mixture = self.chain.ssf
+        assert isinstance(mixture, FixedMixture)
+        reach, footprint = footprint_reach_mm(mixture), mixture.footprint(np.empty((1, 0)))
+        shares = []
+        for card in cards_of(self.chain):
+            out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
+            within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
+                np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
+            )
+            rows = np.flatnonzero(within.any(axis=0))
+            if rows.size:
+                there, part = Poses(*(a[:, rows] for a in poses.arrays)), plan.take(rows)
+                layout = RegionsAndPoses(dict.fromkeys(part.pattern_names, card.region), there, part)
+                out[:, rows] = response(layout, footprint, n_nodes=self.chain.n_nodes)
+            shares.append(out)
+        return shares
 
 
 def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast:
@@ -479,4 +498,4 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
         return DirectForecast((plain and TabulatedChain.of(chain, plain)) or model)
     if chain is None or chain.effects:
         return DirectForecast(model)
-    return DirectForecast(model, _N_ASKED, _PER_SD)
+    return DirectForecast(model, _N_PREDICTED, _PER_SD)

@@ -1,8 +1,9 @@
-"""The inquiry engine (paper, section "The Machine Learning System", figures 2 and 8).
+"""The inquiry engine (paper, section 2.3, figures 2 and 8).
 
-Fifty hypotheses, drawn from the posterior, predict a reading at every place of a fine grid. The predictions at a place
-fall into bins as wide as the sensor's step; with p_j the share of hypotheses in bin j, H = - sum_j p_j log2 p_j is the
-entropy of the reading there. The next reading is taken at random among the reachable places where H is largest.
+Fifty hypotheses, drawn from the posterior, predict a noise-free reading at every place of a fine grid (the paper: "a
+sample of what measurement could be expected"). The predictions at a place fall into bins as wide as the sensor's step;
+with p_j the share of hypotheses in bin j, H = - sum_j p_j log2 p_j is the entropy of the reading. The next place is
+drawn at random among the reachable ones where H is largest.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class UtilityMap:
 
     @property
     def is_flat(self) -> bool:
-        """Whether there is no choice: all available designs have equal utility (to 1e-5), or the only one has none."""
+        """Whether all available designs have equal utility (to 1e-5), or the only one has none."""
         values = self.values[self.reachable]
         return bool(np.ptp(values) <= FLAT and (len(values) > 1 or values[0] <= FLAT))
 
@@ -84,8 +85,8 @@ def entropy_map(
 def label_entropy(labels: FloatArray) -> FloatArray:
     """Return the entropy, in bits, of the labels in each column, (n_samples, n_places) -> (n_places,).
 
-    H = log2(n) - sum_j c_j log2(c_j) / n over the distinct labels j of a column, c_j their
-    counts: those are the lengths of the runs of a sorted column, found for all at once.
+    H = log2(n) - sum_j c_j log2(c_j) / n over the distinct labels j of a column, with counts c_j, which are the lengths
+    of runs in the sorted column.
     """
     n_samples, n_places = labels.shape
     rows = np.sort(labels.T, axis=1)
@@ -106,7 +107,7 @@ def map_of_rows(designs: Designs, rows: IntArray, utility: FloatArray, label: st
         raise ShapeError(f"the utility gives {utility.shape} values; allowed: {rows.shape}, one per design")
     values, reachable = np.zeros(len(designs)), np.zeros(len(designs), dtype=np.bool_)
     values[rows], reachable[rows] = utility, True
-    best_places_mask(values, reachable)  # raises if a value is not finite
+    best_designs_mask(values, reachable)  # raises if a value is not finite
     values.flags.writeable = False
     return UtilityMap(designs, values, reachable, label)
 
@@ -128,11 +129,11 @@ def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1)
     return np.flatnonzero(np.tile(reachable, n_combinations))
 
 
-def best_places_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
-    """Mark the reachable places within `TIE` (1e-9) of the highest reachable utility; a mask, all arrays (n_places,).
+def best_designs_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
+    """Mark the reachable designs within `TIE` (1e-9) of the highest reachable utility; all arrays (n_designs,).
 
-    ReachError if no place is reachable, ShapeError if the arrays differ in shape, ParameterError if the utility of a
-    reachable place is not finite.
+    ReachError if none is reachable, ShapeError if the arrays differ in shape, ParameterError if the utility of a
+    reachable design is not finite.
     """
     if utility.shape != reachable.shape or utility.ndim != 1:
         raise ShapeError(f"utility has shape {utility.shape}, reachable {reachable.shape}; allowed: (n_places,) both")
@@ -143,8 +144,8 @@ def best_places_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
 
 
 def choose(utility: FloatArray, reachable: BoolArray, *, rng: np.random.Generator) -> int:
-    """Draw the index of the next place at random among the best (paper, the machine learning system).
+    """Draw the index of the next design at random among the best (paper, section 2.3).
 
-    It raises as `best_places_mask` does.
+    It raises as `best_designs_mask` does.
     """
-    return int(rng.choice(np.flatnonzero(best_places_mask(utility, reachable))))
+    return int(rng.choice(np.flatnonzero(best_designs_mask(utility, reachable))))

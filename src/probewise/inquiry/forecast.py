@@ -1,4 +1,4 @@
-"""Predictions for many hypotheses at many designs, and the share of the footprint on known cards."""
+"""Predictions for many hypotheses at many designs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from probewise.errors import ParameterError
 from probewise.inquiry.grid import Designs
 from probewise.inquiry.readout import MOST_LEVELS, evenly_spaced_levels, weight_by_level
 from probewise.recordings.plan import Plan
-from probewise.scene import Card, CardedScene, HypothesisScene, outlines
+from probewise.scene import CardedScene, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.sensor.chain import RegionsAndPoses, response
 from probewise.sensor.commanded import has_commanded_height_or_led
-from probewise.sensor.stages import Poses, SensorModel
+from probewise.sensor.stages import SensorModel
 
 _BLOCK = 2048  # designs predicted at a time: a closed form with 20 nodes stays within 20 MB for 50 hypotheses
-MOST_ASKED = 400  # hypotheses predicted directly
+MOST_PREDICTED = 400  # hypotheses predicted directly
 _PER_SD = 8.0  # levels per noise sd: fine, since each of a few hundred hypotheses matters
 _REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
 _TILE_MM = 110.0
@@ -64,13 +63,13 @@ class Forecast(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DirectForecast:
-    """A forecast for any model: direct predictions of at most `n_asked` hypotheses, resampled systematically.
+    """A forecast for any model: direct predictions of at most `n_predicted` hypotheses, resampled systematically.
 
     `levels_per_sd`: number of levels per sd of the noise.
     """
 
     model: SensorModel
-    n_asked: int = MOST_ASKED
+    n_predicted: int = MOST_PREDICTED
     levels_per_sd: float = _PER_SD
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -81,11 +80,11 @@ class DirectForecast:
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
         """Return the predictive distribution at `rows`, by predictions of the resampled hypotheses."""
-        chosen, share = resampled_rows_and_weights(weight, self.n_asked)
-        answers = predict_where_visible(self.model, theta[chosen], plan.take(rows))
-        low, high = float(answers.min()), float(answers.max())
+        chosen, share = resampled_rows_and_weights(weight, self.n_predicted)
+        predicted = predict_where_visible(self.model, theta[chosen], plan.take(rows))
+        low, high = float(predicted.min()), float(predicted.max())
         levels = evenly_spaced_levels(low, high, noise_sd / self.levels_per_sd, most=MOST_LEVELS)
-        index = np.rint((answers - levels[0]) * (1.0 / (levels[1] - levels[0]))).astype(np.int32)
+        index = np.rint((predicted - levels[0]) * (1.0 / (levels[1] - levels[0]))).astype(np.int32)
         stands_for = share / weight[chosen]
 
         def level_weights(weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
@@ -160,41 +159,14 @@ def _bounding_boxes(model: SensorModel, theta: FloatArray, plan: Plan) -> tuple[
         edges = outlines(model.scene.shape.region(theta))
     except ParameterError:  # no closed edge: it may be visible anywhere
         return None
-    reach = _footprint_reach_mm(model.ssf)
+    reach = footprint_reach_mm(model.ssf)
     low, high = (np.array([f(edge, axis=0) for edge in edges]) for f in (np.nanmin, np.nanmax))
     one = plan.take(np.array([0]))
     outside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
     return low - reach, high + reach, float(outside)
 
 
-def _footprint_reach_mm(mixture: FixedMixture) -> float:
+def footprint_reach_mm(mixture: FixedMixture) -> float:
     """Return the distance from the sensor beyond which its footprint is negligible."""
     sds = np.sqrt(np.linalg.eigvalsh(mixture.covs_mm2)[:, -1])
     return float((np.linalg.norm(mixture.means_mm, axis=1) + _REACH * sds).max())
-
-
-def cards_of(model: SensorModel) -> tuple[Card, ...]:
-    """Return the known cards on a model's field; empty if its scene has none."""
-    scene = getattr(model, "scene", None)
-    return scene.cards if isinstance(scene, CardedScene) else ()
-
-
-def footprint_share_by_card(chain: Chain, poses: Poses, plan: Plan) -> list[FloatArray]:
-    """Return for each card the share of the footprint of a known mixture on it, (n_samples or 1, n_points)."""
-    mixture = chain.ssf
-    assert isinstance(mixture, FixedMixture)
-    reach, footprint = _footprint_reach_mm(mixture), mixture.footprint(np.empty((1, 0)))
-    found = []
-    for card in cards_of(chain):
-        out = np.zeros(np.broadcast_shapes(poses.x_mm.shape, poses.y_mm.shape))
-        within = (np.abs(poses.x_mm - card.x_mm) < card.width_mm / 2 + reach) & (
-            np.abs(poses.y_mm - card.y_mm) < card.height_mm / 2 + reach
-        )
-        rows = np.flatnonzero(within.any(axis=0))
-        if rows.size:
-            there = Poses(*(a[:, rows] for a in poses.arrays))
-            part = plan.take(rows)
-            regions = dict.fromkeys(part.pattern_names, card.region)
-            out[:, rows] = response(RegionsAndPoses(regions, there, part), footprint, n_nodes=chain.n_nodes)
-        found.append(out)
-    return found

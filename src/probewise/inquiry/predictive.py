@@ -1,7 +1,7 @@
-"""The noise of a reading, and the weights of a posterior's samples given each possible reading of any setting.
+"""The noise of a reading, and the weights of hypotheses given each possible reading.
 
-The same weights serve the robot (`WeightsGivenReading`): from them follow the expected information of a
-reading, and the expected distance of posterior sds from a goal.
+From these follow the expected information of a reading, the probability that it reaches a target sd, and the expected
+distance of posterior sds from a goal.
 """
 
 from __future__ import annotations
@@ -110,11 +110,11 @@ class ReadingNoise:
             return np.asarray(np.broadcast_to(sd[:, None], predicted.shape))
         if not callable(self.sd):
             return np.full(predicted.shape, self.sd)
-        found = np.asarray(self.sd(predicted.ravel()), dtype=np.float64)
-        if found.shape not in ((), (predicted.size,)):
+        sds = np.asarray(self.sd(predicted.ravel()), dtype=np.float64)
+        if sds.shape not in ((), (predicted.size,)):
             allowed = f"({predicted.size},), one for each predicted reading"
-            raise ShapeError(f"noise sd returns shape {found.shape}; allowed: {allowed}")
-        out = np.array(np.broadcast_to(found, (predicted.size,))).reshape(predicted.shape)
+            raise ShapeError(f"noise sd returns shape {sds.shape}; allowed: {allowed}")
+        out = np.array(np.broadcast_to(sds, (predicted.size,))).reshape(predicted.shape)
         bad = ~((out > 0) & np.isfinite(out))
         if bad.any():
             where = predicted[bad][0]
@@ -203,7 +203,7 @@ class WeightsGivenReading:
 
     @classmethod
     def of(
-        cls, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
+        cls, predicted: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0, repeats: int = 1
     ) -> Self:
         """Build from predicted readings, (n, n_designs), and the weights of the hypotheses, (n,).
 
@@ -211,9 +211,9 @@ class WeightsGivenReading:
         of which the mean counts.
         """
         sd = readout.noise_sd / math.sqrt(repeats)
-        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), sd / _PER_SD, most=MOST_LEVELS)
+        levels = evenly_spaced_levels(float(predicted.min()), float(predicted.max()), sd / _PER_SD, most=MOST_LEVELS)
         chance = readout.cell_probability(levels, repeats=repeats, fine=fine, most=MOST_LEVELS)
-        return cls(nearest_level_index(answers, levels), weight, chance)
+        return cls(nearest_level_index(predicted, levels), weight, chance)
 
     @cached_property
     def weight_by_cell(self) -> FloatArray:
@@ -235,13 +235,13 @@ class WeightsGivenReading:
         """Sum over hypotheses of weight times value times cell probability: values (n,) -> (n_designs, n_cells)."""
         return np.asarray(weight_by_level(self.index, self.weight * values, len(self.chance)) @ self.chance)
 
-    def probability_of_knowing(
+    def probability_of_reaching_target(
         self, lengths: FloatArray, sd: float, *, off: float = math.inf, most_off: float = 1.0
     ) -> FloatArray:
-        """Return the probability, (n_designs,), that after the reading all lengths, (n, n_lengths), are known to `sd`.
+        """Return the probability, (n_designs,), that a reading brings all sds of lengths, (n, n_lengths), below `sd`.
 
-        And that the probability of a length more than `off` from its mean is below `most_off`. The lengths are those
-        of each hypothesis, best less their means, so that no digits are lost.
+        And that a length is more than `off` from its mean with a probability below `most_off`. The lengths are of each
+        hypothesis, best less their means, so that no digits are lost.
         """
         weight, means = self.weight_by_cell, []
         ends = np.ones(weight.shape, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""What a reading can tell: noise, rounding and range of a reading, entropies, and bounds on the number of readings."""
+"""Noise, rounding and range of a reading; entropies; the capacity of a sensor in bits per reading."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int |
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
 
 
-def nearest_level_index(answers: FloatArray, levels: FloatArray) -> IntArray:
+def nearest_level_index(predicted: FloatArray, levels: FloatArray) -> IntArray:
     """Return the index of the nearest of evenly spaced levels to each prediction, of the same shape."""
-    return np.asarray(np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
+    return np.asarray(np.rint((predicted - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
 
 
 def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:

@@ -39,7 +39,7 @@ from probewise.priors import Prior
 _SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
 _STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
 _MOST_ROUNDS = 6
-_MANY_DEGREES = 4
+_MANY_TEMPERATURES = 4
 _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 _MOST_KERNELS = 250
@@ -61,18 +61,18 @@ class SequentialProblem(Protocol):
         """Prior of the parameters."""
         ...
 
-    def predict(self, theta: FloatArray) -> Any:
-        """Predict all readings, theta (n_samples, n_params), for the two functions below."""
+    def evaluate(self, theta: FloatArray) -> Any:
+        """Compute once per batch, theta (n_samples, n_params), what the functions below need, such as predictions."""
         ...
 
-    def log_likelihoods(self, predicted: Any, share: float) -> tuple[FloatArray, FloatArray]:
+    def log_likelihoods(self, evaluated: Any, power: float) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples,) each.
 
-        Those without it count for nothing where that reading's likelihood has the power `share` 1: any number will do.
+        With the last reading's likelihood to the `power` 1, those without it are not used: any number will do.
         """
         ...
 
-    def least_misfit_nats(self, predicted: Any) -> float:
+    def least_misfit_nats(self, evaluated: Any) -> float:
         """Return by how many nats the best prediction of the last reading misses it."""
         ...
 
@@ -121,8 +121,8 @@ class Particles:
     lost_log_z
         Upper bound on the log evidence of a mode that the samples lack: at the last search of the prior it had less
         than one sample, and it may have given every reading since exactly. Infinite if there was no search.
-    asleep
-        Whether the samples are those of fewer readings, and the evidence an upper bound: see `asleep_with`.
+    suspended
+        Whether the samples are those of fewer readings, and the evidence an upper bound: see `suspended_with`.
     """
 
     weighted: Weighted
@@ -132,7 +132,7 @@ class Particles:
     strained: bool = False
     hurried: bool = False
     lost_log_z: float = math.inf
-    asleep: bool = False
+    suspended: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -159,12 +159,12 @@ class Particles:
         related = float(lineages @ lineages) - (self.n_resampled + 1) / len(self.ancestor)
         return max(math.sqrt(max(related, 0.0) + self.start_variance), self.weighted.log_z_error)
 
-    def asleep_with(self, log_likelihood: float) -> Self:
+    def suspended_with(self, log_likelihood: float) -> Self:
         """Return the samples as they are, with the evidence as if they all gave a reading this log likelihood."""
-        return replace(self, weighted=replace(self.weighted, log_z=self.log_z + log_likelihood), asleep=True)
+        return replace(self, weighted=replace(self.weighted, log_z=self.log_z + log_likelihood), suspended=True)
 
     def searched(self, log_z: float) -> Self:
-        """Return the samples as those of a search of the prior that has found this log evidence."""
+        """Return the samples as those of a search of the prior that gave this log evidence."""
         return replace(self, lost_log_z=log_z - math.log(len(self.ancestor)))
 
     def with_zero_evidence(self) -> Self:
@@ -205,21 +205,16 @@ def update(
     least = effort.least_share * n
     if before.log_z == -math.inf:
         return previous
-    predicted = problem.predict(before.theta)
-    now = _EvaluatedSamples(
-        before.theta, problem.prior.log_prob(before.theta), *problem.log_likelihoods(predicted, 1.0)
-    )
-    log_weight, base, ancestor, strained = (
-        before.log_weight,
-        before.log_likelihood,
-        previous.ancestor,
-        previous.strained,
-    )
-    log_z, variance, n_calls, share, degrees = before.log_z, before.log_z_error**2, n, 0.0, 0
-    stuck = problem.least_misfit_nats(predicted) > _SURPRISED
+    evaluated = problem.evaluate(before.theta)
+    log_prior = problem.prior.log_prob(before.theta)
+    now = _EvaluatedSamples(before.theta, log_prior, *problem.log_likelihoods(evaluated, 1.0))
+    log_weight, base = before.log_weight, before.log_likelihood
+    ancestor, strained = previous.ancestor, previous.strained
+    log_z, variance, n_calls, power, n_temperatures = before.log_z, before.log_z_error**2, n, 0.0, 0
+    stuck = problem.least_misfit_nats(evaluated) > _SURPRISED
     while True:
-        all_at_once = n_effective(_updated_log_weights(log_weight, now.after, base))
-        given_up = degrees >= effort.most_temperatures
+        all_at_once = n_effective(_updated_log_weights(log_weight, now.with_last, base))
+        given_up = n_temperatures >= effort.most_temperatures
         stuck |= all_at_once == 0.0 or (given_up and all_at_once < least)
         if stuck and fall_back is not None:
             return particles_from_run(fall_back(), n, problem, n_calls=n_calls, rng=rng)
@@ -227,30 +222,31 @@ def update(
             return replace(previous.with_zero_evidence(), strained=True)
         strained |= stuck
         if all_at_once >= least or given_up:
-            share = 1.0
+            power = 1.0
         else:
-            if degrees == 0:  # the first temperature: only now the readings before count too
-                now = replace(now, before=problem.log_likelihoods(predicted, share)[0])
-            share = _next_power(log_weight, base, now, share, least)
-        weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
+            if n_temperatures == 0:  # the first temperature: only now the readings before count too
+                now = replace(now, without_last=problem.log_likelihoods(evaluated, power)[0])
+            power = _next_power(log_weight, base, now, power, least)
+        weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base)
         gained = float(logsumexp(weighed))
-        log_z, log_weight, base = log_z + gained, weighed - gained, now.log_likelihood_at_power(share)
+        log_z, log_weight, base = log_z + gained, weighed - gained, now.log_likelihood_at_power(power)
         n_eff = n_effective(log_weight)
         variance += max(1.0 / n_eff - 1.0 / n, 0.0)
-        if share == 1.0 and n_eff >= least:
+        if power == 1.0 and n_eff >= least:
             break
         rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         parts = _partition_rows(rows) if fall_back is None else [np.arange(n)]
-        now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), share, problem, rng, parts, effort)
-        n_calls, degrees, ancestor, stuck = n_calls + n_moves, degrees + 1, ancestor[rows], accepted < _STIFF
-        base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
-        if share == 1.0 and (fall_back is None or not stuck):
+        now, accepted, n_moves = _move_by_metropolis(now.take_rows(rows), power, problem, rng, parts, effort)
+        n_calls, n_temperatures = n_calls + n_moves, n_temperatures + 1
+        ancestor, stuck = ancestor[rows], accepted < _STIFF
+        base, log_weight = now.log_likelihood_at_power(power), np.full(n, -math.log(n))
+        if power == 1.0 and (fall_back is None or not stuck):
             strained |= stuck
             break
     found = Weighted(
         before.names,
         now.theta,
-        log_likelihood=now.after,
+        log_likelihood=now.with_last,
         log_weight=log_weight,
         log_z=log_z,
         log_z_error=math.sqrt(variance),
@@ -262,9 +258,9 @@ def update(
         previous,
         weighted=found,
         ancestor=ancestor,
-        n_resampled=previous.n_resampled + degrees,
+        n_resampled=previous.n_resampled + n_temperatures,
         strained=strained,
-        hurried=previous.hurried or degrees >= _MANY_DEGREES,
+        hurried=previous.hurried or n_temperatures >= _MANY_TEMPERATURES,
     )
 
 
@@ -280,16 +276,14 @@ def resample_and_move(
 
     `problem` holds the readings included so far.
     """
-    had = particles.weighted
-    if n == len(had.theta) or had.log_z == -math.inf:
+    before = particles.weighted
+    if n == len(before.theta) or before.log_z == -math.inf:
         return particles
-    rows = resampled_rows(had.weight, n, rng)
-    log_likelihood = had.log_likelihood[rows]
-    start = _EvaluatedSamples(
-        had.theta[rows], problem.prior.log_prob(had.theta[rows]), log_likelihood, log_likelihood.copy()
-    )
-    found = _moved_apart(start, had, problem, n_calls=had.n_calls, run=had.run, rng=rng, effort=effort)
-    lost, n_resampled = max(particles.lost_log_z, had.log_z - math.log(n)), particles.n_resampled + 1
+    rows = resampled_rows(before.weight, n, rng)
+    theta, log_likelihood = before.theta[rows], before.log_likelihood[rows]
+    start = _EvaluatedSamples(theta, problem.prior.log_prob(theta), log_likelihood, log_likelihood.copy())
+    found = _moved_apart(start, before, problem, n_calls=before.n_calls, run=before.run, rng=rng, effort=effort)
+    lost, n_resampled = max(particles.lost_log_z, before.log_z - math.log(n)), particles.n_resampled + 1
     ancestor = particles.ancestor[rows]
     return replace(particles, weighted=found, ancestor=ancestor, n_resampled=n_resampled, lost_log_z=lost)
 
@@ -327,7 +321,7 @@ def _moved_apart(
     return evenly_weighted(
         found.names,
         moved.theta,
-        moved.after,
+        moved.with_last,
         log_z=found.log_z,
         log_z_error=found.log_z_error,
         n_calls=n_calls + n_moves,
@@ -351,44 +345,44 @@ def nested_sampling_from_scratch(
 
 @dataclass(frozen=True, eq=False)
 class _EvaluatedSamples:
-    """Samples with their log prior, and their log likelihood without (`before`) and with (`after`) the last reading."""
+    """Samples with their log prior, and their log likelihoods without and with the last reading."""
 
     theta: FloatArray
     log_prior: FloatArray
-    before: FloatArray
-    after: FloatArray
+    without_last: FloatArray
+    with_last: FloatArray
 
     @classmethod
-    def of(cls, theta: FloatArray, problem: SequentialProblem, share: float) -> _EvaluatedSamples:
+    def of(cls, theta: FloatArray, problem: SequentialProblem, power: float) -> _EvaluatedSamples:
         """Evaluate samples (see `SequentialProblem.log_likelihoods`); outside the prior the likelihood is zero."""
         log_prior = problem.prior.log_prob(theta)
-        before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
+        without_last, with_last = np.zeros(len(theta)), np.full(len(theta), -np.inf)
         possible = np.isfinite(log_prior)
         if possible.any():
-            predicted = problem.predict(theta[possible])
-            before[possible], after[possible] = problem.log_likelihoods(predicted, share)
-        return cls(theta, log_prior, before, after)
+            evaluated = problem.evaluate(theta[possible])
+            without_last[possible], with_last[possible] = problem.log_likelihoods(evaluated, power)
+        return cls(theta, log_prior, without_last, with_last)
 
-    def log_likelihood_at_power(self, share: float) -> FloatArray:
-        """Return the log likelihood, (n,), with the last reading's likelihood raised to the power `share`."""
-        return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
+    def log_likelihood_at_power(self, power: float) -> FloatArray:
+        """Return the log likelihood, (n,), with the last reading's likelihood to this power."""
+        return self.with_last if power == 1.0 else (1.0 - power) * self.without_last + power * self.with_last
 
     def take_rows(self, rows: IntArray) -> _EvaluatedSamples:
-        return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
+        return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.without_last[rows], self.with_last[rows])
 
     def with_rows_overwritten(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
         """Return the samples, with those of `other` (as many) in the rows that the mask `rows` marks."""
         return _EvaluatedSamples(
             np.where(rows[:, None], other.theta, self.theta),
             np.where(rows, other.log_prior, self.log_prior),
-            np.where(rows, other.before, self.before),
-            np.where(rows, other.after, self.after),
+            np.where(rows, other.without_last, self.without_last),
+            np.where(rows, other.with_last, self.with_last),
         )
 
 
 def _move_by_metropolis(
     start: _EvaluatedSamples,
-    share: float,
+    power: float,
     problem: SequentialProblem,
     rng: np.random.Generator,
     parts: Sequence[IntArray],
@@ -396,7 +390,7 @@ def _move_by_metropolis(
 ) -> tuple[_EvaluatedSamples, float, int]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
-    That density has the last reading's likelihood to the power `share`. A round is a proposal from kernels fitted to
+    That density has the last reading's likelihood to this power. A round is a proposal from kernels fitted to
     the samples, then one along the difference of two samples (ter Braak 2006): the first follows curved shells in few
     dimensions, the second works in many. Each of `parts` (rows of the samples) is moved by kernels fitted to the
     previous part, since kernels fitted to the moved samples themselves would be biased. Return the samples, the mean
@@ -412,12 +406,12 @@ def _move_by_metropolis(
             theta, log_ratio = np.empty_like(now.theta), np.empty(n)
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
-            proposed = _EvaluatedSamples.of(theta, problem, share)
+            proposed = _EvaluatedSamples.of(theta, problem, power)
             odds = (
                 proposed.log_prior
-                + proposed.log_likelihood_at_power(share)
+                + proposed.log_likelihood_at_power(power)
                 - now.log_prior
-                - now.log_likelihood_at_power(share)
+                - now.log_likelihood_at_power(power)
                 + log_ratio
             )
             taken = np.log(rng.random(n)) < odds
@@ -456,14 +450,14 @@ def _partition_rows(rows: IntArray) -> list[IntArray]:
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
-def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, share: float, enough: float) -> float:
-    """Return the largest power above `share` of the last reading's likelihood with `enough` effective samples."""
+def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, power: float, enough: float) -> float:
+    """Return the largest power, above this one, of the last reading's likelihood with `enough` effective samples."""
 
     def log_weights_at(power: float) -> FloatArray:
         return _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base)
 
-    low, _ = power_bracket(log_weights_at, share, 1.0, wanted=enough, n_steps=30)
-    return max(low, share + 1e-6)
+    low, _ = power_bracket(log_weights_at, power, 1.0, wanted=enough, n_steps=30)
+    return max(low, power + 1e-6)
 
 
 def _updated_log_weights(log_weight: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray:

@@ -16,11 +16,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, require_finite
 from probewise.errors import ParameterError, did_you_mean, require
 from probewise.inquiry.entropy import UtilityMap, choose, label_entropy, map_of_rows
-from probewise.inquiry.forecast import (
-    Forecast,
-    PredictiveDistributions,
-    resampled_rows_and_weights,
-)
+from probewise.inquiry.forecast import Forecast, PredictiveDistributions, resampled_rows_and_weights
 from probewise.inquiry.grid import Designs
 from probewise.inquiry.predictive import WeightsGivenReading
 from probewise.inquiry.readout import MOST_LEVELS, Readout, entropy_bits
@@ -30,7 +26,7 @@ _CELL = 0.75  # width of a cell in noise sds, for unrounded readings: loses 2 % 
 _SETTLED = 1.0 - 1e-7  # weight of one level from which it counts as certain
 _BLOCK = 512  # designs per batch, to fit the cache
 _NEAR = 15.0  # times the target sd: beyond it, no single reading ends a run
-_MOST_ASKED = 800  # hypotheses for the probability of ending a run
+_MOST_PREDICTED = 800  # hypotheses for the probability of reaching the target
 _MOST_DESIGNS = 250  # the best by the other utility
 _OUTCOMES = 16  # simulated outcomes of the readings of a batch chosen so far
 _FEW = 600  # hypotheses used to simulate them
@@ -38,7 +34,7 @@ _FEW = 600  # hypotheses used to simulate them
 
 @dataclass(frozen=True)
 class Goal:
-    """The stopping rule of a run: the posterior sds of the columns `columns` of theta are all below `sd`."""
+    """The target sd of a run, a part of its stopping rule: the posterior sds of `columns` of theta are below `sd`."""
 
     columns: tuple[int, ...]
     sd: float
@@ -65,7 +61,7 @@ class UtilityInput:
     cost_s
         Seconds that each available design takes, (n,).
     goal
-        The stopping rule, if it is one of sds; else None.
+        The target sd of the lengths; None for a set of shapes.
     """
 
     forecast: Forecast
@@ -87,9 +83,9 @@ class UtilityInput:
     @cached_property
     def predicted(self) -> FloatArray:
         """Noise-free readings of the drawn samples at every available design, (n_drawn, n)."""
-        answers = self.forecast.predict(self.drawn, self.plan.take(self.rows))
-        require_finite("predicted", answers)
-        return answers
+        predicted = self.forecast.predict(self.drawn, self.plan.take(self.rows))
+        require_finite("predicted", predicted)
+        return predicted
 
     @cached_property
     def predictive(self) -> PredictiveDistributions:
@@ -137,14 +133,14 @@ class Utility(Protocol):
         """Label with unit, for a colour bar."""
         ...
 
-    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+    def __call__(self, inputs: UtilityInput) -> FloatArray:
         """Return the utility of every available design, (n,)."""
         ...
 
 
 @dataclass(frozen=True)
 class ReadingEntropy:
-    """Shannon entropy, in bits, of the readings that a few hypotheses predict (paper, the machine learning system).
+    """Shannon entropy, in bits, of the readings that a few hypotheses predict (paper, section 2.3).
 
     The predictions are noise-free and fall into fixed bins, `bin_width` wide and centred on its multiples: one LEGO
     unit rounds as the sensor does. For the naive model there are two readings, so the map is the paper's partition: at
@@ -158,9 +154,9 @@ class ReadingEntropy:
     def __post_init__(self) -> None:
         require(0 < self.bin_width < np.inf, "bin_width", self.bin_width, "finite, greater than 0")
 
-    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+    def __call__(self, inputs: UtilityInput) -> FloatArray:
         """Return the entropy in bits at every available design, (n,)."""
-        return label_entropy(np.rint(utility_input.predicted / self.bin_width))
+        return label_entropy(np.rint(inputs.predicted / self.bin_width))
 
 
 @dataclass(frozen=True)
@@ -173,34 +169,34 @@ class InformationGain:
 
     label: ClassVar[str] = "expected information (bits)"
 
-    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+    def __call__(self, inputs: UtilityInput) -> FloatArray:
         """Return the bits at every available design, (n,)."""
-        return utility_input.information(utility_input.weight)
+        return inputs.information(inputs.weight)
 
 
 @dataclass(frozen=True)
 class InformationAbout:
-    """Expected information, in bits, about a label: a function of the parameters, or the kind of shape.
+    """Expected information, in bits, about a partition of the hypotheses: by a parameter, or by the kind of shape.
 
-    The entropy of the predictive distribution minus its expected entropy given the label: differences among hypotheses
-    of the same label do not count.
+    The entropy of the predictive distribution minus its expected entropy given the part: differences among hypotheses
+    of one part do not count.
     """
 
-    of: Label
+    of: Partition
 
     @property
     def label(self) -> str:
-        """Label of the information and its target."""
+        """Label that names the partition."""
         return f"information about {self.of} (bits)"
 
-    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+    def __call__(self, inputs: UtilityInput) -> FloatArray:
         """Return the bits at every available design, (n,)."""
-        labels = self.of(utility_input.names, utility_input.theta, utility_input.weight)
-        bits = utility_input.information(utility_input.weight, with_noise=True)
-        for value in np.unique(labels):
-            weight = np.where(labels == value, utility_input.weight, 0.0)
+        parts = self.of(inputs.names, inputs.theta, inputs.weight)
+        bits = inputs.information(inputs.weight, with_noise=True)
+        for part in np.unique(parts):
+            weight = np.where(parts == part, inputs.weight, 0.0)
             if weight.sum() > 0:
-                bits -= weight.sum() * utility_input.information(weight, with_noise=True)
+                bits -= weight.sum() * inputs.information(weight, with_noise=True)
         return np.maximum(bits, 0.0)
 
 
@@ -215,20 +211,17 @@ class PerSecond:
         """Label of the other utility, per second."""
         return f"{self.of.label} per second"
 
-    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+    def __call__(self, inputs: UtilityInput) -> FloatArray:
         """Return the utility per second at every design, (n,)."""
-        if not (utility_input.cost_s > 0).all():
-            raise ParameterError(
-                "cost_s",
-                float(utility_input.cost_s.min()),
-                "greater than 0: a reading takes time where the arm stands, too",
-            )
-        return self.of(utility_input) / utility_input.cost_s
+        if not (inputs.cost_s > 0).all():
+            allowed = "greater than 0: a reading takes time where the arm stands, too"
+            raise ParameterError("cost_s", float(inputs.cost_s.min()), allowed)
+        return self.of(inputs) / inputs.cost_s
 
 
 @dataclass(frozen=True)
 class Finishing:
-    """Utility: the probability that the next reading ends the run, if that may be; until then another utility.
+    """Utility: the probability that the next reading reaches the target sd, if it may; until then another utility.
 
     Information counts bits on every parameter, even one that is known well enough: a greedy robot would refine one
     length while another is still too uncertain. This utility uses the sds of the stopping rule.
@@ -252,20 +245,20 @@ class Finishing:
         """Label of the utility until then, and of its replacement near the end."""
         return f"{self.of.label}, or chance to finish"
 
-    def __call__(self, utility_input: UtilityInput) -> FloatArray:
+    def __call__(self, inputs: UtilityInput) -> FloatArray:
         """Return the utility of every available design, (n,), all by the same one of the two.
 
         The probability is computed for the 250 designs best by the other utility; it is set to 0 for the rest.
         """
-        return self.utility_and_label(utility_input)[0]
+        return self.utility_and_label(inputs)[0]
 
-    def utility_and_label(self, utility_input: UtilityInput) -> tuple[FloatArray, str]:
+    def utility_and_label(self, inputs: UtilityInput) -> tuple[FloatArray, str]:
         """Return the utility of every available design, (n,), and the label of the one used."""
-        plain = self.of(utility_input)
-        if utility_input.goal is None or not _may_end_with_one_more(utility_input, utility_input.goal):
+        plain = self.of(inputs)
+        if inputs.goal is None or not _may_end_with_one_more(inputs, inputs.goal):
             return plain, self.of.label
         best = np.argsort(-plain, kind="stable")[:_MOST_DESIGNS]
-        chance = _probability_of_ending(utility_input, utility_input.goal, best)
+        chance = _probability_of_reaching_target(inputs, inputs.goal, best)
         if chance.max() < self.least:
             return plain, self.of.label
         out = np.zeros(len(plain))
@@ -273,58 +266,56 @@ class Finishing:
         return out, "probability that a reading there ends the run"
 
 
-def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
+def _may_end_with_one_more(inputs: UtilityInput, goal: Goal) -> bool:
     """Return whether one more reading may end the run: the largest sd is 1 to 15 times the goal."""
-    lengths = utility_input.theta[:, goal.columns]
-    spread = utility_input.weight @ (lengths - utility_input.weight @ lengths) ** 2
+    lengths = inputs.theta[:, goal.columns]
+    spread = inputs.weight @ (lengths - inputs.weight @ lengths) ** 2
     return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
 
 
-def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
+def _probability_of_reaching_target(inputs: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
     """Return the probability that a reading, or the mean of a design's repeats, reaches the target precision, (n,).
 
     `designs` are places in `rows`.
     """
-    rows, share = resampled_rows_and_weights(utility_input.weight, _MOST_ASKED)
-    away = utility_input.theta[rows][:, goal.columns]
+    rows, share = resampled_rows_and_weights(inputs.weight, _MOST_PREDICTED)
+    away = inputs.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()
-    answers = utility_input.forecast.predict(
-        utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
-    )
-    n_repeats = utility_input.designs.n_repeats[utility_input.rows[designs]]
+    predicted = inputs.forecast.predict(inputs.theta[rows], inputs.plan.take(inputs.rows[designs]))
+    n_repeats = inputs.designs.n_repeats[inputs.rows[designs]]
 
-    def chance(own: FloatArray, n: int) -> FloatArray:
-        given = WeightsGivenReading.of(own, share, utility_input.readout, repeats=n)
-        return given.probability_of_knowing(away, goal.sd)
+    def chance(predicted: FloatArray, n: int) -> FloatArray:
+        weights = WeightsGivenReading.of(predicted, share, inputs.readout, repeats=n)
+        return weights.probability_of_reaching_target(away, goal.sd)
 
-    return by_repeats(chance, answers, n_repeats)
+    return by_repeats(chance, predicted, n_repeats)
 
 
 def by_repeats(
-    utility: Callable[[FloatArray, int], FloatArray], answers: FloatArray, n_repeats: IntArray
+    utility: Callable[[FloatArray, int], FloatArray], predicted: FloatArray, n_repeats: IntArray
 ) -> FloatArray:
     """Return the utility of each design, (n_designs,), from predictions, (n, n_designs), by its number of repeats.
 
     `utility` takes the predictions of designs with the same number of repeats, of which the mean counts.
     """
-    out = np.empty(answers.shape[1])
+    out = np.empty(predicted.shape[1])
     for n in np.unique(n_repeats).tolist():
-        own = np.flatnonzero(n_repeats == n)
-        out[own] = utility(answers[:, own], n)
+        same = np.flatnonzero(n_repeats == n)
+        out[same] = utility(predicted[:, same], n)
     return out
 
 
-class Label(Protocol):
-    """A labelling of hypotheses, as whole numbers; hypotheses of one label need not be distinguished."""
+class Partition(Protocol):
+    """A partition of hypotheses; those of one part need not be distinguished."""
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
-        """Return labels of weighted hypotheses: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
+        """Return each hypothesis's part, a whole number: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
         ...
 
 
 @dataclass(frozen=True)
 class ParameterValue:
-    """Labels by the value of the parameter `name`, in `n_bins` bins of equal posterior probability."""
+    """Partition by the value of the parameter `name`, in `n_bins` bins of equal posterior probability."""
 
     name: str
     n_bins: int = 16
@@ -348,7 +339,7 @@ class ParameterValue:
 
 @dataclass(frozen=True)
 class WhichShape:
-    """Labels by the number of the shape, for hypotheses of a set of shapes (parameter "shape")."""
+    """Partition by the number of the shape, for hypotheses of a set of shapes (parameter "shape")."""
 
     def __str__(self) -> str:
         return "the shape"
@@ -387,21 +378,21 @@ def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
     return plain[text]
 
 
-def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
-    """Compute the utility of every available design (paper, the machine learning system).
+def utility_map(inputs: UtilityInput, utility: Utility) -> UtilityMap:
+    """Compute the utility of every available design (paper, section 2.3).
 
     ShapeError if the utility returns a wrong number of values, ParameterError if one of them is not finite, ReachError
     if no design is available.
     """
     if isinstance(utility, Finishing):  # the utility with two measures reports which one these values are
-        values, label = utility.utility_and_label(utility_input)
+        values, label = utility.utility_and_label(inputs)
     else:
-        values, label = utility(utility_input), utility.label
-    return map_of_rows(utility_input.designs, utility_input.rows, np.asarray(values, dtype=np.float64), label)
+        values, label = utility(inputs), utility.label
+    return map_of_rows(inputs.designs, inputs.rows, np.asarray(values, dtype=np.float64), label)
 
 
 def choose_several(
-    utility_input: UtilityInput, n: int, *, rng: np.random.Generator, chance: FloatArray | None = None
+    inputs: UtilityInput, n: int, *, rng: np.random.Generator, chance: FloatArray | None = None
 ) -> tuple[int, ...]:
     """Choose readings with large joint information, greedily one after another.
 
@@ -410,34 +401,32 @@ def choose_several(
     information is averaged over simulated outcomes: each is a draw from the predictive distribution, with its own
     posterior.
 
-    Return indices of designs, from `utility_input.rows`, in the order in which they were chosen; two may be the same.
+    Return indices of designs, from `inputs.rows`, in the order in which they were chosen; two may be the same.
     `chance` is the probability that a reading at each of these returns a value, (n,), by which its information counts.
     """
-    everywhere = np.ones(len(utility_input.rows), dtype=np.bool_)
+    everywhere = np.ones(len(inputs.rows), dtype=np.bool_)
     weighing = np.ones(1) if chance is None else chance
-    chosen = [choose(utility_input.information(utility_input.weight) * weighing, everywhere, rng=rng)]
-    rows, share = resampled_rows_and_weights(utility_input.weight, _FEW)
-    few = replace(utility_input, theta=utility_input.theta[rows], weight=share / share.sum())
+    chosen = [choose(inputs.information(inputs.weight) * weighing, everywhere, rng=rng)]
+    rows, share = resampled_rows_and_weights(inputs.weight, _FEW)
+    few = replace(inputs, theta=inputs.theta[rows], weight=share / share.sum())
     weights = [few.weight] * _OUTCOMES
     for _ in range(n - 1):
         weights = _weights_after_simulated_reading(few, chosen[-1], weights, rng)
         gain = np.mean([few.information(weight) for weight in weights], axis=0)
         chosen.append(choose(gain * weighing, everywhere, rng=rng))
-    return tuple(int(utility_input.rows[row]) for row in chosen)
+    return tuple(int(inputs.rows[row]) for row in chosen)
 
 
 def _weights_after_simulated_reading(
-    utility_input: UtilityInput, row: int, weights: list[FloatArray], rng: np.random.Generator
+    inputs: UtilityInput, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Simulate one reading per posterior at design `utility_input.rows[row]`; return the posteriors' weights after it.
+    """Simulate one reading per posterior at design `inputs.rows[row]`; return the posteriors' weights after it.
 
     `weights`: of each posterior, (n_samples,).
     """
-    readout = utility_input.readout
-    level = utility_input.forecast.predict(utility_input.theta, utility_input.plan.take(utility_input.rows[[row]]))[
-        :, 0
-    ]
-    sd = readout.noise_sd / np.sqrt(utility_input.designs.n_repeats[utility_input.rows[row]])
+    readout = inputs.readout
+    level = inputs.forecast.predict(inputs.theta, inputs.plan.take(inputs.rows[[row]]))[:, 0]
+    sd = readout.noise_sd / np.sqrt(inputs.designs.n_repeats[inputs.rows[row]])
     out = []
     for weight in weights:
         truth = rng.choice(len(weight), p=weight)

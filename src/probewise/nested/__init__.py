@@ -1,8 +1,7 @@
 """Nested sampling: the evidence of a problem (a prior and a log likelihood) and samples of its posterior.
 
-After the paper's sections "The Machine Learning System" (50 posterior samples, made distinct by about 1000
-Metropolis-Hastings steps) and on estimating the parameters of the spatial sensitivity function (the evidence Z; stop
-when successive values of log Z agree).
+Paper, section 2.3 (50 posterior samples, made distinct by about 1000 Metropolis-Hastings steps) and section 2.7 (the
+evidence Z, eq. 18; 300 live points; stop when consecutive values of log Z differ by less than 1e-8).
 """
 
 from probewise.nested.diversify import diversify

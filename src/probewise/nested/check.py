@@ -75,7 +75,7 @@ class Peak:
     root: FloatArray
 
     @property
-    def height(self) -> float:
+    def log_likelihood(self) -> float:
         """Log likelihood of the highest point."""
         return float(self.highest.log_likelihood[0])
 
@@ -99,7 +99,7 @@ def find_missed_peaks(
 
     top = climb_to_top(peak_of_last_live_points(run, evaluate), evaluate, max_calls=left(_ASCENT_SHARE), rng=rng)
     tops = _tops_apart(run, evaluate, max_calls=left(), rng=rng)
-    if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * n_params:
+    if top.log_likelihood > float(run.log_likelihood.max()) + _FAR_ABOVE * n_params:
         tops.append(top)
     tops += _higher_tops(run, top, evaluate, max_calls=left(), rng=rng)
     n_draws = max(_SAMPLES_PER_PARAM * n_params, _FEWEST_SAMPLES)
@@ -116,11 +116,11 @@ def _samples_if_unmet(
     approximation then gives the peak's evidence.
     """
     n_params, space, drawn = len(top.centre), evaluate.space, top.draw(1.0, n_draws, evaluate, rng)
-    fall = top.height - drawn.log_likelihood[np.isfinite(drawn.log_likelihood)]
+    fall = top.log_likelihood - drawn.log_likelihood[np.isfinite(drawn.log_likelihood)]
     scale = math.sqrt(n_params / 2 / max(float(fall.mean()), 1e-3)) if fall.size else 1.0
     root = scale * top.root
     log_volume = 0.5 * n_params * math.log(2 * math.pi) + float(np.linalg.slogdet(root)[1])
-    log_z = top.height + float(top.highest.log_density[0]) + log_volume
+    log_z = top.log_likelihood + float(top.highest.log_density[0]) + log_volume
     distance = np.linalg.norm(np.linalg.solve(root, (space.enter(run.theta) - top.centre).T), axis=0)
     has = float(run.weight[distance**2 < chdtri(n_params, 1 - _INSIDE)].sum())
     met = has > 0 and run.log_z + math.log(has) > log_z + math.log(_MET * _INSIDE)
@@ -208,7 +208,7 @@ def _tops_apart(run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: 
         root = _BEGIN * covariance_root_of_points(u[rows[k] : rows[k] + _NEXT_DEAD])
         begin = Peak(start.take_rows(slice(k, k + 1)), start.u[k], root)
         top = climb_to_top(begin, evaluate, max_calls=most - evaluate.n_calls, rng=rng)
-        if top.height > enough and separated_by_dip_mask(top.highest, known, scale, _NEAREST, evaluate, rng)[0]:
+        if top.log_likelihood > enough and separated_by_dip_mask(top.highest, known, scale, _NEAREST, evaluate, rng)[0]:
             tops.append(top)
         left = np.array(rest, dtype=np.int64)
         rest = left[separated_by_dip_mask(start.take_rows(left), top.highest, scale, 1, evaluate, rng)].tolist()
@@ -250,13 +250,13 @@ def _higher_tops(
     if n_draws < run.n_live:
         return []
     # Of several peaks of about one height the climb took one, and the run knows the others.
-    known, tops = max(top.height, float(run.log_likelihood.max())), list[Peak]()
+    known, tops = max(top.log_likelihood, float(run.log_likelihood.max())), list[Peak]()
     drawn = top.draw(np.repeat(_SCALES, n_draws)[:, None], n_draws * len(_SCALES), evaluate, rng)
     best = drawn.take_rows(drawn.rows_by_rising_likelihood()[-1:])
     while len(tops) < _MOST_PEAKS and len(best) and best.log_likelihood[0] > known + _HIGHER:
         begin, calls_left = Peak(best, best.u[0], top.root), most - evaluate.n_calls
         tops.append(climb_to_top(begin, evaluate, max_calls=calls_left, rng=rng, known=known + _HIGHER))
-        known = max(known, tops[-1].height)
+        known = max(known, tops[-1].log_likelihood)
     return tops
 
 

@@ -1,4 +1,4 @@
-"""Make repeated posterior samples distinct by Metropolis-Hastings (paper, section "The Machine Learning System")."""
+"""Make repeated posterior samples distinct by Metropolis-Hastings (paper, section 2.3)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def diversify(theta: FloatArray, problem: Samplable, *, rng: np.random.Generator
     """Run a Metropolis-Hastings chain from every sample, all chains in parallel.
 
     Every step proposes one of three symmetric moves to each sample: a Gaussian with the samples' covariance, a
-    difference of two samples (which can lead to another mode), or a change of one parameter on the scale of its prior.
-    The step size is drawn over orders of magnitude. The proposals depend only on the samples as given, not on the
+    difference of two samples (which can lead to another mode), or a change of one parameter on the scale of its prior,
+    scaled by a factor drawn over orders of magnitude. The proposals depend only on the samples as given, not on the
     chains' states, so that every chain has the posterior as its stationary distribution.
 
     `theta` are posterior samples, possibly repeated, (n_samples, n_params); `problem` has a prior with `log_prob`.
@@ -41,22 +41,22 @@ def diversify(theta: FloatArray, problem: Samplable, *, rng: np.random.Generator
     if n_params == 0 or n_steps == 0:
         return start
     prior = problem.prior
-    height = prior.log_prob(start) + evaluate.log_likelihood(start)
-    if not np.isfinite(height).all():
-        at = int(np.flatnonzero(~np.isfinite(height))[0])
+    log_posterior = prior.log_prob(start) + evaluate.log_likelihood(start)
+    if not np.isfinite(log_posterior).all():
+        at = int(np.flatnonzero(~np.isfinite(log_posterior))[0])
         raise ParameterError(f"theta[{at}]", start[at].tolist(), "a sample with posterior density above zero")
     prior_sd = prior.from_unit_cube(rng.random((_N_PRIOR_DRAWS, n_params))).std(axis=0)
     now = start.copy()
     for displacement, threshold in _displacements_and_log_thresholds(start, prior_sd, n_steps, rng):
         proposed = now + displacement
-        proposed_height = prior.log_prob(proposed)
+        proposed_log_posterior = prior.log_prob(proposed)
         # The likelihood is not evaluated outside the prior, where a model may be undefined.
-        inside = np.flatnonzero(np.isfinite(proposed_height))
+        inside = np.flatnonzero(np.isfinite(proposed_log_posterior))
         if inside.size == 0:
             continue
-        proposed_height[inside] += evaluate.log_likelihood(proposed[inside])
-        accept = threshold < proposed_height - height
-        now[accept], height[accept] = proposed[accept], proposed_height[accept]
+        proposed_log_posterior[inside] += evaluate.log_likelihood(proposed[inside])
+        accept = threshold < proposed_log_posterior - log_posterior
+        now[accept], log_posterior[accept] = proposed[accept], proposed_log_posterior[accept]
     return now
 
 

@@ -26,7 +26,7 @@ _ALLOWED_PRIOR = (
 
 
 class Samplable(Protocol):
-    """A problem as the sampler needs it: `probewise.inference.Problem`, or anything with the same attributes."""
+    """A problem as the sampler needs it: `probewise.inference.SensorProblem`, or anything with the same attributes."""
 
     @property
     def prior(self) -> Prior:

@@ -1,6 +1,6 @@
-"""Nested sampling (Skilling 2006), the inference engine (paper, section "The Machine Learning System").
+"""Nested sampling (Skilling 2006), the inference engine (paper, sections 2.3 and 2.7: Z of eq. 18).
 
-The worst live points are removed, which shrinks the volume, and new ones drawn above them.
+The worst live points are removed, which shrinks the volume, and new ones of greater likelihood are drawn.
 
 `run` is the entry point, `replace_worst_live_points` the step, and `RemainingEvidence` and `EvidenceChange` say when to
 stop.
@@ -78,7 +78,7 @@ class RoundSummary:
     last_change: float  # increase of `log_z` by the last dead point
     log_volume: float  # log of the remaining share of the prior
     best_log_likelihood: float
-    level: bool = False  # whether all live points have the same likelihood
+    on_plateau: bool = False  # whether all live points have the same likelihood
 
 
 StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
@@ -104,8 +104,8 @@ class RemainingEvidence:
 class EvidenceChange:
     """Stopping rule of the paper: consecutive values of log Z differ by less than `tolerance`, 1e-8.
 
-    On a plateau there is nothing to climb to: once all live points have the same likelihood and can raise log Z by less
-    than 0.05, the rule ends the run too. Further deaths would leave copies of a few points.
+    On a plateau no point of greater likelihood can be drawn: once all live points have the same likelihood and can
+    raise log Z by less than 0.05, the rule ends the run too. Further deaths would leave copies of a few points.
     """
 
     tolerance: float = 1e-8
@@ -117,7 +117,7 @@ class EvidenceChange:
         """Return the reason to stop, or None."""
         if state.last_change < self.tolerance:
             return f"consecutive values of log Z differ by less than {self.tolerance:g}"
-        rest = RemainingEvidence()(state) if state.level else None
+        rest = RemainingEvidence()(state) if state.on_plateau else None
         return rest and f"all live points have the same likelihood, and {rest}"
 
 
@@ -150,7 +150,7 @@ def run(
     n_workers: int | None = None,
     return_interrupted: bool = False,
 ) -> NestedResult:
-    """Compute the evidence and posterior samples of a problem (paper, section on SSF estimation).
+    """Compute the evidence and posterior samples of a problem (paper, section 2.7).
 
     A doubtful result comes with warnings, which it also stores.
 
@@ -170,8 +170,8 @@ def run(
         How new points are drawn; default `SliceMove()`. While more than a twentieth of the prior is alive, points are
         drawn from the prior itself.
     n_replaced
-        Points replaced per round; default half of `n_live`, for large batches: compared with one at a time, 28 % fewer
-        points are drawn and the variance of log Z is 44 % greater.
+        Points replaced per round; default half of `n_live`, for large batches. Compared with one at a time, 28 % fewer
+        points are drawn, and the variance of log Z is 44 % greater.
     progress
         Called with a `RoundSummary` after every round.
     max_calls
@@ -249,8 +249,8 @@ def replace_worst_live_points(
     start = survivors.take_rows(rng.permutation(len(survivors))[:n_replaced])
     new, tally = move.draw(start.without_births(), bound, survivors.u, evaluate, rng)
     ident = live.ident.max() + 1 + np.arange(n_replaced)
-    level = {"log_birth": np.full(n_replaced, bound.log_likelihood), "birth_label": np.full(n_replaced, bound.label)}
-    born = LivePoints(**vars(new), **level, ident=ident, parent=start.ident)
+    births = {"log_birth": np.full(n_replaced, bound.log_likelihood), "birth_label": np.full(n_replaced, bound.label)}
+    born = LivePoints(**vars(new), **births, ident=ident, parent=start.ident)
     return LivePoints.join(survivors, born), doomed, tally
 
 
@@ -413,7 +413,7 @@ def _do_round(
         last_change=log_z - before,
         log_volume=log_volume,
         best_log_likelihood=best,
-        level=bool(live.log_likelihood.min() == best),
+        on_plateau=bool(live.log_likelihood.min() == best),
     )
 
 

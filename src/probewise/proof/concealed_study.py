@@ -21,6 +21,7 @@ from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.arm import Pose, Reading, SimulatedArm, Speed
 from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
+from probewise.experiment.result import WRONG_MM
 from probewise.inference import Rounded
 from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Result, misfit
 from probewise.proof.estimates import Estimate, estimated_share, grouped
@@ -32,7 +33,6 @@ from probewise.proof.study import (
     MOST_CIRCLES,
     REFERENCE,
     SEED,
-    WRONG_MM,
     accuracy_measures,
     arm_that_reads,
     disc_of,

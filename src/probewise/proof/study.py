@@ -31,7 +31,9 @@ from probewise.experiment import (
     probability_of_length_off,
 )
 from probewise.experiment.from_sensor import AdjustedMixture, sensor_change_prior
+from probewise.experiment.judgement import is_target_reached
 from probewise.experiment.paper import student_t_likelihood
+from probewise.experiment.result import WRONG_MM
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.nested import NESTED_STOP, NestedStop
@@ -148,8 +150,6 @@ def standard_rows() -> tuple[SearchConfiguration, ...]:
     return tuple(replace(REFERENCE, **change) for change in changes)
 
 
-WRONG_MM = 12.0
-"""Three times the 4 mm of the stopping rule: a run that ends with a larger error is sure and wrong."""
 # The study's sensor: one Gaussian, in mm and LEGO units; the world uses the same numbers, rasterised to pixels.
 DARK, BRIGHT = 10.0, 60.0
 BLOB = Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)
@@ -261,7 +261,7 @@ def timed_steps(
 
 def has_reached_target(last: Step, experiment: Experiment) -> bool:
     """Return whether a run reached the target precision with a posterior that fits its readings."""
-    known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
+    known = is_target_reached(experiment, last.sd, last.shapes, last.chance_off)
     return known and not experiment.fit_is_doubtful(last.p_value) and not last.unexplained
 
 

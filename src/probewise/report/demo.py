@@ -246,7 +246,7 @@ class DemoRun:
 def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """State in one sentence how many readings the SSF and the naive robot needed after the same first reading."""
     naive, ssf = (s.n - 1 for s in searches)
-    how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
+    how = "" if all(s.run.target_reached for s in searches) else " (not every run reached that)"
     return (
         f"After the same first reading on white, the robot that knows what its sensor sees needed {ssf} more readings "
         f"to know the circle to 4 mm; the naive robot needed {naive}{how}."

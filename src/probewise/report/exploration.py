@@ -18,14 +18,14 @@ from probewise.experiment import (
     Experiment,
     Exploration,
     Step,
-    found_shape,
+    estimated_shape,
     left_out_after_step,
     probability_of_length_off,
     repaired_sensor,
     result_json,
     samples_csv,
 )
-from probewise.experiment.result import OFF_MM, stop_reason_with_checks
+from probewise.experiment.result import WRONG_MM, stop_reason_with_checks
 from probewise.inquiry import UtilityMap
 from probewise.report import html
 from probewise.report.pictures import animated_gif
@@ -199,20 +199,20 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
 
 def summary_sentence(run: Exploration) -> str:
     """Summarise an exploration: number of readings, the shape found and its parameters."""
-    found = found_shape(run)
+    found = estimated_shape(run)
     several = f" (probability {probability_text(found.probability)})" if run.last.shapes else ""
     known = ", ".join(
         f"{words_without_unit(p.name)} {value_with_error(p.mean, p.sd, unit_of_name(p.name))}" for p in found.parameters
     )
     taken = count_with_noun(len(run.steps), "reading")
-    opening = f"Found in {taken}:" if run.reached else f"Not found to the target precision in {taken}; so far"
+    opening = f"Found in {taken}:" if run.target_reached else f"Not found to the target precision in {taken}; so far"
     article = "an" if found.name[0] in "aeiou" else "a"
     return f"{opening} {article} {found.name}{several} with {known}."
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> html.Markup:
     """Build the table of the shape that an exploration found, with the arm's part of the sd and the truth, if known."""
-    found, true = found_shape(run), truth or {}
+    found, true = estimated_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
     arm = ("of it the arm's",) if run.arm_error is not None else ()
     return html.table(
@@ -322,8 +322,8 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
     fits = "not tested: the most probable noise is not the declared one"
     if p_value is not None:
         fits = f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
-    paper = number_text(run.paper_bits_per_reading, 2)
-    off = probability_text(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
+    paper = f"{number_text(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"
+    off = probability_text(probability_of_length_off(run.experiment, run.posterior, WRONG_MM))
     return {
         "sensor model": model,
         "inference": run.experiment.inference_method.label,
@@ -331,8 +331,8 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
         "stopped because": run.stop_reason,
         "cost": f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time",
         "information": f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading",
-        **({"the paper's count": f"{paper} bits per reading (25 bits over the readings)"} if run.reached else {}),
-        f"probability that a length is off by over {OFF_MM:g} mm": off,
+        **({"the paper's count": paper} if run.target_reached else {}),
+        f"probability that a length is off by over {WRONG_MM:g} mm": off,
         "fit of the best hypothesis": fits,
         **html.seed_fact(seed),
     }

@@ -1,7 +1,6 @@
 """Scenes and shapes: what lies under the sensor, known or hypothesised.
 
-Paper, section "Robotic Arm Test Bed" (the circle's albedo, eq. 1 to 3) and section "Data
-Collection for SSF Estimation" (the patterns S_BW and S_a to S_d).
+Paper, section 2.2 (the circle's albedo, eq. 1 to 3) and section 2.6 (the patterns S_BW and S_a to S_d, eq. 12 to 16).
 """
 
 from probewise.scene.regions import (

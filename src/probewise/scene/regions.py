@@ -1,4 +1,4 @@
-"""Albedo regions, one per hypothesis: frozen values of batched geometry (paper, eq. 1; patterns S_BW, S_a to S_d).
+"""Albedo regions, one per hypothesis: frozen values of batched geometry (paper, eq. 2 and 3; patterns: eq. 12 to 16).
 
 A new kind is a frozen dataclass with `n_regions` and `albedo`. It may register the distance to its edge
 (`edge_distance`) and, where that is closed, its outline (`outlines`); a closed form registered with
@@ -295,7 +295,7 @@ def _edge_distance_of_quadrant(region: QuadrantRegion, x_mm: FloatArray, y_mm: F
 
 @dataclass(frozen=True, eq=False)
 class EllipseRegion(RegionBatch):
-    """Ellipses, albedo `inside` and `outside` them; a disc has equal semi-axes (paper, eq. 1).
+    """Ellipses, albedo `inside` and `outside` them; a disc has equal semi-axes (paper, eq. 2 and 3).
 
     `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis, anticlockwise from X)
     (n_regions,).

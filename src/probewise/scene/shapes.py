@@ -1,4 +1,4 @@
-"""Shapes that may lie on the field (paper, section "The Circle Characterization Experiment", eq. 1 to 3: a circle).
+"""Shapes that may lie on the field (paper, section 2.2, eq. 1: a circle).
 
 Each is a prior over named parameters and the region they define; `AnyOf` is the paper's set of shapes. A new shape is
 one short class: a frozen dataclass with `prior` and `region`.
@@ -51,9 +51,9 @@ Bounds = tuple[float, float]
 
 @dataclass(frozen=True)
 class SymmetryTurn:
-    """The `symmetry_turn` of a shape with an angle: it is the same after a turn `by_rad` with two sides `swapped`.
+    """The `symmetry_turn` of a shape with an angle: the turn after which it is the same again.
 
-    The turn is added to parameter `angle`; that and `swapped` are indices, `swapped` None if no sides are.
+    `by_rad` is added to the parameter of index `angle`; parameters `swapped`, such as two sides, change places.
     """
 
     by_rad: float
@@ -76,10 +76,10 @@ class Field:
 
 @dataclass(frozen=True)
 class PlacedPrior:
-    """Prior of a shape anywhere on a field: x_mm, y_mm, then the shape's own parameters.
+    """Prior of a shape anywhere on a field: x_mm, y_mm, then the shape's other parameters, with prior `own`.
 
-    The own parameters have the prior `own`. The centre is uniform over the field or, given
-    `extent` (own parameters (n_samples, n_own) -> half width and half height (n_samples, 2)),
+    The centre is uniform over the field or, given
+    `extent` (other parameters (n_samples, n_own) -> half width and half height (n_samples, 2)),
     over the centres for which the whole shape lies inside the field.
     """
 
@@ -110,14 +110,14 @@ class PlacedPrior:
         return np.where(inside & np.isfinite(own), own - np.log(room), -np.inf)
 
     def _bounds_of_centre(self, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the greatest (x, y) of the centre, (n_samples, 2) each, given the own parameters."""
+        """Return the least and the greatest (x, y) of the centre, (n_samples, 2) each, given the other parameters."""
         size = np.array([self.field.width_mm, self.field.height_mm])
         margin = np.zeros((len(own), 2)) if self.extent is None else self.extent(own)
         return margin, size - margin
 
 
 def _require_bounds_fit_field(shape: Circle | Ellipse | Rectangle | RegularPolygon, name: str, reach: float) -> None:
-    """Raise ParameterError unless 0 < low < high and, kept inside, both sides of the field exceed 2 * reach * high."""
+    """Raise ParameterError unless 0 < low < high and, if `inside`, the largest shape fits the field."""
     field, bounds = shape.field, getattr(shape, name)
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
@@ -368,7 +368,7 @@ class _AnyOfPrior:
     def _fill(
         self, out: FloatArray, which: IntArray, maps: Sequence[Callable[[FloatArray], FloatArray]], values: FloatArray
     ) -> None:
-        """Fill the columns of `out`, (n_samples, n_params), but the first with each shape's map of `values`."""
+        """Fill every column of `out`, (n_samples, n_params), except the first, from each shape's map of `values`."""
         for k, (mapped_by, columns) in enumerate(zip(maps, self.columns_by_shape, strict=True)):
             mapped = mapped_by(values[:, columns])
             # Every shape fills its own columns; the selected shape fills the shared ones.

@@ -1,7 +1,7 @@
 """From scene to reading: the SSF, its response to a scene, and the chain of stages to a reading.
 
-Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_max - I_min) R,
-(RwithSSF) and (discreteR) for R, (Ssf) for the mixture of Gaussians, and the naive sensor.
+Paper, sections 2.4 and 2.5: the naive sensor (eq. 6), M = I_min + (I_max - I_min) R (eq. 7), R (eq. 8 and 9), and the
+mixture of Gaussians (eq. 10).
 """
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response

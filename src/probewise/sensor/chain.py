@@ -1,4 +1,4 @@
-"""From scene to reading: the sensor model as a chain of stages (paper, eq. modelI)."""
+"""The sensor model as a chain of stages, from scene to reading (paper, section 2.5, eq. 7)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from probewise.errors import ParameterError, require
 from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, Region, UniformRegion
-from probewise.scene.scenes import Scene
+from probewise.scene.scenes import Card, CardedScene, Scene
 from probewise.sensor.commanded import (
     footprint_at_commanded_height,
     has_commanded_height_or_led,
@@ -30,6 +30,7 @@ from probewise.sensor.stages import (
     NoiseParameters,
     Poses,
     SceneView,
+    SensorModel,
     Stage,
     View,
     effects_with_columns,
@@ -105,7 +106,7 @@ def require_scene(scene: object, order: str) -> None:
 class Chain:
     """A sensor model: pose, scene, footprint, seen fraction, response curve, gain, offset, lag, saturation.
 
-    M = I_min + (I_max - I_min) R (paper, eq. modelI), with R the SSF's response to the scene and
+    M = I_min + (I_max - I_min) R (paper, eq. 7), with R the SSF's response to the scene and
     any number of effects, each one function at one stage. Effects are sorted by stage and, within
     a stage, by name, whatever the order in which they are given. Columns of theta: the SSF's,
     the levels', the scene's, then the effects' as "effect.parameter".
@@ -287,6 +288,12 @@ class Chain:
         return effects_with_columns(self.effects, first)
 
 
+def cards_of(model: SensorModel) -> tuple[Card, ...]:
+    """Return the known cards on a model's field; empty if its scene has none."""
+    scene = getattr(model, "scene", None)
+    return scene.cards if isinstance(scene, CardedScene) else ()
+
+
 @dataclass(frozen=True, eq=False)
 class RegionsAndPoses:
     """The region under each reading and the sensor's pose relative to it: all that does not depend on the SSF.
@@ -345,7 +352,7 @@ class RegionsAndPoses:
 
 
 def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
-    """Integrate the footprint over each reading's pattern (paper, eq. RwithSSF).
+    """Integrate the footprint over each reading's pattern (paper, eq. 8).
 
     By closed forms, and quadrature at curved edges. A kind of region without a closed form is summed over pixels: error
     about 1e-3, with a `SlowWarning`.

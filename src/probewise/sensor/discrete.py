@@ -1,4 +1,4 @@
-"""The paper's sum over a discrete SSF matrix (paper, eq. discrete R), for any field and any region.
+"""The paper's sum over a discrete SSF matrix (paper, eq. 9), for any field and any region.
 
 The second of two independent routes to the response; the other, the closed forms of `probewise.sensor.gaussian`, shares
 only the regions' albedo at points. The albedo of a pixel is its covered share, from 89 places in it.

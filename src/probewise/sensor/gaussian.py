@@ -1,6 +1,6 @@
 """Response of a Gaussian footprint to a region: closed forms and one-dimensional quadrature.
 
-The first of the two independent routes to the response R (paper, eq. RwithSSF): exact integrals of each
+The first of the two independent routes to the response R (paper, eq. 8): exact integrals of each
 Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
 `probewise.sensor.discrete`. A new kind of region may register its closed form with
 `mean_albedo_under_one_gaussian.register`; without one it is integrated numerically from its `albedo`.

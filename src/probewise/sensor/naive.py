@@ -1,4 +1,4 @@
-"""The paper's naive sensor: it sees only the point under its centre (paper, "The Naive Likelihood")."""
+"""The paper's naive sensor: it sees only the point under its centre (paper, eq. 6)."""
 
 from __future__ import annotations
 

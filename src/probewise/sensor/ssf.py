@@ -1,4 +1,4 @@
-"""The spatial sensitivity function (SSF): mixtures of Gaussians and discrete fields (paper, eq. Ssf)."""
+"""The spatial sensitivity function (SSF): mixtures of Gaussians and discrete fields (paper, eq. 10)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def mixture_parameter_names(n_gaussians: int) -> tuple[str, ...]:
 
 
 def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
-    """Turn the paper's parameters into weights, means and covariances (paper, eq. Ssf).
+    """Turn the paper's parameters into weights, means and covariances (paper, eq. 10).
 
     The exponent A x^2 + B y^2 + 2 C x y belongs to the covariance 1/2 inv([[A, C], [C, B]]);
     its mass is a pi / sqrt(AB - C^2).

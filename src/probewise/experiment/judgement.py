@@ -1,4 +1,4 @@
-"""Judge: what the posterior says of the shape, whether it explains the readings, and whether the run may stop."""
+"""Judgement of a posterior: moments, goodness of fit, and the stopping rule of a run (`is_target_reached`)."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from scipy.special import chdtrc, ndtr, ndtri
 
 from probewise._arrays import FloatArray
+from probewise.arm.carry_out import PATTERN
 from probewise.arm.instrument import Reading
 from probewise.experiment.arm_error import ArmError, arm_error_in_posterior
-from probewise.experiment.journal import PATTERN
-from probewise.experiment.kinds import Posterior
-from probewise.experiment.setup import Experiment, largest_sd_mm
+from probewise.experiment.kinds import PosteriorByKind
+from probewise.experiment.setup import Experiment
 from probewise.inference.problem import SensorProblem
 from probewise.inference.rounded import ScaleEnds
 from probewise.inquiry import UtilityMap, prior_entropy
@@ -23,8 +23,11 @@ from probewise.inquiry.readout import capacity_bits, entropy_bits
 from probewise.nested import Weighted
 from probewise.scene.shapes import AnyOf, mean_angles, with_angles_near
 
-OFF_SDS = 3.0
+WRONG_SDS = 3.0
 """Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""
+
+MOST_PROBABILITY_WRONG = 0.01
+"""Probability of a wrong length below which a run with doubt in its sensor may end."""
 
 MOST_MISSING = 8
 """Missing readings (NaN) in a row after which a run ends."""
@@ -47,8 +50,8 @@ class Judgement:
         probable shape, with NaN for parameters of other shapes.
     shapes
         Probability of each shape of a set, by its name (empty for a single shape).
-    may_stop
-        Whether the stopping rule is met, arm included.
+    target_reached
+        Whether the stopping rule is met (`is_target_reached`), with the arm's error.
     chance_off
         Probability that a length is off by three times the sd of the stopping rule.
     p_value
@@ -57,7 +60,7 @@ class Judgement:
     notes
         Warnings.
     unexplained
-        With what the residuals of the best hypothesis change, in words; "" if they show no trend.
+        The trend of the best hypothesis's residuals, in words; "" if they show none.
     arm_error
         Effect of the arm's own error; None far from the end of a run, or if that error is not known.
     """
@@ -65,7 +68,7 @@ class Judgement:
     mean: FloatArray
     sd: FloatArray
     shapes: Mapping[str, float]
-    may_stop: bool
+    target_reached: bool
     chance_off: float
     p_value: float | None
     notes: tuple[str, ...]
@@ -75,7 +78,7 @@ class Judgement:
 
 def judge(
     experiment: Experiment,
-    kinds: Posterior,
+    by_kind: PosteriorByKind,
     posterior: Weighted,
     readings: Sequence[Reading],
     *,
@@ -83,11 +86,12 @@ def judge(
 ) -> Judgement:
     """Judge a posterior, the arm's error included if the readings alone know the lengths.
 
-    `kinds` and `posterior` are as `infer` returns them; `rng` draws the arm's errors.
+    `by_kind` and `posterior` are as `infer` returns them; `rng` draws the arm's errors.
     """
     mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     p_value, notes = None, () if posterior.run is None else posterior.run.warnings
-    leader, samples = kinds.kinds[kinds.most_probable_kind_index], kinds.particles[kinds.most_probable_kind_index]
+    likely = by_kind.most_probable_kind_index
+    leader, samples = by_kind.kinds[likely], by_kind.particles[likely]
     problem = leader.problem(experiment.problem(readings).recording)
     unexplained = "" if experiment.trust == 1 else trend_of_residuals(samples.weighted, problem)
     if unexplained:
@@ -101,17 +105,17 @@ def judge(
                 "sensor model leaves something out"
             )
             notes = (*notes, doubt)
-    may_stop, off = may_stop_and_chance_off(experiment, posterior)
-    judged = Judgement(mean, sd, shapes, may_stop, off, p_value, notes, unexplained)
+    target_reached, off = target_reached_and_chance_off(experiment, posterior)
+    judged = Judgement(mean, sd, shapes, target_reached, off, p_value, notes, unexplained)
     if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm:
-        return with_arm_error(judged, experiment, kinds, posterior, readings, rng=rng)
+        return with_arm_error(judged, experiment, by_kind, posterior, readings, rng=rng)
     return judged
 
 
 def with_arm_error(
     judged: Judgement,
     experiment: Experiment,
-    kinds: Posterior,
+    by_kind: PosteriorByKind,
     posterior: Weighted,
     readings: Sequence[Reading],
     *,
@@ -123,7 +127,7 @@ def with_arm_error(
         experiment,
         readings,
         posterior.theta[:, experiment.shape_columns],
-        kinds.with_raised_fault_odds(),
+        by_kind.with_raised_left_out_odds(),
         mean=judged.mean,
         sd=judged.sd,
         likely_shape=likely,
@@ -133,11 +137,11 @@ def with_arm_error(
         return judged
     theta = posterior.theta.copy()
     theta[:, experiment.shape_columns] += arm.shifts
-    may_stop, off = may_stop_and_chance_off(experiment, posterior, theta=theta, arm_sd=arm.sd)
-    return replace(judged, may_stop=may_stop, chance_off=off, arm_error=arm)
+    target_reached, off = target_reached_and_chance_off(experiment, posterior, theta=theta, arm_sd=arm.sd)
+    return replace(judged, target_reached=target_reached, chance_off=off, arm_error=arm)
 
 
-def may_stop_and_chance_off(
+def target_reached_and_chance_off(
     experiment: Experiment,
     posterior: Weighted,
     *,
@@ -150,8 +154,27 @@ def may_stop_and_chance_off(
     """
     _, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     shifted = posterior if theta is None else replace(posterior, theta=theta)
-    off = probability_of_length_off(experiment, shifted, OFF_SDS * experiment.stop_sd_mm)
-    return experiment.may_stop(np.hypot(sd, arm_sd), shapes, off), off
+    off = probability_of_length_off(experiment, shifted, WRONG_SDS * experiment.stop_sd_mm)
+    return is_target_reached(experiment, np.hypot(sd, arm_sd), shapes, off), off
+
+
+def is_target_reached(
+    experiment: Experiment, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0
+) -> bool:
+    """Return whether the stopping rule is met: the shape is known to the target sd.
+
+    `sd` and `shapes` are posterior sds of the shape's parameters and the shapes' probabilities, `chance_off` the
+    probability that a length is off by three times the target sd. With `trust` below 1, that must be below 1 %, since
+    the posterior then has tails that sds do not show.
+    """
+    likely = max(shapes.values(), default=1.0) >= experiment.stop_probability
+    sure = experiment.trust == 1 or chance_off < MOST_PROBABILITY_WRONG
+    return largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm and likely and sure
+
+
+def largest_sd_mm(names: tuple[str, ...], sd: FloatArray) -> float:
+    """Return the largest sd among the parameters whose names end in _mm; NaN is ignored."""
+    return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))
 
 
 def with_aligned_angles(experiment: Experiment, posterior: Weighted) -> Weighted:
@@ -165,9 +188,9 @@ def with_aligned_angles(experiment: Experiment, posterior: Weighted) -> Weighted
 
 def theta_with_aligned_angles(experiment: Experiment, theta: FloatArray, weight: FloatArray) -> FloatArray:
     """Return samples, (n_samples, n_params), aligned as by `with_aligned_angles`; `weight` (n_samples,)."""
-    own = theta[:, experiment.shape_columns]
-    aligned = with_angles_near(experiment.shape, own, mean_angles(experiment.shape, own, weight))
-    if aligned is own:
+    of_shape = theta[:, experiment.shape_columns]
+    aligned = with_angles_near(experiment.shape, of_shape, mean_angles(experiment.shape, of_shape, weight))
+    if aligned is of_shape:
         return theta
     out = theta.copy()
     out[:, experiment.shape_columns] = aligned
@@ -196,11 +219,11 @@ def shape_moments_and_probabilities(
     share = np.bincount(which, weights=weight, minlength=len(experiment.shape.shape_names))
     likely = int(share.argmax())
     columns = experiment.shape.prior.columns_by_shape[likely]
-    own = theta[np.ix_(which == likely, columns)]
+    of_likely = theta[np.ix_(which == likely, columns)]
     given = weight[which == likely] / share[likely]
     mean, sd = np.full((2, theta.shape[1]), np.nan)
-    mean[columns] = given @ own
-    sd[columns] = np.sqrt(given @ (own - mean[columns]) ** 2)
+    mean[columns] = given @ of_likely
+    sd[columns] = np.sqrt(given @ (of_likely - mean[columns]) ** 2)
     return mean, sd, dict(zip(experiment.shape.shape_names, (float(p) for p in share / share.sum()), strict=True))
 
 
@@ -249,7 +272,7 @@ def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, probl
 
 
 def trend_of_residuals(posterior: Weighted, problem: SensorProblem) -> str:
-    """Say with what the residuals of the most likely hypothesis change: place, way, direction, time; "" if with none.
+    """Say with what the residuals of the most likely hypothesis change, such as "the time"; "" if with nothing.
 
     Their normal scores, which any law of the noise leaves normal, are correlated with each, whatever the noise.
     """
@@ -295,22 +318,23 @@ def stop_reason(
 ) -> str | None:
     """Return the reason why a run ends, or None if it continues.
 
-    `must_continue`: whether it goes on for a check though the lengths are known. `n_missing`: missing readings in a
+    `must_continue`: whether it goes on for a check though the target is reached. `n_missing`: missing readings in a
     row, if they are too many, else 0.
     """
-    names, known = experiment.shape.prior.names, judged.may_stop and not must_continue and not judged.unexplained
+    names = experiment.shape.prior.names
+    reached = judged.target_reached and not must_continue and not judged.unexplained
     included, of_arm, sd = "", 0.0, judged.sd
     if judged.arm_error is not None:
         included, of_arm = ", the arm's own error included", largest_sd_mm(names, judged.arm_error.sd)
         sd = np.hypot(sd, judged.arm_error.sd)
     widest = largest_sd_mm(names, sd)
     widest_known = f"the widest length is known to {widest:.1f} mm{included}"
-    if known and experiment.fit_is_doubtful(judged.p_value):
+    if reached and experiment.fit_is_doubtful(judged.p_value):
         return (
             f"no hypothesis explains the readings (p = {judged.p_value:.1g}), so the posterior, narrow as it is "
             f"({widest:.1f} mm), is not to be trusted; a diagnosis of the readings asks what the model leaves out"
         )
-    if known:
+    if reached:
         return f"every length is known to better than {experiment.stop_sd_mm:g} mm{included}"
     if of_arm >= experiment.stop_sd_mm > largest_sd_mm(names, judged.sd):
         return (
@@ -339,7 +363,7 @@ def stop_reason(
 
 
 @dataclass(frozen=True)
-class Bound:
+class ReadingsLowerBound:
     """Lower bound on the mean number of readings, for search and refinement separately.
 
     Attributes
@@ -357,7 +381,7 @@ class Bound:
     capacity_bits: float
 
 
-def least_readings(experiment: Experiment, *, rng: np.random.Generator) -> Bound:
+def least_readings(experiment: Experiment, *, rng: np.random.Generator) -> ReadingsLowerBound:
     """Return a lower bound on the mean number of readings: bits needed over bits per reading, search plus refinement.
 
     The search ends with the first reading on the shape. Any reading before is on the shape with probability p at most,
@@ -381,7 +405,7 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator) -> Bound
     yes = min(covered, 0.5)
     # The largest entropy of parameters with the target's sd is that of independent Gaussians.
     target_bits = len(prior.names) * 0.5 * math.log2(2 * math.pi * math.e * experiment.stop_sd_mm**2)
-    return Bound(
+    return ReadingsLowerBound(
         -math.log2(covered),
         prior_bits + math.log2(covered) - target_bits,
         float(entropy_bits(np.array([yes, 1.0 - yes]))),

@@ -83,6 +83,7 @@ def test_a_sensor_that_reads_high_on_black_gets_levels_the_other_way_round():
     ("rows", "change", "message"),
     [
         (slice(None), lambda r: np.full_like(r, 7.0), "all 408 usable readings equal 7"),
+        (slice(None), lambda r: np.arange(r.size) * 1e-300, "whose squares no float holds'; allowed: another unit"),
         (slice(None), lambda r: np.full_like(r, np.nan), "none usable"),
         (slice(404, 408), lambda r: np.array([20.0, 21.0, 12.0, 11.0]), "one place"),
         ([60, 60, 90], lambda r: np.array([3.0, 4.0, np.nan]), "every usable reading taken at one place"),

@@ -48,9 +48,8 @@ def with_arm_error(exploration, geometry):
     experiment = dataclasses.replace(exploration.experiment, fitted_arm=FittedArm(geometry, LEVELS))
     of = (experiment, exploration.readings, last.posterior.theta[:, experiment.shape_columns])
     moments = {name: getattr(last, name) for name in ("mean", "sd", "likely_shape")}
-    error = arm_error_in_posterior(
-        *of, last.by_kind.with_raised_left_out_odds(), **moments, rng=np.random.default_rng(1)
-    )
+    of += (last.by_kind.with_raised_left_out_odds(),)
+    error = arm_error_in_posterior(*of, **moments, rng=np.random.default_rng(1))
     return dataclasses.replace(exploration, steps=(*exploration.steps[:-1], dataclasses.replace(last, arm_error=error)))
 
 

@@ -139,9 +139,8 @@ def test_a_kind_that_a_search_found_far_behind_sleeps_and_is_solved_from_the_pri
     recording = journal(doubting, 3)
     now = method.updated(prior_posterior(kinds, 1000, rng=rng), recording.take(np.arange(1)), rng=rng)
     leader, other = now.particles
-    other = replace(
-        other, weighted=replace(other.weighted, log_z=leader.log_z - behind), lost_log_z=0.0, suspended=True
-    )
+    weighted = replace(other.weighted, log_z=leader.log_z - behind)
+    other = replace(other, weighted=weighted, lost_log_z=0.0, suspended=True)
     two = recording.take(np.arange(2))
     found = method.updated(replace(now, particles=(leader, other)), two, rng=rng).particles[1]
     assert found.suspended == sleeps

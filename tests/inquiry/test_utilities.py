@@ -23,7 +23,7 @@ from probewise.inquiry import (
     utility_map,
     utility_named,
 )
-from probewise.inquiry.utilities import _probability_of_reaching_target
+from probewise.inquiry.utilities import _probability_of_reaching_target as probability
 
 APART = [[0.0, 0.0, 0.0], [0.0, 40.0, 40.0], [0.0, 0.0, 80.0], [0.0, 40.0, 120.0]]
 """Four hypotheses: the first place tells nothing, the second one bit, the third all two."""
@@ -165,11 +165,7 @@ def test_four_readings_end_a_run_as_one_of_half_the_noise_does(made):
     near = narrow(made, Goal((2,), 5.0))
     each = replace(near, readout=Readout(2.0), designs=replace(near.designs, repeats=(4,)))
     designs = np.arange(0, len(near.rows), 500)
-    np.testing.assert_allclose(
-        _probability_of_reaching_target(each, each.goal, designs),
-        _probability_of_reaching_target(near, near.goal, designs),
-        atol=1e-9,
-    )
+    np.testing.assert_allclose(probability(each, each.goal, designs), probability(near, near.goal, designs), atol=1e-9)
 
 
 def by_importance(made, inputs, goal, design, n=4000):

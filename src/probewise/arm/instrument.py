@@ -15,7 +15,7 @@ from probewise._kinds import checked_number, require_kind, warn_of_likely_degree
 from probewise.errors import ParameterError, ReachError, require
 
 Side: TypeAlias = Literal[-1, 1]
-"""Direction of arrival: -1 with the count decreasing, 1 increasing."""
+"""Direction in which a motor arrives at its goal: -1 with its count decreasing, 1 increasing."""
 
 
 class Clock(Protocol):

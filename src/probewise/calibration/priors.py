@@ -320,6 +320,8 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     low, high = float(readings.min()), float(readings.max())
     found = f"all {readings.size} usable readings equal {low:g}"
     require(low < high, named, found, "readings that differ: scan an edge")
+    found = f"readings of {low:g} to {high:g}, whose squares no float holds"
+    require((high - low) ** 2 >= np.finfo(np.float64).tiny, named, found, "another unit of reading")
     place = np.stack([plan.x_mm, plan.y_mm], axis=-1)
     still = rounding_error(place)
     moves, lengths = list[FloatArray](), list[float]()

@@ -34,7 +34,7 @@ from probewise.cli._inputs import (
 )
 from probewise.cli._options import parser, refuse_options
 from probewise.diagnosis import NEXT_PLAN, PlanAudit
-from probewise.errors import ParameterError, ProbewiseError, require
+from probewise.errors import ParameterError, PipeWarning, ProbewiseError, require
 from probewise.progress import Progress
 from probewise.recordings import Recording, read_recording
 from probewise.recordings.table import csv_text
@@ -215,6 +215,7 @@ def _diagnosed(words: Sequence[str]) -> tuple[str, dict[str, bytes]]:
     """Diagnose one recording in a temporary folder; return a message, "" if all went well, and the files written."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the page of each recording has them
+        warnings.simplefilter("default", PipeWarning)  # who waits for a pipe should know it
         given = ["diagnose", *words, "--out", folder, "--quiet"]
         arguments = parser().parse_args(given)
         arguments.words, message = given, ""

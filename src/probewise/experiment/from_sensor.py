@@ -97,12 +97,12 @@ def experiment_for(
     field
         The playing field, mm; the places are a grid of 131 x 65 over it, as in the paper.
     method
-        "particles": sequential Monte Carlo. "paper": nested sampling anew after each reading, the entropy of 50
+        "particles": sequential Monte Carlo. "paper": nested sampling again after each reading, the entropy of 50
         predictions, a Student-t likelihood with unknown sd or the naive one, and a complete sensor model.
     model
         "ssf" or "naive".
     utility
-        Utility, or its name (see `inquiry.utility_named`); by default `Finishing()`, with the paper's method its own.
+        Utility, or its name (see `inquiry.utility_named`); by default `Finishing()`, with the paper's, entropy.
     learn_sensor
         Infer the SSF's size and place and the two levels jointly with the shape, with a prior from the calibration.
     batch

@@ -48,7 +48,7 @@ class FittedArm:
     calibrated_mm
         Place on the field where this arm took the readings of the calibration: the sensor's levels include the error of
         the height there. A sensor's file does not say it; None assumes the middle of the field, where the command `arm
-        record` lays a plan unless it is told otherwise. ParameterError for a place out of the arm's reach.
+        record` lays a plan by default. ParameterError for a place out of the arm's reach.
     """
 
     geometry: Geometry

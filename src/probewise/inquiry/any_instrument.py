@@ -345,8 +345,8 @@ class Inquiry(ShowsItself):
     n_samples
         Posterior samples, 400 or more.
     n_live
-        Live points of nested sampling, which starts anew if the samples cannot follow a reading, or have lost a part of
-        the posterior.
+        Live points of nested sampling, which starts again if the samples cannot follow a reading, or have lost a part
+        of the posterior.
 
     Raises
     ------

@@ -274,7 +274,7 @@ def _may_end_with_one_more(inputs: UtilityInput, goal: Goal) -> bool:
 
 
 def _probability_of_reaching_target(inputs: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
-    """Return the probability that a reading, or the mean of a design's repeats, reaches the target precision, (n,).
+    """Return the probability that a reading, or the mean of a design's repeats, reaches the target sd, (n,).
 
     `designs` are places in `rows`.
     """

@@ -30,6 +30,7 @@ from probewise.nested.weights import resampled_rows, weighted_quantiles
 _FORMAT = "nested-result/4"
 # How an array is kept, by the annotation of its field.
 _READ_ONLY: Mapping[object, Callable[[Any], NDArray[Any]]] = {"FloatArray": read_only_floats, "IntArray": frozen_int}
+_OF_RANKS = ("insertion_rank", "insertion_n_ranked")
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,16 +294,24 @@ class NestedResult(Samples):
     def load(cls, path: str | Path) -> NestedResult:
         """Read a file written by `save`; FileError if there is none, or it is damaged or of another format."""
         path = checked_path("path", path)
-        cure = "make the file anew with this version"
-        head, arrays = read_archive(path, _FORMAT, "a file written by NestedResult.save", cure=cure)
+        wanted, cure = "a file written by NestedResult.save", "make the file anew with this version"
+        head, arrays = read_archive(path, _FORMAT, wanted, cure=cure)
         if odd := {*head, *arrays} ^ {f.name for f in fields(cls)}:
             names = ", ".join(sorted(odd))
             raise FileError(path, f"fields {names} missing or unknown", "the fields that NestedResult.save writes")
-        head |= {name: tuple(head[name]) for name in ("names", "warnings")}
-        head["check"] = head["check"] and Check(**head["check"])
-        if runs := head["agreement"]:
-            head["agreement"] = Agreement(**(runs | {n: tuple(runs[n]) for n in ("log_z", "log_z_error")}))
-        return cls(**(head | arrays))
+        try:
+            head |= {name: tuple(head[name]) for name in ("names", "warnings")}
+            head["check"] = head["check"] and Check(**head["check"])
+            if runs := head["agreement"]:
+                head["agreement"] = Agreement(**(runs | {n: tuple(runs[n]) for n in ("log_z", "log_z_error")}))
+            n_dead, n_ranks = (arrays[name].size for name in ("log_weight", "insertion_rank"))
+            shapes = {"theta": (n_dead, len(head["names"])), **dict.fromkeys(_OF_RANKS, (n_ranks,))}
+            for name, array in arrays.items():
+                sound = array.shape == shapes.get(name, (n_dead,)) and not np.isnan(array.astype(np.float64)).any()
+                require(sound and array.dtype.kind in "biuf", name, array, f"numbers, {shapes.get(name, (n_dead,))}")
+            return cls(**(head | arrays))
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileError(path, f"unusable: {message_of(error, kind=False)}", wanted) from error
 
 
 def archive_bytes(head: Mapping[str, object], arrays: Mapping[str, NDArray[Any]], *, compressed: bool = False) -> bytes:

@@ -321,7 +321,7 @@ def run_once(
         keeper = CheckpointFile(checkpoint, checkpoint_every_s, settings)
         resumed = keeper.resume(evaluate, moving, rng)
     now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
-    if len(now.live) < n_live:  # a run with more calls begins anew
+    if len(now.live) < n_live:  # a run with more calls begins again
         keeper = None
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)

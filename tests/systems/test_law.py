@@ -155,7 +155,7 @@ TABLE = RunTable(
 )
 
 
-def _about(law, parameters, table, values, *, sd=1e-3, max_step=0.06):
+def _about(law, parameters, table, values, *, sd=1e-3, max_step=0.03):
     """Return the reference fit at parameters `values`: uniform from 0 to twice each, so that they are in the middle."""
     priors = {name: (0.0, 2 * value) for name, value in zip(parameters, values, strict=True)}
     simulator = Simulator(

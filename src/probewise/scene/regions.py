@@ -93,23 +93,6 @@ def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatAr
     return np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
 
 
-# A Fibonacci lattice in the unit square, whose places are even along either side: a straight edge cuts off a share that
-# is right to a hundredth.
-_N_PLACES = 89
-_PLACES = np.stack([np.arange(_N_PLACES), 55 * np.arange(_N_PLACES) % _N_PLACES]) / _N_PLACES + 0.5 / _N_PLACES - 0.5
-
-
-def mean_albedo_of_pixels(region: Region, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-    """Return the mean albedo over each of many square pixels, from 89 places in each, (n_regions, n_points).
-
-    The pixels have centres `centers_mm` (n_points, 2), side `pixel_mm`, and are turned by `turn_rad` (n_points,).
-    """
-    (across, up), cosine, sine = pixel_mm * _PLACES, np.cos(turn_rad)[:, None], np.sin(turn_rad)[:, None]
-    x, y = centers_mm[:, :1] + cosine * across - sine * up, centers_mm[:, 1:] + sine * across + cosine * up
-    found = region.albedo(np.stack([x.ravel(), y.ravel()], axis=-1))
-    return np.asarray(found.reshape(len(found), len(centers_mm), -1).mean(axis=2))
-
-
 @dataclass(frozen=True, eq=False)
 class UniformRegion(RegionBatch):
     """A uniform albedo `level`, shape (n_regions,)."""

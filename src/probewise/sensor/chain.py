@@ -354,8 +354,8 @@ class RegionsAndPoses:
 def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = ACCURATE_NODES) -> FloatArray:
     """Integrate the footprint over each reading's pattern (paper, eq. 8).
 
-    By closed forms, and quadrature at curved edges. A kind of region without a closed form is summed over pixels: error
-    about 1e-3, with a `SlowWarning`.
+    By closed forms, and quadrature at curved edges. A kind of region without a closed form is seen at some thousand
+    places: error about 1e-3, with a `SlowWarning`.
 
     Returns R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses.
 

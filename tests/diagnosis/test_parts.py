@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import quad
 
 from probewise.arm import readings_of_recording, recording_of_readings
+from probewise.diagnosis import templates as templates_module
 from probewise.diagnosis.advice import Alias
 from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, effect_values
@@ -18,8 +19,15 @@ from probewise.diagnosis.light_sensor import LightSensorApparatus, rows_as_next_
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise import NoiseLaw, noise_statistics, white_noise
 from probewise.diagnosis.prepared import join, join_plans
+from probewise.diagnosis.search.hypotheses import Refits
 from probewise.diagnosis.sensors import default_sensor, sensor_from_samples, theta_to_natural, with_free_form
-from probewise.diagnosis.templates import TemplateBank, log_bayes_factors_of_pairs, templates_of_effect
+from probewise.diagnosis.templates import (
+    EffectTemplates,
+    TemplateBank,
+    TemplateCache,
+    log_bayes_factors_of_pairs,
+    templates_of_effect,
+)
 from probewise.diagnosis.verdict import Hypothesis, Judged, verdict_and_combination
 from probewise.effects import VOCABULARY, Extent
 from probewise.effects.effect import Where
@@ -216,6 +224,30 @@ def test_a_pair_weighs_as_one_template_of_all_its_columns(law):
     for (a, b), found in log_bayes_factors_of_pairs(problem, banks, singles).items():
         both = np.hstack([banks[a][0], banks[b][0]])
         assert found == pytest.approx(TemplateBank.of([both], ["both"]).log_bayes_factors(problem)[0, 0])
+
+
+def test_templates_about_the_latest_fit_alone_are_remembered_where_they_are_many(monkeypatch):
+    def four(found, effect, usable):
+        return EffectTemplates((np.ones((4, 1)),), (np.ones((1, 1)),), (effect,), np.zeros(1, dtype=np.int64))
+
+    monkeypatch.setattr(templates_module, "templates_of_effect", four)
+    monkeypatch.setattr(templates_module, "_MOST_REMEMBERED", 4)
+    cache, effects = TemplateCache(np.arange(4)), [VOCABULARY["offset_drift"].for_extent(EXTENT)]
+    for about in (first := object(), second := object()):
+        bank = cache.coarse_bank(about, effects)
+        assert cache.coarse_bank(about, effects) is bank
+        assert first in cache.known or about is second
+    assert [*cache.known] == [about for about, _ in cache.banks] == [second]
+    passing = [each.labels for each in cache.passing_banks(second, effects)]
+    assert passing == [bank.labels]
+
+
+def test_the_refit_of_a_null_under_the_simplest_noise_serves_the_nulls_that_are_no_better():
+    def weighed(log_z):
+        return SimpleNamespace(evidence={(): SimpleNamespace(log_z=log_z)})
+
+    refits = Refits(None, SimpleNamespace(certain=()), TemplateCache(np.arange(4)), plain=[weighed(-10.0)])
+    assert refits.null_under_simplest_noise(weighed(-11.0)) is refits.plain[0]
 
 
 def test_what_survives_of_a_template_is_what_no_parameter_takes_up():

@@ -151,9 +151,8 @@ class TemplateBank:
         Without a random walk they are sums over readings of a few precisions, which are the same for many noise models.
         """
         if (key := law.whitening_key) not in self._grams:
-            parts = (
-                [] if law.walk.size else [(part, *np.unique(each, return_inverse=True)) for part, each in law.precision]
-            )
+            given = [] if law.walk.size else law.precision
+            parts = [(before, *np.unique(each, return_inverse=True)) for before, each in given]
             self._grams[key] = out = list[FloatArray]()
             for number, members in enumerate(self.groups):
                 rows = self._rows(members)
@@ -323,8 +322,10 @@ class TemplateCache:
     def _keep(self, found: Fit) -> dict[Effect, EffectTemplates]:
         """Return the templates about a fit, now the latest; forget those about the earliest if there are too many."""
         self.known[found] = self.known.pop(found, {})
-        while len(self.known) > 1 and sum(map(_count_numbers, self.known.values())) > _MOST_REMEMBERED:
-            self.known.pop(forgotten := next(iter(self.known)))
+        while sum(each.n_numbers for own in self.known.values() for each in own.values()) > _MOST_REMEMBERED:
+            if (forgotten := next(iter(self.known))) is found:
+                break
+            del self.known[forgotten]
             self.banks = {key: bank for key, bank in self.banks.items() if key[0] is not forgotten}
         return self.known[found]
 
@@ -342,10 +343,6 @@ class TemplateCache:
             return None
         columns, settings = (tuple(every[k] for k in cast(list[int], at)) for every in (first.columns, first.settings))
         return EffectTemplates(columns, settings, effect.variants(), np.zeros(len(at), dtype=np.int64))
-
-
-def _count_numbers(known: Mapping[Effect, EffectTemplates]) -> int:
-    return sum(each.n_numbers for each in known.values())
 
 
 def templates_of_effect(found: Fit, effect: Effect, usable: IntArray, *, most: int | None = None) -> EffectTemplates:

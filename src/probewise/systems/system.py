@@ -238,9 +238,7 @@ class System:
         """Return whether an effect acts at a stage of this system: False for one on rates without a law."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
 
-    def part_that_predicts(
-        self, rows: IntArray, table: RunTable, effects: Sequence[Effect]
-    ) -> tuple[RunTable, IntArray]:
+    def part_that_predicts(self, rows: IntArray, table: Any, effects: Sequence[Effect]) -> tuple[Any, IntArray]:
         """Return a part of a table that suffices to predict some of its rows, and their numbers there.
 
         Few of many rows suffice if neither the simulator nor an effect looks at others: at trial points of the prior,

@@ -21,8 +21,7 @@ from pathlib import Path
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.diagnosis import diagnose_system, generators_of_diagnosis
 from probewise.report.diagnosis_figures import before_and_after
-from probewise.report.plots import png
-from probewise.report.plots.apparatus import draw_arm_lengths
+from probewise.report.plots import draw_arm_lengths, png
 from probewise.report.plots.canvas import figure_of
 from probewise.report.words import typeset_numbers
 from probewise.systems import read_simulator, read_table_for
@@ -66,7 +65,6 @@ def diagnose_pendulum(folder: Path) -> None:
     axes = before_and_after(found)
     said = typeset_numbers(found.reason.partition(" (p =")[0])
     figure_of(axes).suptitle(f"Verdict: {said}", x=0.02, ha="left", fontweight="bold", fontsize=9)
-    figure_of(axes).tight_layout(pad=0.4, h_pad=0.9)
     (STATIC / "pendulum.png").write_bytes(png(axes, dpi=130))
     kept = {"verdict": found.verdict, "combination": list(found.combination), "reason": found.reason}
     (STATIC / "pendulum.json").write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -4,7 +4,7 @@ A sensor model from a recording
 
 Shows a sensor model of one Gaussian fitted to the shipped recording (simulated with the paper's plan), and how well it
 predicts the readings. The sensor's spatial sensitivity function (SSF) is the weight of each point below it in a
-reading. The figures follow the paper's: how the recording was taken, the data, the SSF, the predictions.
+reading. The figures follow the paper's: the data, the SSF, the predictions.
 """
 
 # %%
@@ -18,8 +18,6 @@ from probewise.report import plots
 seed = 1
 print(f"seed {seed}")
 recording = read_recording(shipped("paper"))
-fig, ax = plt.subplots(figsize=(7, 3.5))
-plots.sensor_orientations(recording, ax=ax)
 fig, ax = plt.subplots()
 plots.readings_by_orientation(recording, ax=ax)
 

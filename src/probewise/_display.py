@@ -1,23 +1,14 @@
 """How results show themselves: text, HTML in a notebook, a picture, a page; tables as data frames.
 
-A result's class derives from `ShowsItself`, of a verb's result from `Reported`. What draws and writes it is registered
-in `report`, higher in the layers, and loaded by name when it is first needed: it loads plotting.
+A result's class derives from `ShowsItself`, of a verb's result from `Reported`. What draws and writes it is in
+`report`, higher in the layers, and loaded by name when it is first needed: it loads plotting.
 """
 
 from __future__ import annotations
 
-import functools
 import importlib
 from pathlib import Path
 from typing import Any
-
-
-@functools.singledispatch
-def render_html(value: object) -> str:
-    """Return a result as an HTML fragment; of a type without a registered renderer, the text of its `str`."""
-    import html
-
-    return f"<pre>{html.escape(str(value))}</pre>"
 
 
 class ShowsItself:
@@ -55,11 +46,10 @@ class ShowsItself:
         return importlib.import_module("probewise.report.notebook").drawing_of(self)
 
     def _repr_html_(self) -> str:
-        importlib.import_module("probewise.report.notebook")
         import numpy as np  # it is loaded by the time there is a result
 
         with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"):  # whatever np.seterr says
-            return render_html(self)
+            return str(importlib.import_module("probewise.report.notebook").html_of(self))
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         printer.text(str(self))

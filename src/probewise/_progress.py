@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Never
+from typing import Never
 
 from tqdm import tqdm
 
@@ -78,32 +78,23 @@ def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary], 
     return tell
 
 
-class _LastReport(NamedTuple):
-    """The last report; its fields are the arguments of `Progress`."""
-
-    stage: str
-    done: int
-    total: int
-    note: str
-
-
 class _StageBars:
     """A progress function that shows one bar per stage; bars of stages longer than two seconds stay visible."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._shows_at = time.monotonic() + _PATIENCE_S
-        self._now: _LastReport | None = None
+        self._stage, self._done, self._total, self._note = "", 0, 0, ""
         self._began = 0.0
         self._bar: tqdm[Never] | None = None
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        stage, note = printable(stage), printable(note)
+        stage = printable(stage)
         with self._lock:
-            if self._now is None or (stage, total) != (self._now.stage, self._now.total):
+            if (stage, total) != (self._stage, self._total):
                 self._close_bar(ended=True)
                 self._began = time.time()
-            self._now = _LastReport(stage, done, total, note)
+            self._stage, self._done, self._total, self._note = stage, done, total, printable(note)
             self._update_bar()
 
     def refresh(self) -> None:
@@ -119,14 +110,14 @@ class _StageBars:
             self._close_bar(ended=ended)
 
     def _update_bar(self) -> None:
-        if self._now is None or time.monotonic() < self._shows_at:
+        if not self._stage or time.monotonic() < self._shows_at:
             return
         if self._bar is None:
-            total = self._now.total or None
-            self._bar = tqdm(desc=self._now.stage, total=total, bar_format=_WITH_TOTAL if total else _WITHOUT)
+            total = self._total or None
+            self._bar = tqdm(desc=self._stage, total=total, bar_format=_WITH_TOTAL if total else _WITHOUT)
             self._bar.start_t = self._began
-        self._bar.set_postfix_str(self._now.note, refresh=False)
-        self._bar.update(self._now.done - self._bar.n)
+        self._bar.set_postfix_str(self._note, refresh=False)
+        self._bar.update(self._done - self._bar.n)
 
     def _close_bar(self, *, ended: bool) -> None:
         if self._bar is not None:
@@ -134,7 +125,7 @@ class _StageBars:
                 self._bar.n = self._bar.total
             self._bar.leave = time.time() - self._began > _PATIENCE_S
             self._bar.close()
-        self._bar = self._now = None
+        self._bar, self._stage = None, ""
 
 
 class _TextProgress:
@@ -146,22 +137,20 @@ class _TextProgress:
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
         self._said = ""
-        self._now = _LastReport("getting ready", 0, 0, "")
+        self._now = "getting ready"
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        self._now = _LastReport(printable(stage), done, total, printable(note))
+        self._now = printable(f"{stage}{f', {done} of {total}' if total else ''}{f', {note}' if note else ''}")
         self.refresh()
 
     def refresh(self) -> None:
         """Write the last report as a line if it says something new and the wait since the line before is over."""
         now = time.monotonic()
         wait = max(_BETWEEN_LINES_S, _SHARE_OF_ALL * (now - self._began)) if self._said else _PATIENCE_S
-        stage, done, total, note = self._now
-        text = f"{stage}{f', {done} of {total}' if total else ''}{f', {note}' if note else ''}"
-        if now - self._last < wait or text == self._said:
+        if now - self._last < wait or self._now == self._said:
             return
-        self._last, self._said = now, text
-        sys.stderr.write(f"{text} ({now - self._began:.0f} s)\n")
+        self._last, self._said = now, self._now
+        sys.stderr.write(f"{self._now} ({now - self._began:.0f} s)\n")
         sys.stderr.flush()
 
     def close(self, *, ended: bool) -> None:

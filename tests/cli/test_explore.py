@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main, parser
-from probewise.cli._bench import InstrumentWithCallbacks
 from probewise.cli.explore import Search
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
@@ -133,15 +131,6 @@ def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path
     share = sum(float(row["weight"]) for row in rows if row["shape"] == found["shape"]["name"])
     assert found["shape"]["probability"] == pytest.approx(share, abs=1e-3)
     assert found["chance_off_12mm"] >= 1 - share - 1e-3
-
-
-def test_the_bar_says_where_the_arm_moves_before_it_does():
-    told = []
-    arm = SimulatedArm(lambda pose, time_s, height_mm: 42.0)
-    telling = InstrumentWithCallbacks(arm, told.append, told.append)
-    reading = telling.measure(Pose(500.0, 200.0))
-    assert telling.reachable(np.array([[500.0, 200.0], [0.0, 0.0]])).tolist() == [True, False]
-    assert told == [Pose(500.0, 200.0), reading]
 
 
 @pytest.mark.slow

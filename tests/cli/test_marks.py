@@ -1,20 +1,19 @@
 """The geometry fitted at the emulated bench, and sheets that are watched while a plan is carried out."""
 
 import dataclasses
-import io
 import math
 import re
 
 import numpy as np
 import pytest
 
-from probewise.arm import DryRun, LegoArm, RequestToPerson, read_geometry, shipped_geometry_path
+from probewise.arm import DryRun, LegoArm, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._bench import warn_if_place_sd_large
-from probewise.cli._record import SheetCheck, person_at_bench, uniform_shades_at_places
+from probewise.cli._record import SheetCheck, uniform_shades_at_places
 from probewise.cli.arm import bring_to_mark, place_after_moves
-from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
+from probewise.recordings import HalfPlane, Uniform, paper_plan, write_plan
 
 OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3, "upper_mm": 3, "lower_mm": -3}
 
@@ -146,46 +145,3 @@ def test_a_right_scan_is_not_told_of():
     watch = SheetCheck(plan, white_is_bright=True)
     levels = 14 + 44 / (1 + np.exp(-plan.x_mm / 3))
     assert not any(watch.complaint_about_reading(row, float(value)) for row, value in enumerate(levels + noise))
-
-
-def test_a_sheet_is_looked_at_over_its_white_and_its_black():
-    plan = paper_plan()
-    watch = SheetCheck(plan, white_is_bright=True)
-    everywhere = lambda places: np.ones(len(places), dtype=bool)  # noqa: E731
-    for name, pattern in plan.patterns.items():
-        places = watch.white_and_black_places(name, everywhere)
-        assert set(places) == {True, False}
-        for is_white, place in places.items():
-            assert uniform_shades_at_places(pattern, np.array([place]))[0] == is_white
-    assert watch.complaint_about_levels("boundary", {True: 55.0, False: 15.0}) is None
-    assert "reads 15 where it should be white and 55 where black" in watch.complaint_about_levels(
-        "quadrant_a", {True: 15.0, False: 55.0}
-    )
-
-
-def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet(monkeypatch, capsys):
-    geometry = read_geometry(shipped_geometry_path())
-    arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
-    values = iter([12.0, 57.0])
-    monkeypatch.setattr(arm, "measure", lambda pose: dataclasses.replace(_reading(pose), value=next(values)))
-    monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))
-    plan = paper_plan()
-    with arm:
-        hands = person_at_bench(
-            arm, plan, (524.0, 260.0), SheetCheck(plan, white_is_bright=True), check_sheets=True, emulated=True
-        )
-        hands(RequestToPerson("lay sheet 'quadrant_c'", pattern="quadrant_c"))
-        hands(RequestToPerson("turn the sensor", turned_rad=math.pi / 2))
-    said = capsys.readouterr().err
-    assert "in the emulator's terminal: corner:528,264,1,1" in said
-    assert "in the emulator's terminal: turn 90" in said
-    assert (
-        "warning: sheet 'quadrant_c' contradicts its pattern: it reads 12 where it should be white and 57 where" in said
-    )
-    assert isinstance(plan.patterns["quadrant_c"], Quadrant)
-
-
-def _reading(pose):
-    from probewise.arm import Reading
-
-    return Reading(0.0, pose, 1.0)

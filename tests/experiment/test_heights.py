@@ -10,7 +10,6 @@ from exploring import run
 from hand_made import NAMES, sensor_of
 
 from probewise.arm import Pose, Reading, as_instrument
-from probewise.cli._bench import InstrumentWithCallbacks
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.experiment import arm_over, experiment_for, explore, result_json
 from probewise.inference import GaussianKnown
@@ -157,9 +156,6 @@ class OwnArm:
 ELSEWHERE = {
     "of each reading": OwnArm({"height_mm": 20.0}),
     "of the arm": OwnArm({}, read_height_mm=20.0),
-    "of an arm with callbacks": InstrumentWithCallbacks(
-        as_instrument(OwnArm({}, read_height_mm=20.0)), lambda _: None, lambda _: None
-    ),
 }
 
 
@@ -213,15 +209,13 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("with_callbacks", [False, True])
 @pytest.mark.parametrize(("declared", "changes", "message"), REFUSED.values(), ids=REFUSED.keys())
 def test_what_an_arm_does_not_declare_that_it_can_is_refused_before_it_moves(
-    small, tmp_path, with_callbacks, declared, changes, message
+    small, tmp_path, declared, changes, message
 ):
     """It would be recorded as turned or lifted, and would not be."""
     moved = []
     arm = as_instrument(OwnArm({}, measure=moved.append, **declared))
-    arm = InstrumentWithCallbacks(arm, print, print) if with_callbacks else arm
     path = tmp_path / "journal.jsonl"
     with pytest.raises(ParameterError, match=message):
         next(explore(arm, asked(small, **changes), rng=np.random.default_rng(1), journal=path))

@@ -53,7 +53,7 @@ def test_every_category_has_its_name_on_the_axis_and_in_the_caption(covariate, v
     )
     diagnosis = SimpleNamespace(recording=taken, apparatus=LightSensorApparatus())
     view = views_of_place(diagnosis, place)[-1]
-    assert view.category_names_on_axis == names
+    assert view.names == names
     assert view.window == ((-0.5, 0.5) if scan else (-0.5, len(names) - 0.5))
     assert ("scan one" if scan else ", ".join(names)) in _place_caption(diagnosis, place)
 

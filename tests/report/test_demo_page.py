@@ -1,4 +1,4 @@
-"""The demo's page: what it compares begins alike, its map is that of the circles drawn on it."""
+"""The demo's page: every figure is there, and the diagnosis is that of the command."""
 
 import io
 from types import SimpleNamespace
@@ -17,16 +17,8 @@ from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
-from probewise.report.demo import (
-    RobotSearch,
-    doubt_section,
-    doubt_sentence,
-    draw_effect_probabilities,
-    draw_final_posteriors,
-    paper_view,
-    window_around_runs_mm,
-)
-from probewise.report.plots import PAGE_IN, grid_of_axes, png
+from probewise.report.demo import RobotSearch, doubt_section, doubt_sentence, draw_views
+from probewise.report.plots import PAGE_IN, png
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
@@ -50,19 +42,6 @@ def searched(max_readings):
 @pytest.fixture(scope="module")
 def found():
     return searched(2)
-
-
-def test_the_view_shows_the_fifty_circles_and_the_place_chosen_from_them(found):
-    window = window_around_runs_mm([found], 1)
-    outline = np.array([[510.0, 260.0], [600.0, 350.0], [690.0, 260.0]])
-    search = RobotSearch("SSF", found, {}, outline, (10.0, 60.0))
-    ax = paper_view(search, 1, window_mm=window, ax=grid_of_axes(1, 1, size_in=(8.2, 5.2))[0, 0])
-    assert len(ax.collections[0].get_paths()) == 50
-    green = ax.collections[-1].get_offsets()[0]
-    assert tuple(green) == (found.readings[1].pose.x_mm, found.readings[1].pose.y_mm)
-    left, right, low, high = window
-    assert left < green[0] < right
-    assert low < green[1] < high
 
 
 def test_the_demo_the_command_and_the_function_diagnose_by_the_same_randomness(monkeypatch, tmp_path):
@@ -90,7 +69,7 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
     searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
-    drawn = {"doubt.png": png(draw_final_posteriors(searches)), "belief.png": png(draw_effect_probabilities(found))}
+    drawn = {"doubt.png": png(draw_views(searches, 2)), "belief.png": b"<svg></svg>"}
     widest = 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
     assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= widest
     said = "".join(doubt_section(searches, drawn).elements)
@@ -120,14 +99,13 @@ def test_the_page_shows_every_figure_that_is_drawn(found):
         predict(sensor, recording.plan, recording.readings),
         searches,
         searches,
-        searches,
         diagnose(recording.take(np.arange(0, 408, 8)), rng=np.random.default_rng(1)),
         read_geometry(shipped_geometry_path()),
         "lag",
         1,
     )
     drawn = {name: draw() for name, draw in report.figure_drawers(found).items()}
-    page = report.page_html(found, drawn, frames=[[drawn["doubt.png"]] * 2] * 2, seconds=2.0)
-    assert page.count("<img") == len(drawn) + 1  # two slides, and one figure is a file alone, ssf.png
+    page = report.page_html(found, drawn, seconds=2.0)
+    assert page.count("<img") == len(drawn) - 1  # one figure is a file alone, ssf.png
     assert "could not be drawn" not in page
     assert "The simulated world that made this recording concealed: lag." in page

@@ -1,7 +1,6 @@
 """Pages are self-contained and escape what they are given."""
 
 import io
-import re
 from html.parser import HTMLParser
 
 from hypothesis import given
@@ -9,8 +8,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from probewise._words import count_with_noun
-from probewise.report.html import Section, figure, page, paragraph, slideshow, table
-from probewise.report.words import number_text, number_unsigned_zero, probability_text
+from probewise.report.html import Section, figure, page, paragraph, table
+from probewise.report.words import number_text, probability_text
 
 
 def png(size, dpi=None):
@@ -73,7 +72,7 @@ def test_a_page_needs_nothing_from_outside():
 def test_numbers_are_written_as_people_read_them():
     assert number_text(-1.25, 1) == "−1.2"
     assert number_text(float("nan"), 1) == "–"
-    assert number_unsigned_zero(-0.01, 1) == "0.0"
+    assert number_text(-0.01, 1) == "0.0"
     assert (count_with_noun(1, "reading"), count_with_noun(2, "reading")) == ("1 reading", "2 readings")
     assert (probability_text(1e-9), probability_text(0.5), probability_text(1.0)) == ("< 0.001", "0.500", "> 0.999")
 
@@ -89,13 +88,3 @@ def test_many_sections_are_listed_with_links_that_lead_to_them():
     assert all(made.count(f'id="{link[1:]}"') == 1 for link in links)
     assert "<h3>first &lt;part&gt;</h3>" in made
     assert "<nav" not in page("t", answer="a", key_figure=figure(PNG, "key"), sections=sections[:1])
-
-
-def test_a_slideshow_shows_its_last_picture_where_scripts_are_off():
-    slides = [(PNG, "first"), (PNG, "second"), (PNG, "last")]
-    made = page("t", answer="a", key_figure=slideshow(slides, "steps"), sections=())
-    shown = [part.startswith("<div hidden") for part in re.findall(r'<div[^>]*class="slide"', made)]
-    assert shown == [True, True, False]
-    assert "<label hidden>" in made
-    assert made.count("<script>") == 1
-    assert "<script>" not in page("t", answer="a", key_figure=figure(PNG, "key"), sections=())

@@ -71,7 +71,7 @@ def synthetic(n_params, n=600, n_live=50):
 
 def test_a_trace_shows_every_dead_point_against_the_volume_left(result):
     axes = plots.trace_plot(result)
-    assert axes.shape == (4, 2)
+    assert axes.shape == (4, 1)
     assert "ln X" in axes[-1, 0].get_xlabel()
     assert "−" in axes[0, 0].get_title(loc="left")
     (dots,) = (c for c in axes[1, 0].collections if isinstance(c, PathCollection))
@@ -111,7 +111,7 @@ def test_a_corners_regions_hold_what_they_say():
 
 def test_chosen_parameters_are_drawn_in_their_order(result):
     axes = plots.corner_plot(result, parameters=["I_min", "x_mm"])
-    assert [ax.get_xlabel() for ax in axes[-1]] == [r"$I_\mathrm{min}$", "x (mm)"]
+    assert [ax.get_xlabel() for ax in axes[-1]] == ["I min", "x (mm)"]
     assert plots.trace_plot(result, parameters=["angle_rad"])[1, 0].get_ylabel() == "angle (rad)"
     for wrong in (["y_mm"], []):
         with pytest.raises(ParameterError, match="parameters is"):
@@ -142,7 +142,7 @@ def test_insertion_ranks_are_counted_against_a_band_of_all_bars(result):
     left = ((counts < low) | (counts > high)).any(axis=1).sum()
     assert left < 40
     assert binom.cdf(low - 1, n, 1 / n_bars) < 0.01 / n_bars
-    assert "p = " in ax.get_title(loc="left")
+    assert "p = " in ax.get_xlabel()
 
 
 def test_the_course_of_a_run_ends_at_its_evidence(result):

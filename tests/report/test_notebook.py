@@ -8,7 +8,7 @@ import pytest
 from matplotlib.axes import Axes
 
 import probewise
-from probewise._display import ShowsItself, render_html
+from probewise._display import ShowsItself
 from probewise.cli import main
 from probewise.errors import ParameterError
 from probewise.nested import run
@@ -52,7 +52,6 @@ def test_a_value_without_a_renderer_shows_its_escaped_summary():
 
     assert Plain()._repr_html_() == "<pre>a &lt; b\nand more</pre>"
     assert repr(Plain()) == "<Plain: a < b>"
-    assert render_html(3) == "<pre>3</pre>"
 
 
 def test_what_has_no_picture_says_so():

@@ -1,4 +1,4 @@
-"""Pictures of a run: a GIF with every frame in order, and two runs side by side."""
+"""Pictures of a run: a GIF with every frame in order."""
 
 import io
 
@@ -14,8 +14,8 @@ def png(colour, size):
     return out.getvalue()
 
 
-def test_frames_follow_each_other_and_smaller_ones_are_set_on_white():
-    moving = Image.open(io.BytesIO(animated_gif([png("red", (8, 6)), png("blue", (4, 6))], frame_s=0.5, last_s=2.0)))
+def test_frames_follow_each_other():
+    moving = Image.open(io.BytesIO(animated_gif([png("red", (8, 6)), png("blue", (8, 6))], frame_s=0.5, last_s=2.0)))
     assert moving.n_frames == 2
     assert moving.size == (8, 6)
     assert moving.info["loop"] == 0
@@ -23,6 +23,4 @@ def test_frames_follow_each_other_and_smaller_ones_are_set_on_white():
     assert tuple(np.asarray(moving.convert("RGB"))[3, 6]) == (255, 0, 0)
     moving.seek(1)
     assert moving.info["duration"] == 2000
-    second = np.asarray(moving.convert("RGB"))
-    assert tuple(second[3, 1]) == (0, 0, 255)
-    assert tuple(second[3, 6]) == (255, 255, 255)
+    assert tuple(np.asarray(moving.convert("RGB"))[3, 1]) == (0, 0, 255)

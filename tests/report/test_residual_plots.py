@@ -29,7 +29,6 @@ def drawn():
         "neighbours": plots.residual_autocorrelation(noise, scan, rho=0.3),
         "spread": plots.spread_by_level(X, noise, unit="V", model_sd=np.ones(200)),
         "tails": plots.residual_histogram(noise, 1.0),
-        "lost": plots.lost_readings_against_predicted(X, noise, X > 9.0, unit="V"),
         "lattice": plots.readings_modulo_step(np.round(noise, 1), 0.1, unit="V"),
     }
 
@@ -70,13 +69,6 @@ def test_no_legend_lies_over_data(figures, images):
 def test_the_same_drawing_gives_the_same_bytes():
     first, second = (plots.svg(plots.heldout_gain_by_scan([("edge_0", 0.5)], 0.2, 0.05)) for _ in range(2))
     assert first == second
-
-
-@pytest.mark.parametrize(("window", "shaded"), [((2.0, 3.0), True), ((0.5, 9.5), False)])
-def test_only_a_part_of_the_axis_stands_out(window, shaded):
-    x = np.linspace(0.0, 10.0, 200)
-    ax = plots.mean_residuals_along(mean_residuals(x, np.sin(x), None, sd=1.0), label="X", unit="V", window=window)
-    assert ("stands out here" in ax.get_legend_handles_labels()[1]) is shaded
 
 
 def test_rounded_readings_lie_on_their_lattice(figures):

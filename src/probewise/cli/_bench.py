@@ -182,7 +182,7 @@ def nxt_port(name: str) -> str:
     return chosen.where
 
 
-def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
+def prompter_unless_dry_run(arguments: argparse.Namespace, arm: Instrument) -> Callable[[object], None]:
     """Return a function that prompts the person; in a dry run, it only prints the request."""
     return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
 
@@ -236,23 +236,6 @@ def world_and_scale(sensor: Path | None, *, lego: bool = False) -> tuple[World, 
     if lego and fitted.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
     return world_like(fitted), scale_of(fitted.instrumentation)
-
-
-class InstrumentWithCallbacks:
-    """An instrument, already entered, that calls `moving` with each pose before it moves, `read` with each reading."""
-
-    def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
-        self._instrument, self._moving, self._read = instrument, moving, read
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._instrument, name)
-
-    def measure(self, pose: Pose) -> Reading:
-        """Call `moving`, measure, call `read`, and return the reading."""
-        self._moving(pose)
-        reading = self._instrument.measure(pose)
-        self._read(reading)
-        return reading
 
 
 @dataclasses.dataclass(frozen=True)
@@ -354,14 +337,15 @@ def without_measured_covariates(plan: recordings.Plan, instrumentation: recordin
 # The person at the bench
 
 
-def prompter(arm: Instrument) -> Callable[[str], None]:
-    """Return a function that prompts a person and waits for Enter, while keeping the arm awake."""
-    return partial(press_enter, prompter_for_answer(arm))
+def prompter(arm: Instrument) -> Callable[[object], None]:
+    """Return a function that prompts a person for something to do and waits for Enter, while keeping the arm awake."""
+    ask = prompter_for_answer(arm)
 
+    def press_enter(request: object) -> None:
+        text = str(request)
+        ask(f"{text[0].upper()}{text[1:]}, then press Enter: ")
 
-def press_enter(answer_to: Callable[[str], str], text: str) -> None:
-    """Prompt a person, by a function that returns the line typed, and wait for Enter."""
-    answer_to(f"{text[0].upper()}{text[1:]}, then press Enter: ")
+    return press_enter
 
 
 def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:

@@ -158,7 +158,8 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
 def refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
     """Raise ParameterError if one of these options is given: there are none with `what`."""
     for name in names:
-        if (value := getattr(arguments, name, None)) is not None:
+        value = getattr(arguments, name, None)
+        if value is not None and value is not False:
             raise ParameterError(f"--{name.replace('_', '-')}", str(value), f"none with {what}")
 
 

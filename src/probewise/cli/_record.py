@@ -1,29 +1,23 @@
-"""`probewise arm record`: carry out a plan and write the recording, with a check of each sheet that is laid."""
+"""`probewise arm record`: carry out a plan and write the recording, with a check of each sheet by its readings."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import math
-import os
-import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray
+from probewise._arrays import FloatArray
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file, is_device_or_pipe
 from probewise.arm import (
     Geometry,
-    LegoArm,
-    OwnInstrument,
-    Pose,
     Reading,
-    RequestToPerson,
-    SimulatedArm,
     carry_out,
     readings_of_recording,
     recording_of_readings,
@@ -35,8 +29,7 @@ from probewise.cli import _bench
 from probewise.cli._common import message_to_resume, print_warning, progress_of, say
 from probewise.cli._inputs import read_or_shipped_plan
 from probewise.cli._options import SHIPPED, parse_place, refuse_options
-from probewise.emulator.bench import scene_text
-from probewise.errors import FileError, ParameterError, shown
+from probewise.errors import FileError, shown
 from probewise.recordings import Pattern, Plan, Recording, read_plan_and_readings, write_recording
 from probewise.recordings.files import pictures_to_write
 from probewise.recordings.patterns import have_same_albedo
@@ -47,12 +40,9 @@ _OFF_PLAN_RAD = math.radians(5.0)  # and the true orientation
 _LEGO_OFF_PLAN_RAD = math.radians(47.0)  # a LEGO mount turns by right angles, so that up to 45 degrees are left
 
 _SEES_MM = 14.0  # radius of the sensor's view
-_LOOK_MM = 25.0  # margin around the plan's places within which a sheet shows its pattern
-_SHARE = 0.05  # least contrast of white and black, as a share of the range of readings
+_SHARE = 0.05  # least contrast of white and black, as a share of the larger
 _OFF = 0.35  # largest deviation from a level, as a share of the contrast; beyond any noise
-_FEWEST = 3
 _COLOURS = {True: "white", False: "black"}
-_SPREAD_SHARE = 0.15  # largest spread of readings of one shade, as a share of the range
 _AROUND_MM = np.stack(
     [
         radius * np.array([math.cos(turn), math.sin(turn)])
@@ -87,18 +77,14 @@ def record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     instrument, bench = _bench.open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     with reporting_what_is_kept(kept_message), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not is_own)
-        ask: Callable[[RequestToPerson], None]
+        ask: Callable[[Any], None]
         if bench is not None:
             ask = partial(bench.carry_out_request, plan.patterns, origin)
         elif arguments.dry_run:
             ask = _bench.prompter_unless_dry_run(arguments, arm)
         else:
             arm.mounted_rad = math.nan  # an earlier process may have left the sensor turned
-            # A pseudo-terminal is an emulator's.
-            emulated = not is_own and os.path.realpath(_bench.nxt_port(arguments.arm)).startswith(
-                ("/dev/pts/", "/dev/ttys")
-            )
-            ask = person_at_bench(arm, plan, origin, check, check_sheets=not is_own, emulated=emulated)
+            ask = _bench.prompter(arm)
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             about = f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes"
             say(arguments, f"{about}; including {BY_HAND_S:g} s for each step by hand")
@@ -182,72 +168,14 @@ def _differences(before: Plan, plan: Plan, off_rad: float) -> Iterator[str]:
             yield f"{field.name} is {values[0]!r} there, {values[1]!r} here"
 
 
-# Sheets that a person lays
-
-
-def person_at_bench(
-    arm: LegoArm | OwnInstrument | SimulatedArm,
-    plan: Plan,
-    origin_mm: tuple[float, float],
-    sheet_check: SheetCheck,
-    *,
-    check_sheets: bool,
-    emulated: bool,
-) -> Callable[[RequestToPerson], None]:
-    """Return a function that prompts a person to carry out a request of `carry_out`, and then checks the sheet.
-
-    With `check_sheets` a sheet is checked before it is scanned, until it is right or the person overrides the check; a
-    user's own instrument takes only the plan's readings. If `emulated`, requests are carried out by typing in the
-    emulator's terminal, and the prompt says what.
-    """
-    answer = _bench.prompter_for_answer(arm)
-
-    def hint(request: RequestToPerson) -> str:
-        if emulated and request.turned_rad is not None:
-            return f" (in the emulator's terminal: turn {np.degrees(request.turned_rad):g})"
-        if not emulated or request.pattern is None:
-            return ""
-        try:
-            scene = scene_text(_bench.shifted_pattern(plan.patterns[request.pattern], origin_mm))
-        except ParameterError:
-            return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
-        return f" (in the emulator's terminal: {scene})"
-
-    def complaint_about_sheet(name: str) -> str | None:
-        """Read over a sheet's white and over its black; return a complaint if a reading is wrong, else None."""
-        chosen = sheet_check.white_and_black_places(name, lambda places: arm.reach.contains(places + origin_mm))
-        values = {}
-        for is_white, place in chosen.items():
-            there = place + np.array(origin_mm)
-            x_mm, y_mm = there.tolist()
-            standing = float(arm.orientation_rad(there[None, :])[0])
-            values[is_white] = arm.measure(Pose(x_mm, y_mm, standing)).value
-        return sheet_check.complaint_about_levels(name, values)
-
-    def ask(request: RequestToPerson) -> None:
-        _bench.press_enter(answer, f"{request}{hint(request)}")
-        if request.pattern is None or not check_sheets:
-            return
-        while (wrong := complaint_about_sheet(request.pattern)) is not None:
-            if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
-                print_warning(f"{wrong}; is the right sheet there, the right way round?")
-                break
-            if answer(f"{wrong}. Correct it and press Enter, or type go to continue anyway:  ").lower() == "go":
-                break
-
-    return ask
-
-
 class SheetCheck:
-    """A check of each sheet against its pattern, by the readings over its uniform white and black.
+    """A check of each sheet that a person lays against its pattern, by the readings over its uniform white and black.
 
     `white_is_bright`: whether white is known to read higher than black, as with the LEGO light sensor.
     """
 
     def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:
         self._plan, self._bright = plan, white_is_bright
-        ends = plan.instrumentation.declared_ends
-        self._range = ends[1] - ends[0] if len(ends) == 2 else math.nan
         self._read: dict[bool, list[float]] = {True: [], False: []}
         self._reported: set[tuple[str, bool]] = set()
         places = np.stack([plan.x_mm, plan.y_mm], axis=-1)
@@ -261,70 +189,27 @@ class SheetCheck:
         if math.isnan(shade) or math.isnan(value):
             return None
         name, is_white = self._plan.pattern_names[int(self._plan.pattern[row])], bool(shade)
-        wrong = self._complaint_against_earlier(is_white, value)
-        if wrong is None:
-            self._read[is_white].append(value)
+        own, other = self._read[is_white], self._read[not is_white]
+        if not (other and self._contradicts(is_white, value)):
+            own.append(value)
             return None
         if (name, is_white) in self._reported:
             return None
         self._reported.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
-        return f"sheet {name!r} contradicts its pattern: at {place} it is {_COLOURS[is_white]}, and {wrong}"
+        here, there = (_COLOURS[shade] for shade in (is_white, not is_white))
+        wrong = f"reads {value:g}, where {there} read {np.median(other):g}"
+        wrong += f" and {here} {np.median(own):g}" if own else ""
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {here}, and {wrong}"
 
-    def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
-        """Return a complaint about readings over a sheet's white (True) and black (False), else keep them as levels."""
-        wrong = None
-        if len(values) == 2 and self._bright and values[True] - values[False] < self._least_contrast(*values.values()):
-            wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
-        for is_white, value in values.items():
-            told = self._complaint_against_earlier(is_white, value)
-            wrong = wrong or (None if told is None else f"where it should be {_COLOURS[is_white]} {told}")
-        if wrong is not None:
-            return f"sheet {name!r} contradicts its pattern: {wrong}"
-        for is_white, value in values.items():
-            self._read[is_white].append(value)
-        return None
-
-    def white_and_black_places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, FloatArray]:
-        """Choose where to check a sheet: a reachable place over uniform white (True), one over uniform black (False).
-
-        Return (x, y) in mm in the plan's frame by these keys, if there is such a place; `allowed` returns the mask
-        of reachable places, (n, 2), in that frame.
-        """
-        rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
-        there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
-        middle = there.mean(axis=0)
-        beside = middle + _LOOK_MM * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
-        candidates = np.concatenate([there, beside])
-        candidates = candidates[allowed(candidates)]
-        found = uniform_shades_at_places(self._plan.patterns[name], candidates)
-        by_shade = {is_white: candidates[found == float(is_white)] for is_white in (True, False)}
-        return {
-            is_white: places[np.argmin(((places - middle) ** 2).sum(axis=-1))]
-            for is_white, places in by_shade.items()
-            if len(places)
-        }
-
-    def _complaint_against_earlier(self, is_white: bool, value: float) -> str | None:
-        """Return a complaint if a reading over white or black contradicts earlier readings of the sheets, else None."""
-        own, other = self._read[is_white], self._read[not is_white]
-        if own and other:
-            level, opposite = float(np.median(own)), float(np.median(other))
-            if abs(value - level) > max(_OFF * abs(opposite - level), self._least_contrast(level, opposite)):
-                of_other = f"{_COLOURS[not is_white]} {opposite:g}"
-                return f"reads {value:g}; {_COLOURS[is_white]} read {level:g} so far, {of_other}"
-        elif len(own) >= _FEWEST:
+    def _contradicts(self, is_white: bool, value: float) -> bool:
+        """Return whether a reading over one shade is far from earlier ones of it, or on the wrong side of the other."""
+        own, opposite = self._read[is_white], float(np.median(self._read[not is_white]))
+        if own:
             level = float(np.median(own))
-            if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
-                return f"reads {value:g}; {_COLOURS[is_white]} read {level:g} so far"
-        elif other and self._bright:
-            opposite = float(np.median(other))
-            if (value - opposite) * (1 if is_white else -1) < self._least_contrast(value, opposite):
-                return f"reads {value:g}, where {_COLOURS[not is_white]} read {opposite:g}"
-        return None
-
-    def _least_contrast(self, *levels: float) -> float:
-        return _SHARE * (self._range if math.isfinite(self._range) else max(abs(level) for level in levels))
+            least = max(_OFF * abs(opposite - level), _SHARE * max(abs(level), abs(opposite)))
+            return abs(value - level) > least
+        return self._bright and (value - opposite) * (1 if is_white else -1) < _SHARE * max(abs(value), abs(opposite))
 
 
 def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:

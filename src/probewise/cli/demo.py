@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Mapping
 from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probewise import diagnosis as engine
-from probewise._words import count_with_noun
 from probewise._writing import PAGE, Drawings, StagedFiles, checked_output_directory, staged_output
 from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.calibration import FittedSensor, calibrate, predict, write_sensor
@@ -25,10 +23,8 @@ from probewise.experiment import (
     Exploration,
     HiddenShape,
     Model,
-    Step,
     arm_over,
     experiment_for,
-    explore,
     run_from_place,
 )
 from probewise.inquiry import ReadingEntropy
@@ -39,7 +35,7 @@ from probewise.world import saturation
 from probewise.world.shipped import true_world as world_behind
 
 if TYPE_CHECKING:
-    from probewise.report.demo import RobotSearch
+    pass
 
 DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
 _MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
@@ -75,7 +71,7 @@ def run_demo(
     drawn_truth = _CIRCLE.prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     truth, doing = tuple(drawn_truth.tolist()), "calibrating, searching and diagnosing"
     with worker_pool(2) as pool:
-        progress(doing, 0, 8)
+        progress(doing, 0, 6)
         diagnosing = pool.submit(diagnose_shipped_recording, seed)
         orders, n_live = ((1, 2, 3, 4), 300) if full else ((1, 2), N_LIVE)
         recording, rng = read_recording(shipped("paper")), np.random.default_rng([seed, 1])
@@ -87,23 +83,23 @@ def run_demo(
 
         doubts: dict[str, Any] = {"saturates_at": report.SATURATION, "max_readings": MAX_READINGS_DOUBT}
         doubting = {name: seek(7, trust=trust, **doubts) for name, trust in _TRUSTS.items()}
-        starting = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
-        searching = {name: seek(2, model=model, on_circle=False) for model, name in _MODELS.items()}
-        parts: list[Any] = [diagnosing, *doubting.values(), *starting.values(), *searching.values()]
-        progress(doing, 1, 8)
+        searching = {name: seek(6, model=model, utility=ReadingEntropy()) for model, name in _MODELS.items()}
+        parts: list[Any] = [diagnosing, *doubting.values(), *searching.values()]
+        progress(doing, 1, 6)
         for done, future in enumerate(as_completed(parts), start=2):
             future.result()
-            progress(doing, done, 8)
+            progress(doing, done, 6)
     progress("writing the results")
     diagnosis, prediction = diagnosing.result(), predict(sensor, recording.plan, recording.readings)
-    searches, started_alike, doubted = (
-        _searches_with_true_circle(sensor, ((name, run.result()) for name, run in runs.items()), truth)
-        for runs in (searching, starting, doubting)
+    means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
+    outline_mm, levels = outlines(_CIRCLE.region(np.array([truth])))[0], (means["I_min"], means["I_max"])
+    searches, doubted = (
+        [report.RobotSearch(name, run.result(), known, outline_mm, levels) for name, run in runs.items()]
+        for runs in (searching, doubting)
     )
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     geometry = read_geometry(shipped_geometry_path())
-    of_searches = (searches, started_alike, doubted)
-    found = report.DemoRun(calibration, recording, prediction, *of_searches, diagnosis, geometry, concealed, seed)
+    found = report.DemoRun(calibration, recording, prediction, searches, doubted, diagnosis, geometry, concealed, seed)
     figures, made = report.figure_drawers(found), output_of(diagnosis, seed=seed, source="concealed.csv")
     seconds = time.monotonic() - started
     in_its_folder = (f"{DIAGNOSIS}/{name}" for name in (*made.drawers, PAGE))
@@ -114,45 +110,16 @@ def run_demo(
         answers = report.main_findings_by_key(found)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
 
-    def page(drawn: Mapping[str, bytes]) -> str:
-        n, frames = sum(search.n for search in searches), list[list[bytes]]()
-        for search in searches:
-            frames.append([])
-            for step in search.run.steps:
-                progress("drawing every step", sum(map(len, frames)), n, search.model)
-                name = f"{search.model}, step {step.number}"
-                frames[-1].append(drawings.draw(name, partial(_frame_png, search, step)))
-        return report.page_html(found, drawn, frames=frames, seconds=seconds)
-
     drawings_of_diagnosis.write_report(made.drawers, made.page, progress=progress)
-    drawings.write_report(figures, page, progress=progress)
+    drawings.write_report(figures, partial(report.page_html, found, seconds=seconds), progress=progress)
     return (
-        *report.search_comparison_lines(searches),
-        report.summary_sentence(started_alike),
+        *(f"{s.model} robot: {s.n} readings, off by {s.largest_error_mm:.1f} mm" for s in searches),
+        report.summary_sentence(searches),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {found.concealed}",
         f"a concealed saturation: {report.doubt_sentence(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     )
-
-
-def _searches_with_true_circle(
-    sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
-) -> list[RobotSearch]:
-    """List a `RobotSearch` of each (robot's name, run), with the true circle and the readings over black and white."""
-    from probewise.report.demo import RobotSearch
-
-    means, known = sensor.mean(), dict(zip(_CIRCLE.prior.names, truth, strict=True))
-    outline_mm = outlines(_CIRCLE.region(np.array([truth])))[0]
-    return [RobotSearch(name, run, known, outline_mm, (means["I_min"], means["I_max"])) for name, run in runs]
-
-
-def _frame_png(search: RobotSearch, step: Step) -> bytes:
-    from probewise.report.plots.canvas import axes_of_frame, png
-
-    title = f"{search.model} model, after {count_with_noun(step.number, 'reading')}"
-    ax = axes_of_frame((6.6, 3.45), (0.7, 0.55, 0.9, 0.3))
-    return png(search.draw_view(step.number, title=title, ax=ax), dpi=90, tight=False)
 
 
 def _search(
@@ -162,14 +129,13 @@ def _search(
     stream: int,
     *,
     max_readings: int,
-    on_circle: bool = True,
     saturates_at: float | None = None,
     **options: Any,
 ) -> Exploration:
     """Search for the circle with a simulated arm and a model by the `options` of `experiment_for`.
 
-    The first reading is on the circle, the same for all robots compared, unless not `on_circle`. The sensor saturates
-    at the reading `saturates_at`, which its model leaves out; None: nowhere.
+    The first reading is on the circle, the same for all robots compared. The sensor saturates at the reading
+    `saturates_at`, which its model leaves out; None: nowhere.
     """
     field, world = Field(), world_behind("paper")
     if saturates_at is not None:
@@ -177,8 +143,6 @@ def _search(
     experiment = experiment_for(sensor, _CIRCLE, field, n_live=N_LIVE_ROBOT, **{"trust": 1.0, **options})
     rng = np.random.default_rng([seed, stream])
     with arm_over(world, HiddenShape("circle", _CIRCLE, np.array(truth)).surface, field, seed=seed) as arm:
-        if not on_circle:
-            return Exploration(experiment, tuple(explore(arm, experiment, rng=rng, max_readings=max_readings)))
         x_mm, y_mm, radius_mm = truth
         away, turn = np.random.default_rng([seed, 5]).random(2)
         away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn

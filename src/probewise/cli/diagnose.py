@@ -11,7 +11,7 @@ import hashlib
 import json
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ from probewise.cli._inputs import (
     read_joined_table,
 )
 from probewise.cli._options import parser, refuse_options
-from probewise.diagnosis import NEXT_PLAN, PlanAudit
+from probewise.diagnosis import NEXT_PLAN
 from probewise.errors import ParameterError, PipeWarning, ProbewiseError, require
 from probewise.progress import Progress
 from probewise.recordings import Recording, read_recording
@@ -63,7 +63,6 @@ def run(arguments: argparse.Namespace) -> int:
     drawings = Drawings(checked_output_directory(arguments.out, main="diagnosis.json"))
     source = ", ".join(path.name for path in arguments.recordings)
     rng, nested_rng, _ = engine.generators_of_diagnosis(arguments.seed)
-    audited: Callable[[], PlanAudit | None] = lambda: None  # noqa: E731
     with contextlib.ExitStack() as stack:
         simulator = stack.enter_context(open_simulator(arguments)) if of_simulator else None
         progress = stack.enter_context(progress_of(arguments))
@@ -88,12 +87,10 @@ def run(arguments: argparse.Namespace) -> int:
             diagnosis = engine.diagnose(joined, sensor=given, null=null, progress=progress, **options)
             if null is not None:
                 diagnosis = diagnosis.with_shape_in_next_plan(null.shape)
-            else:
-                audited = partial(engine.audit_plan_of_diagnosis, diagnosis, sensor=sensor)
             notes = joined.notes
             read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
             advised, column = NEXT_PLAN, "reading"
-        made = output_of(diagnosis, seed=arguments.seed, source=source, audited=audited)
+        made = output_of(diagnosis, seed=arguments.seed, source=source)
         inputs = inputs_and_filled_in_plan(read, drawings.out / advised, column)
         drawings.write_results(made, inputs=inputs, progress=progress)
     summary = f"{diagnosis.summary()}\nseed {arguments.seed}; written to {drawings.out}"

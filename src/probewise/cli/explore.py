@@ -23,7 +23,7 @@ from probewise.calibration import FittedSensor, read_sensor, write_sensor
 from probewise.cli import _bench
 from probewise.cli._common import finish, message_to_resume, progress_of, say
 from probewise.cli._inputs import read_or_shipped_geometry, tables_and_descriptions
-from probewise.cli._options import parse_numbers
+from probewise.cli._options import parse_numbers, refuse_options
 from probewise.effects import spoken_name
 from probewise.errors import FileError, ParameterError, did_you_mean, require
 from probewise.experiment import Experiment, Exploration, HiddenShape, ModelName, Step, read_journal
@@ -69,10 +69,6 @@ def run(arguments: argparse.Namespace) -> int:
             return "nothing was read"
         return message_to_resume(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
-    def report_activity(doing: str) -> None:
-        believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
-        progress("exploring", note=f"reading {len(steps) + 1} of at most {arguments.max_readings}, {doing}{believed}")
-
     about = {
         **experiments.sensor_entry(search.sensor, _path_relative_to_folder(out, arguments.sensor)),
         **experiments.geometry_entry(search.geometry),
@@ -85,11 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         instrument as arm,
         closing(
             experiments.explore(
-                _bench.InstrumentWithCallbacks(
-                    arm,
-                    lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
-                    lambda reading: report_activity(f"thinking about a reading of {reading.value:g}"),
-                ),
+                arm,
                 search.experiment,
                 rng=search.streams.run,
                 max_readings=arguments.max_readings,
@@ -98,10 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
         ) as found,
     ):
-        if n_before:
-            progress("going through the journal", 0, n_before)
-        else:
-            report_activity("choosing its place")
+        progress(*(("going through the journal", 0, n_before) if n_before else ("taking the first readings",)))
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in found)
         if search.other is not None:
             pairs = experiments.shadow_run(found, search.other, instrument, rng=search.streams.shadow)
@@ -109,6 +98,9 @@ def run(arguments: argparse.Namespace) -> int:
             search.draw_and_write(step, shadow)
             if step.replayed:
                 progress("going through the journal", step.number, n_before)
+            else:
+                note = f"reading {step.number} of at most {arguments.max_readings}"
+                progress("exploring", note=f"{note}; widest sd {step.largest_sd_mm:.1f} mm")
     result = Exploration(search.experiment, tuple(steps), sensor=search.sensor)
     with reporting_what_is_kept(kept_message, results=True), progress_of(arguments) as progress:
         search.write_results(result, progress=progress)
@@ -269,10 +261,11 @@ class Search:
         """Write the files of a search, then animation and report; each step's picture is there already."""
         seed = self.arguments.seed
 
-        def page(_: Mapping[str, bytes]) -> str:
+        def page(drawn: Mapping[str, bytes]) -> str:
             return report.page_html(
                 result,
-                self.frames,
+                self.frames[-1],
+                drawn["run.gif"],
                 seed=seed,
                 model=self.model,
                 truth=self.known,
@@ -300,29 +293,25 @@ class Search:
         if missing.leading != experiments.CLEAN:
             yield f"what the readings say of the sensor: probewise diagnose {journal} --out DIAGNOSIS"
         if self.known is not None:
-            yield f"error        {report.errors_text(result, self.known)}"
+            yield f"truth        {', '.join(f'{name} {value:.5g}' for name, value in self.known.items())}"
 
 
 def _refuse_contradictions(arguments: argparse.Namespace, arm: _bench.ArmName, geometry: Geometry | None) -> None:
     """Raise ParameterError for an option that does not go with the arm (with the geometry of a LEGO arm) or another."""
-    paper, both, lego = arguments.method == "paper", arguments.both_models, geometry is not None
-    naive, read_mm = both or arguments.model == "naive", math.nan if geometry is None else geometry.read_height_mm
-    at_one_height = f"none with the LEGO arm but {read_mm:g}: it reads that many mm above the surface"
-    for name, refused, allowed in (
-        ("geometry", arm.kind == "file", "none with FILE.py, which defines its own reach"),
-        ("orientations", lego, "none with the LEGO arm, no joint of which turns its sensor"),
-        ("heights", lego and arguments.heights != (read_mm,), at_one_height),
-        ("heights", both and not lego, "none with --both-models, since the naive model has no height"),
-        ("reference", naive or paper, "none with --both-models, --model naive or --method paper"),
-        ("nested_stop", not paper, "only with --method paper"),
-        ("levels", not (naive and paper), "only with --method paper and --model naive"),
-        ("truth", arm.is_real, "none with a real arm, whose target is unknown"),
-    ):
-        value = getattr(arguments, name)
-        if refused and value not in (None, []):
-            listed = value[0] if name == "reference" else value
-            said = ",".join(f"{number:g}" for number in listed) if isinstance(listed, tuple) else str(listed)
-            raise ParameterError(f"--{name.replace('_', '-')}", said, allowed)
+    naive = arguments.both_models or arguments.model == "naive"
+    if arm.kind == "file":
+        refuse_options(arguments, "FILE.py, which defines its own reach", "geometry")
+    if arm.is_real:
+        refuse_options(arguments, "a real arm, whose target is unknown", "truth")
+    if geometry is not None:
+        refuse_options(arguments, "the LEGO arm, no joint of which turns its sensor", "orientations")
+        if arguments.heights != (read_mm := geometry.read_height_mm,):
+            what = f"the LEGO arm but {read_mm:g}: it reads that many mm above the surface"
+            refuse_options(arguments, what, "heights")
+    elif arguments.both_models:
+        refuse_options(arguments, "--both-models, since the naive model has no height", "heights")
+    if not (naive and arguments.method == "paper"):
+        refuse_options(arguments, "any but --method paper and --model naive", "levels")
 
 
 def _checked_field(text: str | None, geometry: Geometry | None) -> Field:

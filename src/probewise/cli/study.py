@@ -8,8 +8,8 @@ from typing import Any
 
 from probewise._writing import checked_output_directory
 from probewise.cli._executor import run_and_report
-from probewise.cli._options import SIZES
-from probewise.errors import ParameterError, require
+from probewise.cli._options import SIZES, refuse_options
+from probewise.errors import require
 from probewise.proof import pages
 from probewise.proof.concealed_study import concealed_study
 from probewise.proof.study import SearchConfiguration, paper_comparison_rows, standard_rows, study
@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
     checked_output_directory(arguments.out, file, main=file)
     command = _command_line(arguments)
     if arguments.concealed:
-        _require_none(arguments, (*_FACTORS, "quoted", "beside_paper"), "--concealed")
+        refuse_options(arguments, "--concealed, which has its own rows", *_FACTORS, "quoted", "beside_paper")
         hiding = concealed_study(
             arguments.circles,
             max_readings=arguments.max_readings,
@@ -35,8 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
         page_of = partial(pages.concealed_page, command=command)
         return run_and_report(hiding, page_of, arguments, file, "concealed.csv")
-    for name, value in _given(arguments, _OF_CONCEALED).items():
-        raise ParameterError(f"--{name}", value, "only with --concealed")
+    refuse_options(arguments, "a study without --concealed", *_OF_CONCEALED)
     rows = _configuration_rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
@@ -51,16 +50,11 @@ def _given(arguments: argparse.Namespace, names: Iterable[str]) -> dict[str, Any
     return {name: value for name, value in values.items() if value is not None and value is not False}
 
 
-def _require_none(arguments: argparse.Namespace, names: Iterable[str], beside: str) -> None:
-    for name in _given(arguments, names):
-        raise ParameterError(f"--{name.replace('_', '-')}", "given", f"none with {beside}, which has its own rows")
-
-
 def _configuration_rows(arguments: argparse.Namespace) -> tuple[SearchConfiguration, ...]:
     given = _given(arguments, _FACTORS)
     if arguments.beside_paper:
         others = [name for name in given if name not in ("population", "nested_stop")]
-        _require_none(arguments, others, "--beside-paper")
+        refuse_options(arguments, "--beside-paper, which has its own rows", *others)
         return paper_comparison_rows(**given)
     if not given:
         return standard_rows()

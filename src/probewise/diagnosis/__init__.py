@@ -17,7 +17,6 @@ from probewise.diagnosis.audit import (
     PlanAudit,
     audit_json,
     audit_plan,
-    audit_plan_of_diagnosis,
     audit_system,
 )
 from probewise.diagnosis.best_repair import Improvement
@@ -81,7 +80,6 @@ __all__ = [
     "Weighing",
     "audit_json",
     "audit_plan",
-    "audit_plan_of_diagnosis",
     "audit_system",
     "calibrated_of",
     "diagnose",

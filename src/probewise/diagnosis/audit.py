@@ -23,9 +23,8 @@ from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.advice import LAMBDA, LEAST_SHARE, classes_of
 from probewise.diagnosis.apparatus import ENOUGH_NATS, Command, Words
-from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import orthonormalise_groups
-from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null
+from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.light_sensor import LightSensorApparatus, candidate_scans, scan_started_after, target_swaps
 from probewise.diagnosis.prepared import join_plans
 from probewise.diagnosis.sensors import (
@@ -36,7 +35,6 @@ from probewise.diagnosis.sensors import (
     require_same_unit,
     require_sensor_prior,
     sensor_from_samples,
-    with_free_form,
 )
 from probewise.diagnosis.simulator_rows import ON_NOISE, SimulatorApparatus
 from probewise.diagnosis.templates import templates_of_effect
@@ -46,7 +44,7 @@ from probewise.effects.noise import noise_of_runs, noise_per_run, noise_sd
 from probewise.errors import ParameterError, require
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_patterns_described, require_plan
-from probewise.sensor import Stage, is_free_form
+from probewise.sensor import Stage
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
 from probewise.systems.system import STANDS_STILL, with_converged_step
@@ -179,7 +177,6 @@ class Expected:
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
-_MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...
 _LINE = 99  # characters of a line of the summary
 _SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis, and where a hundred scans are tried
 _LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
@@ -365,30 +362,6 @@ def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, 
         return {name: max(k for k in range(last) if name not in fine[k]) + 1 for name in names}
 
     return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
-
-
-def audit_plan_of_diagnosis(diagnosis: Diagnosis, *, sensor: SensorPrior | None = None) -> PlanAudit:
-    """Audit the plan of a diagnosis about the sensor that it calibrated, without cures.
-
-    `diagnosis` is of a light sensor over known patterns; of more than 4,000 usable readings, every second (third, ...)
-    is used. `sensor` is the earlier sensor that was the prior of the diagnosis, if any.
-    """
-    known, usable = diagnosis.null, np.flatnonzero(diagnosis.recording.usable)
-    plan = diagnosis.recording.plan.take(usable[:: -(-len(usable) // _MOST_READINGS)])
-    mean, extent = known.theta.mean(axis=0), Extent.of(diagnosis.recording)
-    own = mean[None, : 6 * known.n_gaussians + 2]
-    if sensor is not None:
-        null = sensor_from_samples(sensor)
-    elif is_free_form(own[:, :-2]):
-        null = with_free_form(default_sensor(extent, 1))
-    else:
-        null = default_sensor(extent, known.n_gaussians)
-    z, sd = np.clip(null.z(own)[0], -FARTHEST, FARTHEST), float(known.noise_sd.mean())
-    scaled = partial(_effects_under, VOCABULARY, _levels(known.chain.names, mean), null)
-    expected = Expected(null, z, sd, scaled, f"{_AS_CALIBRATED} from these readings")
-    bank = expected.bank(plan, most=_SETTINGS)
-    seen, cosines = audits_and_cosines(bank, list(VOCABULARY), plan.instrumentation.unit)
-    return PlanAudit(plan, expected.assumed, seen, cosines, (), seen)
 
 
 def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:

@@ -37,26 +37,6 @@ def parse_scene(text: str) -> Surface:
         raise ParameterError("--scene", text, f"{'; '.join(FORMS)}; in mm and degrees") from error
 
 
-def scene_text(surface: Surface) -> str:
-    """Return the text of a scene for `parse_scene`, its numbers to six digits.
-
-    Raises ParameterError for an ellipse, and for a scene with none of the forms, such as stripes or black on white.
-    """
-    if (getattr(surface, "inside", 1.0), getattr(surface, "outside", 0.0)) == (1.0, 0.0):
-        match surface:
-            case Uniform(albedo):
-                return f"uniform:{albedo:g}"
-            case HalfPlane(normal, offset):
-                return f"edge:{math.degrees(normal):.6g},{offset:.6g}"
-            case Quadrant((x, y), (dx, dy)):
-                return f"corner:{x:g},{y:g},{dx},{dy}"
-            case Disc((x, y), radius):
-                return f"circle:{x:g},{y:g},{radius:g}"
-            case Polygon(vertices):
-                return "polygon:" + ",".join(f"{x:g},{y:g}" for x, y in vertices)
-    raise ParameterError("scene", type(surface).__name__, "; ".join(FORMS))
-
-
 def _parse_finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):

@@ -12,33 +12,13 @@ from probewise.diagnosis import CURE_PLAN, EffectAudit, PlanAudit, audit_json
 from probewise.diagnosis.advice import LAMBDA
 from probewise.diagnosis.apparatus import ENOUGH_NATS
 from probewise.diagnosis.audit import ALIAS
+from probewise.diagnosis.words import parameter_in_words
 from probewise.effects import spoken_name
 from probewise.recordings import write_plan
 from probewise.report.html import Markup, Section, figure, page, table
 from probewise.report.plots.canvas import AxesGrid, png
 from probewise.report.plots.probabilities import audit_matrix
 from probewise.report.words import number_text, typeset_numbers
-
-_SIZES = {
-    "albedo": "change of albedo",
-    "amp": "amplitude",
-    "amp_mm": "amplitude",
-    "deg": "turn",
-    "dx_mm": "along X",
-    "dy_mm": "along Y",
-    "frac": "relative change",
-    "mm": "height",
-    "mm_per_mm": "slope",
-    "offset_mm": "shift",
-    "per_hour": "change",
-    "per_mm_x": "along X",
-    "per_mm_y": "along Y",
-    "per_volt": "relative change",
-    "width_mm": "play",
-    "x": "along X",
-    "y": "along Y",
-}
-"""Names in words of the parameters that scale an effect."""
 
 
 def summary_sentence(audit: PlanAudit) -> str:
@@ -90,7 +70,7 @@ def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> s
         answer=summary_sentence(audit),
         key_figure=shown,
         sections=[_help_section(audit), every, Section("What was assumed", (assumed,))],
-        terms_in=f"{summary_sentence(audit)} {shown}",
+        with_terms=True,
     )
 
 
@@ -140,7 +120,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
                 effect.detectability,
                 number_text(effect.share, 2),
                 effect.reason or ", ".join(f"{spoken_name(n)} {c:.3f}" for n, c in effect.alike[:4]) or "–",
-                "; ".join(_detectable_size_in_words(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
+                _detectable_sizes_in_words(effect),
                 *["–" if effect.rows is None else str(effect.rows)] * counted,
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
@@ -158,22 +138,13 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
     )
 
 
-def _detectable_size_in_words(parameter: str, unit: str, amount: float | None) -> str:
-    """Write a parameter's name, unless its unit tells, and its value (`amount`) at lambda 8; "at no size" for None."""
-    name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
-    value = "at no size" if amount is None else f"{amount:.2g} {_unit_in_words(unit)}"
-    return f"{name} {value}".strip()
-
-
-def _unit_in_words(unit: str) -> str:
-    """Write "1/V" as "per V", as "1 per V" too, and "LEGO/h" as "LEGO units per h"; a user's own unit is kept."""
-    if unit.startswith("1 per "):
-        return unit.removeprefix("1 ")
-    upper, _, lower = unit.partition("/")
-    if upper not in ("1", "LEGO", "mm"):
-        return unit_after_number(unit)
-    own = "" if upper == "1" else unit_after_number(upper)
-    return f"{own} per {lower}".strip() if lower else own
+def _detectable_sizes_in_words(effect: EffectAudit) -> str:
+    """Write the value at lambda 8 ("at no size" for None) of each parameter that scales an effect."""
+    said = []
+    for size in effect.smallest:
+        value = "at no size" if size.amount is None else f"{size.amount:.2g} {unit_after_number(size.unit)}".rstrip()
+        said.append(f"{parameter_in_words(effect.name, size.parameter, size.unit)} {value}")
+    return "; ".join(said) or "–"
 
 
 def output_of(value: PlanAudit, *, seed: int | None = None, source: str = "the plan") -> Output:

@@ -23,7 +23,6 @@ from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_n_gaussians
 from probewise.report.words import (
     decimals_to_show,
     number_text,
-    number_unsigned_zero,
     typeset_numbers,
     value_and_interval_texts,
     value_with_error,
@@ -57,7 +56,7 @@ def summary_sentence(sensor: FittedSensor) -> str:
         said += f", ahead of {others[0].n_gaussians} by {value_with_error(lead, error)} in ln Z"
     short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0)).tolist()
     digits, noise_sd = decimals_to_show(long, 1), float(sensor.noise_sd.mean())
-    u, v = (number_unsigned_zero(float(at), digits) for at in sensor.field.mean_mm)
+    u, v = (number_text(float(at), digits) for at in sensor.field.mean_mm)
     return (
         f"{said}: centred at ({u}, {v}) mm on the sensor, "
         f"{number_text(long, digits)} by {number_text(short, digits)} mm (sd), "

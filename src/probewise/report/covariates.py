@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._words import UNITS, unit_after_number, unit_of_name
 from probewise.diagnosis import ALARM, Diagnosis, Place
-from probewise.effects import RARE_EFFECTS, name_without_copy_suffix
+from probewise.effects import RARE_EFFECTS
 from probewise.recordings import Plan
 from probewise.report.residual_means import ResidualMeans, mean_residuals
 from probewise.systems import RunTable
@@ -29,7 +29,6 @@ _SEEN = 2.3  # sds beyond which a mean visibly leaves the band
 _N_SAMPLES = 200  # posterior samples for the variance that the fit absorbs
 _ASTRAY = 0.01  # largest deviation of a scan from its line, as a share of its length
 _LEAST_PLACES = 3  # least number of places in a line
-_LEAST_PERIODS = 3.0  # least number of periods in a recording for folding it
 
 
 def covariate_in_words(name: str) -> str:
@@ -93,21 +92,16 @@ def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, st
 class CovariateView:
     """A covariate against which residuals are drawn.
 
-    `at` holds its values, (n_points,), NaN in rows not drawn; `label` is the axis label; `names` each value's name if
-    the covariate is categorical. `window` is the interval to shade, in the covariate's unit or, if categorical, in
-    positions on the axis. `place` is the window with significant residuals that is drawn; None: another view.
+    `at` holds its values, (n_points,), NaN in rows not drawn; of a categorical covariate positions 0, 1, 2 ... with
+    `names`. `label` is the axis label; `window` the interval to shade; `place` the window with significant residuals
+    that is drawn; None: another view.
     """
 
     at: FloatArray
     label: str
-    names: Mapping[float, str] | None = None
+    names: Sequence[str] = ()
     window: tuple[float, float] | None = None
     place: Place | None = None
-
-    @property
-    def category_names_on_axis(self) -> list[str] | None:
-        """Names of a categorical covariate's distinct values, in ascending order of value; None for others."""
-        return None if self.names is None else [self.names[v] for v in _distinct_values(self.at)]
 
 
 class ResidualNoise:
@@ -143,29 +137,26 @@ class ResidualNoise:
             sd=self.sd,
             rho=self.rho,
             scan=self.diagnosis.recording.plan.scan,
-            names=view.names,
-            window=None if view.names else view.window,
+            window=view.window,
             absorbed=self.absorbed,
         )
 
     def first_view(self) -> CovariateView:
         """Choose the first figure's covariate: the first candidate with a mean of 2.3 sds or more, else the largest.
 
-        Candidates in order: time, X or a column, folded at a named effect's period; covariates with significant
-        residuals, those on which an unknown effect most probably depends first; the repair's change of the predicted
-        readings. Without any, the predicted reading.
+        Candidates in order: covariates with significant residuals (`ranked_places`), the repair's change of the
+        predicted readings, the predicted reading.
         """
         diagnosis, before, after = self.diagnosis, self.diagnosis.before, self.diagnosis.after
-        candidates = _views_at_period(diagnosis)
-        for place in sorted(diagnosis.where, key=lambda place: -_probability_unknown_depends_on(diagnosis, place)):
+        candidates: list[CovariateView] = []
+        for place, _ in self.ranked_places():
             if diagnosis.verdict != "clean" or place.p_value < ALARM:
                 candidates += views_of_place(diagnosis, place)
         if diagnosis.repair_changes_predictions and diagnosis.verdict != "clean":
             change = after.readings_with_walk - before.readings_with_walk
             unit = diagnosis.recording.plan.instrumentation.unit_after_number
             candidates.append(CovariateView(change, f"change that the repair makes ({unit})"))
-        if not candidates:
-            return CovariateView(np.array(before.readings), axis_label(diagnosis, "level"))
+        candidates.append(CovariateView(np.array(before.readings), axis_label(diagnosis, "level")))
         sizes = [self.means_in(view).largest_mean_in_sds for view in candidates]
         seen = [view for view, size in zip(candidates, sizes, strict=True) if size >= _SEEN]
         return seen[0] if seen else candidates[np.argmax(sizes)]
@@ -201,7 +192,14 @@ def views_of_place(diagnosis: Diagnosis, place: Place) -> list[CovariateView]:
     if place.without_effect:
         unit = unit_after_number(diagnosis.recording.plan.instrumentation.unit)
         label = f"reading to be expected without it ({unit})"
-    by_covariate = CovariateView(at, label, names, _shaded_interval(place, at, names), place)
+    window = None if place.start is None or place.end is None else (place.start, place.end)
+    values = _distinct_values(at)
+    if names:
+        held = [k for k, v in enumerate(values) if (window[0] <= v <= window[1] if window else names[v] == place.scan)]
+        window = (held[0] - 0.5, held[-1] + 0.5) if held else None
+        at = np.where(np.isfinite(at), np.searchsorted(values, at), np.nan)
+    shown = [names[v] for v in values] if names else []
+    by_covariate = CovariateView(at, label, shown, window, place)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
     return [view_along_scan(diagnosis, place.scan, place), by_covariate]
@@ -247,46 +245,6 @@ def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float
         return 0.0
     within = " within scans" if place.scan is not None and place.covariate != diagnosis.apparatus.words.run else ""
     return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)
-
-
-def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
-    """List views of time, X or a column, folded at periods of the verdict of which the recording spans three."""
-    plan = diagnosis.recording.plan
-    folded: list[tuple[FloatArray, float, str, str]] = []
-    for effect in diagnosis.effects:
-        means = {p.name: p.mean for p in effect.parameters}
-        hz = means.get("hz" if isinstance(plan, RunTable) else "alias_hz", 0.0)
-        period = means.get("period" if isinstance(plan, RunTable) else "period_mm", 0.0)
-        if effect.name not in diagnosis.combination:
-            continue
-        if hz > 0:
-            folded.append((plan.time_s, 1 / hz, *covariate_in_words_and_unit(diagnosis, "time")))
-        if isinstance(plan, RunTable):
-            if period > 0 and not hz > 0:
-                column = name_without_copy_suffix(effect.name).partition(":")[2]
-                folded.append((plan.covariates[column], period, column, ""))
-        elif period > 0:
-            folded.append((plan.x_mm, period, "X", "mm"))
-    return [
-        CovariateView(
-            np.mod(values, period), f"{name} within one period of {period:.4g} {unit}" + (f" ({unit})" if unit else "")
-        )
-        for values, period, name, unit in folded
-        if np.ptp(values) > _LEAST_PERIODS * period
-    ]
-
-
-def _shaded_interval(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
-    """Return the interval of the axis to shade for a place: from its start to its end; None if it has none.
-
-    For a categorical covariate (`names`): half a position beyond the first and last category that the place holds.
-    """
-    ends = None if place.start is None or place.end is None else (place.start, place.end)
-    if not names:
-        return ends
-    shown = _distinct_values(at)
-    members = [k for k, v in enumerate(shown) if (ends[0] <= v <= ends[1] if ends else names[v] == place.scan)]
-    return (members[0] - 0.5, members[-1] + 0.5) if members else None
 
 
 def _distinct_values(at: FloatArray) -> list[float]:

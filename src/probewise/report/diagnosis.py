@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from probewise.diagnosis import (
     Formula,
     ParameterFound,
     Place,
-    PlanAudit,
     calibrated_of,
     diagnosis_json,
     generators_of_diagnosis,
@@ -44,7 +43,6 @@ from probewise.diagnosis.words import (
 from probewise.effects import name_without_copy_suffix
 from probewise.recordings import write_plan
 from probewise.report import html
-from probewise.report.audit import audit_table
 from probewise.report.covariates import (
     ResidualNoise,
     category_name_by_value,
@@ -58,7 +56,6 @@ from probewise.report.words import (
     number_text,
     probability_text,
     range_text,
-    rounded_count_text,
     typeset_numbers,
 )
 from probewise.systems import RunTable, run_table_csv, write_fitted_system
@@ -68,7 +65,6 @@ __all__ = ["figure_drawers", "output_of", "page_html", "sections", "summary_sent
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
-_MOST_CREDIBLE = 6
 _LIKELY = 0.05  # probability of an effect from which it has a paragraph of its own
 _CHANCE = 0.05  # p-value above which chance is a sufficient explanation
 _NOISE_CAPTIONS = {
@@ -76,7 +72,7 @@ _NOISE_CAPTIONS = {
     "random_walk": "Correlation of residuals, by how many readings they lie apart: for a random walk it falls slowly.",
     "signal_dependent_noise": "Scatter of residuals by predicted reading: constant for white noise.",
     "outliers": "Histogram of residuals on a logarithmic scale, with a normal distribution.",
-    "dropouts": "Recorded against predicted readings; lost readings have one value, whatever is predicted.",
+    "dropouts": "Histogram of residuals on a logarithmic scale, with a normal distribution; lost readings are far out.",
     "quantisation": "Position of readings between two multiples of the rounding step; unrounded readings lie anywhere.",
 }
 
@@ -96,10 +92,8 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[html.Sect
     ]
 
 
-def page_html(
-    diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int | None, audit: PlanAudit | None = None
-) -> str:
-    """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`, `audit` that of its plan, if any."""
+def page_html(diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int | None) -> str:
+    """Return the HTML of a diagnosis's page; `drawn` is from `figure_drawers`."""
     n_used = int(diagnosis.recording.usable[rows_to_diagnose(diagnosis.recording)].sum())
     readings = f"{n_used} used of {len(diagnosis.recording)}"
     facts = {
@@ -109,15 +103,14 @@ def page_html(
         **dict(diagnosis.apparatus.words.facts),
     }
     notes = html.notes_in_words((*diagnosis.recording.notes, *notes_on_calls(diagnosis)))
-    design = () if audit is None else (html.Section("What these readings could have shown", _audit_elements(audit)),)
     shown = html.figure(drawn["first.svg"], _first_figure_caption(diagnosis))
     first = html.fragment(shown, html.definition_list(_questions_and_answers(diagnosis)))
     return html.page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
         key_figure=first,
-        sections=[*sections(diagnosis, drawn), *design, html.Section("This run", (facts, *notes))],
-        terms_in=f"{diagnosis.verdict} {first}",
+        sections=[*sections(diagnosis, drawn), html.Section("This run", (facts, *notes))],
+        with_terms=True,
     )
 
 
@@ -132,14 +125,7 @@ def _first_figure_caption(diagnosis: Diagnosis) -> str:
     where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: {diagnosis.apparatus.words.before_in_words}{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
-    return f"Residuals, averaged in bins. {circles}{_walk_note(diagnosis)} {band}{where} {bars}"
-
-
-def _walk_note(diagnosis: Diagnosis) -> str:
-    """Return the sentence, after a space, that residuals do not contain the noise's random walk; "" without one."""
-    if not diagnosis.after.has_walk:
-        return ""
-    return " Residuals count from the random walk of the zero that all readings show: what it explains is not in them."
+    return f"Residuals, averaged in bins. {circles} {band}{where} {bars}"
 
 
 def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
@@ -163,25 +149,25 @@ def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         run = diagnosis.apparatus.words.run
         facts.append(("Does it predict what comes next?", f"{told} Held out was the last fifth of each {run}."))
     if changes:
-        beside = " (beside the random walk of the zero)" if diagnosis.after.has_walk else ""
-        left = f"{_rms_in_words(diagnosis)}{diagnosis.recording.weighting_in_words}{beside}"
+        beside = " (beside the random walk of the zero, which no residual contains)" if diagnosis.after.has_walk else ""
+        left = f"rms {_rms_in_words(diagnosis)}{beside}."
         if diagnosis.by_rows:
-            left += f". The unknown part is corrected in these readings only: {diagnosis.not_in_model}"
-        facts.append(("Residuals", f"rms {left}."))
+            left += f" The unknown part is corrected in these readings only: {diagnosis.not_in_model}."
+        facts.append(("Residuals", left))
     if diagnosis.combination_shares:
         samples = f"Posterior samples in {diagnosis.apparatus.words.model} contain {diagnosis.shares_in_words}."
         facts.append(("In the repaired model", samples))
     return facts
 
 
-def _rms_in_words(diagnosis: Diagnosis, weighting: str = "") -> str:
+def _rms_in_words(diagnosis: Diagnosis) -> str:
     """Write the rms of the residuals as calibrated, and after a repair that changes them."""
-    gain, unit = diagnosis.improvement, f"{diagnosis.recording.plan.instrumentation.unit_after_number}{weighting}"
-    before = f"{gain.rms_before:.3g} {unit}"
+    gain, unit = diagnosis.improvement, diagnosis.recording.plan.instrumentation.unit_after_number
+    before = f"{gain.rms_before:.3g} {unit}{diagnosis.recording.weighting_in_words}"
     if not diagnosis.repair_changes_predictions:
         return before
-    before += f" {diagnosis.apparatus.words.before_in_words}"
-    return f"{before}, {gain.rms_after:.3g} {unit} {diagnosis.after_in_words}"
+    after = typeset_numbers(f"{gain.rms_after:.3g} {diagnosis.after_in_words}")
+    return f"{before} {diagnosis.apparatus.words.before_in_words}, {after}"
 
 
 def _formula_in_words(formula: Formula) -> str:
@@ -208,26 +194,17 @@ def _signed_nats(nats: float, sd: float) -> str:
 
 
 def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
-    p_value = diagnosis.p_value
-    if p_value > _CHANCE:
-        often = f"{100 * p_value:.0f} of 100 recordings look"
-    elif p_value > 1e-6:
-        often = f"1 recording in {rounded_count_text(1 / p_value)} looks"
-    else:
-        often = "less than 1 recording in a million looks"
-    often = f"with nothing missing, {often} as odd as this ({p_in_words(p_value)})"
-    if diagnosis.verdict == "noise":
-        log_evidence = diagnosis.improvement.log_evidence
-        gained = f"its log evidence over white noise is {log_evidence:.0f} nats"
-        if log_evidence < 0.5:  # what is beyond doubt is in both models
-            gained = "all readings are multiples of one step"
-        mean = "nothing significant" if p_value >= ALARM else "nothing that any effect explains better"
-        said = f"For the noise model, hardly: {gained}. The mean shows {mean}: {often}."
+    p_value, log_evidence = diagnosis.p_value, diagnosis.improvement.log_evidence
+    often = "less than 1 recording in a million looks"
+    if p_value > 1e-6:
+        often = f"1 recording in {float(f'{1 / p_value:.2g}'):,.0f} looks"
+    said = "Yes" if p_value > _CHANCE else "Hardly"
+    if diagnosis.verdict == "noise":  # what is beyond doubt is in both models, and gains nothing
+        gained = f"log evidence {log_evidence:.0f} nats over white noise"
+        said = f"The noise, hardly ({gained if log_evidence > 0.5 else 'all readings are multiples of one step'})"
     elif diagnosis.verdict == "unknown" and p_value > _CHANCE:
-        said = f"For the mean, yes: {often}. But chance would not put so many outlying readings together."
-    else:
-        said = f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
-    return typeset_numbers(said)
+        said = "The mean, yes, but chance would not put so many outlying readings together"
+    return typeset_numbers(f"{said}: with nothing missing, {often} as odd as this ({p_in_words(p_value)}).")
 
 
 def _next_readings_in_words(diagnosis: Diagnosis) -> str:
@@ -254,14 +231,8 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
 def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
     credible = [hypothesis_in_words(() if k == "clean" else k.split("+")) for k in diagnosis.credible]
     likely = [e for e in diagnosis.effects if e.probability > _LIKELY]
-    rest = [e for e in diagnosis.effects if e.probability <= _LIKELY]
     told = [f"{effect_in_words(e.name)} ({probability_text(e.probability)}): {e.sentence}" for e in likely]
-    listed = [h for h in diagnosis.hypotheses[:8] if h.probability > 1e-3]
-    probabilities = ((hypothesis_in_words(h.effects), probability_text(h.probability)) for h in listed)
-    held: str = f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(credible)}."
-    if len(credible) > _MOST_CREDIBLE:
-        names = html.paragraph(f"{'; '.join(credible)}.")
-        held = html.details(f"95 % credible set: {len(credible)} explanations", names)
+    held = f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(credible)}."
     candidates = ", ".join(
         f"{effect_in_words(name) if effect_has_words(name) else term_family_in_words(name)} ({probability_text(p)})"
         for name, p in diagnosis.unknown_candidates
@@ -270,7 +241,6 @@ def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
     opening = "Candidates for the unknown effect (a covariate that it depends on, or a form)"
     return (
         *(_as_sentence(diagnosis, said) for said in told),
-        html.table(("explanation", "probability"), probabilities),
         held,
         *([f"{opening}: {candidates}."] if candidates else []),
         *(  # effects in the repaired model's samples that are not among the diagnosis's
@@ -279,7 +249,6 @@ def _explanation_elements(diagnosis: Diagnosis) -> Sequence[str]:
         ),
         *_laplace_and_nested_table(diagnosis),
         *([_effect_table(likely)] if likely else []),
-        *([html.details(f"{len(rest)} less likely effects", _effect_table(rest))] if rest else []),
     )
 
 
@@ -311,7 +280,7 @@ def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
     opening = (
         f"Residuals of the {diagnosis.apparatus.words.unrepaired} model against each covariate in which they are "
         "significant: the headline's first, then the most visible. Each dot is a reading; by chance alone, 95 % of the "
-        f"means would lie in the grey band.{_walk_note(diagnosis)}"
+        f"means would lie in the grey band."
     )
     first, rest = shown[:_MOST_PLACES], shown[_MOST_PLACES:]
     return (opening, *first, *((html.details(f"{len(rest)} more", *rest),) if rest else ()))
@@ -324,13 +293,11 @@ def before_and_after_caption(diagnosis: Diagnosis) -> str:
     if diagnosis.repair_changes_predictions:
         which = f"The {run} that changes most"
         colours = f"orange {diagnosis.apparatus.words.before_in_words}, blue {diagnosis.after_in_words}"
-    walk = ", each with the random walk of the zero that all readings show" if diagnosis.after.has_walk else ""
-    shown = f"readings (black) and predictions ({colours}{walk})"
-    return f"{which}: {shown}, and below the residuals with their running means."
+    return f"{which}: readings (black) and predictions ({colours}), and below the residuals with their running means."
 
 
 def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequence[str]:
-    against = f"All residuals against time and against predicted reading, with running means.{_walk_note(diagnosis)}"
+    against = "All residuals against time and against predicted reading, with running means."
     curves = [effect for effect in diagnosis.effects if figure_name_of(effect.name) in drawn]
     return (
         html.figure(drawn["before_after.svg"], before_and_after_caption(diagnosis)),
@@ -354,13 +321,8 @@ def _heldout_gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> 
             "over all, with standard error."
         )
         shown = html.figure(drawn["gain.svg"], caption)
-    facts = {}
-    if gain.heldout_by_scan:
-        per_reading = _signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)
-        facts["gain on held-out readings"] = f"{per_reading} per reading"
-    if changes:
-        facts["log evidence gained"] = f"{number_text(gain.log_evidence, 1)} nats"
-    facts["rms of the residuals"] = _rms_in_words(diagnosis, diagnosis.recording.weighting_in_words)
+    facts = {"log evidence gained": f"{number_text(gain.log_evidence, 1)} nats"} if changes else {}
+    facts["rms of the residuals"] = _rms_in_words(diagnosis)
     facts["test for further missing effects"] = typeset_numbers(p_in_words(gain.p_value_after))
     return shown, facts
 
@@ -373,10 +335,9 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> Sequenc
     rows = [
         (p.name.replace("_", " "), unit_after_number(p.unit), *_value_and_interval_texts(p)) for p in noise.parameters
     ]
-    beside = ", the random walk aside" if diagnosis.after.has_walk else ""
     caption = (
         f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
-        f"Middle: scatter by predicted reading{beside}. Below: histogram on a logarithmic scale{beside}."
+        f"Middle: scatter by predicted reading. Below: histogram on a logarithmic scale."
     )
     found = (html.table(("parameter", "unit", "value", "95 % interval"), rows),) if rows else ()
     return (typeset_numbers(test), *found, html.figure(drawn["noise.svg"], caption))
@@ -430,24 +391,6 @@ def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
     return html.table(("aliased in these readings", "cosine", "what would separate them", "readings needed"), rows)
 
 
-def _audit_elements(audit: PlanAudit) -> Sequence[str | Mapping[str, str]]:
-    meaning: dict[Literal["fine", "aliased", "invisible"], str] = {
-        "fine": "detected, and told from every other",
-        "aliased": "detected, but another effect can imitate it",
-        "invisible": "not detected",
-    }
-    listed = {}
-    for kind, words in meaning.items():
-        effects = audit.effects_with_detectability(kind)
-        names = [f"{e.name} (with {e.alike[0][0]})" if kind == "aliased" else e.name for e in effects]
-        listed[f"{kind} ({words})"] = ", ".join(names).replace("_", " ") or "none"
-    return (
-        listed,
-        html.details("every effect, with numbers", audit_table(audit.effects)),
-        "probewise audit PLAN.csv lists the readings that would help, before any are taken.",
-    )
-
-
 def _as_sentence(diagnosis: Diagnosis, text: str) -> str:
     return typeset_numbers(f"{diagnosis.apparatus.words.as_sentence(text).rstrip('.')}.")
 
@@ -478,12 +421,11 @@ def output_of(
     seed: int | None = None,
     rng: np.random.Generator | None = None,
     source: str = "",
-    audited: Callable[[], PlanAudit | None] = lambda: None,
 ) -> Output:
     """Return the files of a diagnosis: diagnosis.json, both models, the next readings; its figures and page.
 
     `rng` draws the samples in the sensors' files (default: by the seed); `source` names the recordings (default: the
-    recording's own name); `audited` makes the audit of the plan, or None.
+    recording's own name).
     """
     source = source or value.recording.source or "the readings"
     of_simulator = isinstance(value.recording.plan, RunTable)
@@ -491,7 +433,7 @@ def output_of(
     return Output(
         partial(_write_files_of_simulator if of_simulator else partial(_write_files_of_light_sensor, rng=rng), value),
         figure_drawers(value),
-        lambda drawn: page_html(value, drawn, source=source, seed=seed, audit=audited()),
+        partial(page_html, value, source=source, seed=seed),
         ("witness_*.svg", "gain.svg", *(("next.csv",) if of_simulator else (NEXT_PLAN, "next_plan.json"))),
         main="diagnosis.json",
     )

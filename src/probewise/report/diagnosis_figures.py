@@ -25,13 +25,12 @@ from probewise.report.covariates import (
 )
 from probewise.report.plots import residuals as plots
 from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, stack_of_axes, svg
-from probewise.report.plots.probabilities import hypothesis_probabilities, n_further_lines
+from probewise.report.plots.probabilities import height_of_bars_in, hypothesis_probabilities
 from probewise.systems import RunTable
 from probewise.systems.forms import Form
 
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
-_FIGURE_IN = 6.8  # width of the first figure
 _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readings' value counts as lost
 
 
@@ -81,9 +80,7 @@ def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
     diagnosis = chance.diagnosis
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names, most = [hypothesis_in_words(h.effects) for h in listed], min(len(listed), _MOST_BARS)
-    n_bars = most + (len(diagnosis.hypotheses) > most)
-    lines = n_further_lines(names[:_MOST_BARS], width_in=_FIGURE_IN)
-    axes = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3) + 0.16 * lines], width_in=_FIGURE_IN)
+    axes = stack_of_axes([2.7, height_of_bars_in([*names[:most], *["others"] * (len(diagnosis.hypotheses) > most)])])
     above, below = axes
     shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
@@ -126,19 +123,14 @@ def _curve_svg(diagnosis: Diagnosis, curve: Form) -> bytes:
 
 
 def _draw_means_along(chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes) -> None:
-    diagnosis, names, at = chance.diagnosis, view.category_names_on_axis, view.at
-    if names is not None:  # rows of the k-th value are spread evenly, in row order, about k
-        at = np.full(view.at.shape, np.nan)
-        for k, value in enumerate(np.unique(view.at[np.isfinite(view.at)])):
-            rows = np.flatnonzero(view.at == value)
-            at[rows] = k + np.linspace(-0.4, 0.4, rows.size) if rows.size > 1 else k
+    diagnosis = chance.diagnosis
     plots.mean_residuals_along(
         chance.means_in(view, after=after),
         label=view.label,
         unit=diagnosis.recording.plan.instrumentation.unit_after_number,
-        each=(at, diagnosis.before.residuals) if each else None,
+        each=(view.at, diagnosis.before.residuals) if each else None,
         window=view.window,
-        names=names,
+        names=view.names,
         before=diagnosis.apparatus.words.before_in_words,
         after=diagnosis.after_in_words,
         ax=ax,
@@ -155,9 +147,8 @@ def before_and_after(diagnosis: Diagnosis) -> AxesGrid:
     rows = rows_of_scan_changed_most(plan, after.readings_with_walk - before.readings_with_walk)
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
-    walking = ", with the walk" if after.has_walk else ""
     named = ((diagnosis.apparatus.words.before_in_words, before), (diagnosis.after_in_words, after))
-    models = [(f"{name}{walking}", own.readings_with_walk[rows]) for name, own in named]
+    models = [(name, own.readings_with_walk[rows]) for name, own in named]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = plan.instrumentation.unit_after_number
     models = models if diagnosis.repair_changes_predictions else models[:1]
@@ -202,20 +193,17 @@ def _draw_noise_panel(chance: ResidualNoise, name: str, ax: Axes) -> None:
     predicted, residuals, sd = diagnosis.after.readings, np.array(diagnosis.after.residuals), float(chance.sd.mean())
     unit = recording.plan.instrumentation.unit_after_number
     found = {p.name: p.mean for p in diagnosis.noise.parameters}
-    if "share" in found and "value" in found:  # lost readings carry no information on the noise of the others
+    if (
+        name != "dropouts" and "share" in found and "value" in found
+    ):  # lost readings carry no information on the noise of the others
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * sd)
-        lost &= np.abs(residuals) > _LOST * sd
-        residuals[lost] = np.nan
-        lost[list(recording.left_out)] = True
-        if name == "dropouts":
-            plots.lost_readings_against_predicted(predicted, recording.readings, lost, unit=unit, ax=ax)
-            return
+        residuals[lost & (np.abs(residuals) > _LOST * sd)] = np.nan
     if name == "quantisation" and "step" in found:
         plots.readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
     elif name in ("correlated_noise", "random_walk"):
         walking = residuals + diagnosis.after.walk
         plots.residual_autocorrelation(walking, recording.plan.scan, rho=found.get("rho"), ax=ax)
-    elif name == "outliers":
+    elif name in ("outliers", "dropouts"):
         plots.residual_histogram(residuals / chance.sd, 1.0, ax=ax)
     else:
         model_sd = chance.sd if np.ptp(chance.sd) > 0 else None

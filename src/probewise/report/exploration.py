@@ -26,15 +26,20 @@ from probewise.experiment import (
     samples_csv,
 )
 from probewise.experiment.result import WRONG_MM, stop_reason_with_checks
-from probewise.inquiry import UtilityMap
 from probewise.report import html
 from probewise.report.pictures import animated_gif
 from probewise.report.plots.canvas import PAGE_IN, AxesGrid, axes_of_frame, grid_of_axes, png
 from probewise.report.plots.probabilities import effect_probabilities_by_reading
 from probewise.report.plots.search import draw_field_legend, information_gained, playing_field, posterior_widths
-from probewise.report.words import interval_text, number_text, probability_text, value_with_error, words_without_unit
-from probewise.scene import outlines, with_angles_near
-from probewise.scene.shapes import shape_and_columns
+from probewise.report.words import (
+    number_text,
+    probability_text,
+    range_text,
+    typeset_numbers,
+    value_with_error,
+    words_without_unit,
+)
+from probewise.scene import outlines
 from probewise.sensor import Chain
 from probewise.verbs import DEFAULT_SEED
 
@@ -50,19 +55,16 @@ def draw_robot_view(
     *,
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
-    drawn: UtilityMap | None = None,
     title: str = "",
-    lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the robot's view of the field after a step of an experiment, as in the paper; return the axes.
 
     `readings` are x_mm, y_mm and value up to this step, `levels` the readings over black and white; `truth_mm` is the
-    true outline, (n_vertices, 2), where known; `drawn` the map, by default that from which the robot chose;
-    `lego_scale` adds the paper's coordinates at the top.
+    true outline, (n_vertices, 2), where known.
     """
     seen = np.asarray(readings, dtype=np.float64).reshape(-1, 3)
-    pose, drawn = step.next_pose, drawn or step.map
+    pose, drawn = step.next_pose, step.map
     return playing_field(
         drawn.image,
         drawn.grid.x_mm,
@@ -76,7 +78,6 @@ def draw_robot_view(
         cards_mm=[card.corners_mm for card in experiment.cards],
         utility_label=drawn.label,
         title=title or f"after {count_with_noun(step.number, 'reading')}, {number_text(step.bits, 1)} bits known",
-        lego_scale=lego_scale,
         ax=ax,
     )
 
@@ -90,7 +91,7 @@ def robot_view_png(
     truth_mm: FloatArray | None = None,
 ) -> bytes:
     """Draw the robot's view after one step, with its legend; return a PNG; parameters as in `draw_robot_view`."""
-    ax = axes_of_frame((8.4, 4.7), (0.75, 1.1, 1.15, 0.35))
+    ax = axes_of_frame()
     draw_robot_view(step, experiment, readings, levels=levels, truth_mm=truth_mm, ax=ax)
     draw_field_legend(ax)
     return png(ax, dpi=90, tight=False)
@@ -160,11 +161,9 @@ def _fault_section(steps: Sequence[Step], trust: float, draw: html.Draw) -> html
     """Build the section on effects that the sensor model may leave out: their probabilities after each reading."""
     doubted = left_out_after_step(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
-    changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
-    dashed = " A dashed line marks a change of the most probable one." if changed else ""
     shown = html.figure(
         draw("probabilities of faults", lambda: png(effect_probabilities_by_reading(beliefs))),
-        f"Probabilities of the sensor's possible faults after each reading.{dashed}",
+        "Probabilities of the sensor's possible faults after each reading.",
     )
     named = [(n, p) for n, p in doubted.probability.items() if p >= _LEAST_SHOWN][:_MOST_SHOWN]
     rows = (("nothing" if n == CLEAN else spoken_name(n), probability_text(p)) for n, p in named)
@@ -179,22 +178,6 @@ def draw_widths_and_information(runs: Mapping[str, Sequence[Step]], *, target_mm
     posterior_widths(widths, target_mm=target_mm, ax=axes[0, 0])
     information_gained({name: np.array([s.bits for s in steps]) for name, steps in runs.items()}, ax=axes[0, 1])
     return axes
-
-
-def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
-    """Write each parameter's estimate minus its truth, ± its posterior sd; those without a truth are left out."""
-    step, truth = run.last, dict(truth)
-    likely, columns = shape_and_columns(run.experiment.shape, step.likely_shape)
-    names = [step.names[k] for k in columns]
-    if all(name in truth for name in names):  # the angle nearest the estimate's by the shape's symmetry
-        near = with_angles_near(likely, np.array([[truth[name] for name in names]]), step.mean[columns])[0]
-        truth |= dict(zip(names, near.tolist(), strict=True))
-    return ", ".join(
-        f"{words_without_unit(name.removeprefix(f'{step.likely_shape}.'))} "
-        f"{value_with_error(float(mean) - truth[name], float(sd), unit_of_name(name))}"
-        for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
-        if name in truth and np.isfinite(mean)
-    )
 
 
 def summary_sentence(run: Exploration) -> str:
@@ -223,7 +206,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> h
                 unit_of_name(p.name),
                 *value_with_error(p.mean, p.sd).partition(" ± ")[::2],
                 *(() if p.arm_sd is None else (f"{p.arm_sd:.2g}",)),
-                interval_text(*p.interval95),
+                typeset_numbers(range_text(*p.interval95)),
                 *((f"{short[p.name]:.6g}" if p.name in short else "–",) if truth else ()),
             )
             for p in found.parameters
@@ -254,7 +237,8 @@ def steps_table(run: Exploration, unit: str = "LEGO") -> html.Markup:
 
 def page_html(
     run: Exploration,
-    frames: Sequence[bytes],
+    last_view: bytes,
+    animation: bytes,
     *,
     seed: int | None,
     model: str,
@@ -265,8 +249,9 @@ def page_html(
 ) -> str:
     """Return the HTML of an exploration's page.
 
-    `frames` are PNGs of the steps; `truth` are the parameters of the true shape by name, where known; `beside` are
-    steps of other sensor models, updated with the same readings, by the model's name; `draw` makes the curves.
+    `last_view` is a PNG, `animation` a GIF of all steps; `truth` are the parameters of the true shape by name, where
+    known; `beside` are steps of other sensor models, updated with the same readings, by the model's name; `draw` makes
+    the curves.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
@@ -274,31 +259,26 @@ def page_html(
     shape: list[str | Mapping[str, str]] = [shape_table(run, truth)]
     if last.shapes:
         shape.append(html.table(("shape", "probability"), ((n, probability_text(p)) for n, p in last.shapes.items())))
-    shape.append(_facts(run, MODEL_NAMES.get(model, model), truth, seed))
+    shape.append(_facts(run, MODEL_NAMES.get(model, model), seed))
     if last.sensor:
         sensor = [
             (words_without_unit(name), unit_of_name(name), *value_with_error(mean, sd).partition(" ± ")[::2])
             for name, (mean, sd) in last.sensor.items()
         ]
         shape.append(html.table(("parameter", "unit", "mean", "sd"), sensor, caption="The sensor, learnt along."))
-    more = "" if trust == 1 else " Information about what the sensor model leaves out is included."
-    arm = "" if run.arm_error is None else " The arm's own error, which the result above counts, is not in it."
     how_fast = (
         html.figure(
             draw("progress", lambda: png(draw_widths_and_information(runs, target_mm=run.experiment.stop_sd_mm))),
-            f"Left: widest posterior sd of a length after each reading; dashed: the target precision.{arm} Right: "
-            f"information about the shape, prior minus posterior differential entropy.{more}",
+            "Left: widest posterior sd of a length after each reading; dashed: the target precision. Right: "
+            "information about the shape, prior minus posterior differential entropy.",
         ),
         steps_table(run, unit),
     )
-    slides = [
-        (picture, f"Reading {s.number}: {s.reading.value:g}.") for s, picture in zip(run.steps, frames, strict=True)
-    ]
     sections = [
         html.Section("The shape and what it cost", (*shape, *(f"Doubtful: {note}." for note in run.notes))),
         *((_fault_section(run.steps, trust, draw),) if trust < 1 else ()),
         html.Section("How fast", how_fast),
-        html.Section("Every step", (html.slideshow(slides, "The robot's view after each reading."),)),
+        html.Section("Every step", (html.figure(animation, "The robot's view after each reading."),)),
     ]
     caption = (
         "The robot's view of the field after the last reading: at lighter places, a reading carries more information."
@@ -311,12 +291,12 @@ def page_html(
     return html.page(
         "The robot's search",
         answer=summary_sentence(run),
-        key_figure=html.figure(frames[-1], caption),
+        key_figure=html.figure(last_view, caption),
         sections=sections,
     )
 
 
-def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed: int | None) -> dict[str, str]:
+def _facts(run: Exploration, model: str, seed: int | None) -> dict[str, str]:
     """Return what a run is and cost, in words, by name."""
     p_value = run.last.p_value
     fits = "not tested: the most probable noise is not the declared one"
@@ -327,7 +307,6 @@ def _facts(run: Exploration, model: str, truth: Mapping[str, float] | None, seed
     return {
         "sensor model": model,
         "inference": run.experiment.inference_method.label,
-        **({"error against the truth, ± posterior sd": errors_text(run, truth)} if truth else {}),
         "stopped because": run.stop_reason,
         "cost": f"{count_with_noun(len(run.steps), 'reading')}, {number_text(run.seconds, 0)} s of arm time",
         "information": f"{number_text(run.last.bits, 1)} bits, {number_text(run.bits_per_reading, 2)} per reading",
@@ -357,8 +336,8 @@ def output_of(value: Exploration, *, seed: int | None = None) -> Output:
     def page(drawn: Mapping[str, bytes]) -> str:
         model = "ssf" if isinstance(value.experiment.model, Chain) else "naive"
         unit = "LEGO" if value.sensor is None else value.sensor.instrumentation.unit
-        shown = [drawn[name] for name in frames]
-        return page_html(value, shown, seed=seed, model=model, truth=known, unit=unit)
+        last = drawn[f"frames/{len(value.steps):03d}.png"]
+        return page_html(value, last, drawn["run.gif"], seed=seed, model=model, truth=known, unit=unit)
 
     animation = {"run.gif": lambda: animated_gif([draw() for draw in frames.values()])}
     return Output(write_files, frames | animation, page, ("frames/[0-9][0-9][0-9].png",), main="result.json")

@@ -16,7 +16,7 @@ from probewise.diagnosis import SystemFit, fit_json
 from probewise.report.html import Section, definition_list, figure, notes_in_words, page, seed_fact, table
 from probewise.report.plots.canvas import svg
 from probewise.report.plots.residuals import recorded_against_predicted, residuals_against_covariates
-from probewise.report.words import digits_of_range, typeset_numbers
+from probewise.report.words import typeset_numbers, value_and_interval_texts
 from probewise.systems import RunTable, samples_csv, write_fitted_system
 
 _MOST_INPUTS = 4
@@ -66,10 +66,8 @@ def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int | None) -
     """Return the HTML of a fit's page; `drawn` is from `figure_drawers`."""
     own, mode = fit.fitted, fit.fitted.mode()
     median, interval = np.median(own.samples, axis=0), own.interval()
-    digits = {name: digits_of_range(*interval[name], 5) for name in own.names}
-    ends = {name: " to ".join(f"{end:.{digits[name]}g}" for end in interval[name]) for name in own.names}
     rows = [
-        (name, *(typeset_numbers(text) for text in (f"{value:.{digits[name]}g}", ends[name], f"{mode[name]:.8g}")))
+        (name, *value_and_interval_texts(value, *interval[name]), typeset_numbers(f"{mode[name]:.8g}"))
         for name, value in zip(own.names, median, strict=True)
     ]
     run = {

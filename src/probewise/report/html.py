@@ -1,21 +1,14 @@
-"""Self-contained HTML pages: escaped elements, embedded figures, technical terms explained where first used."""
+"""Self-contained HTML pages: escaped elements, embedded figures, technical terms explained at the end."""
 
 from __future__ import annotations
 
 import base64
 import html
-import io
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import TypeAlias
 
-from PIL import Image
-
 _FEWEST_LISTED = 4  # sections from which on a page has a list of contents
-_CSS_DPI = 96.0
-_MOST_COLUMNS = 3  # of a table that fits a narrow screen
 
 
 class Markup(str):
@@ -61,20 +54,11 @@ def paragraph(*children: str, class_: str = "") -> Markup:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "") -> Markup:
-    """Build a table, one cell per heading in each row (else ValueError); digits of numeric cells have equal width."""
-    wide = len(header) > _MOST_COLUMNS
+    """Build a table, one cell per heading in each row (else ValueError)."""
     head = element("tr", *(element("th", cell, scope="col") for cell in header))
-    labels = header if wide else [""] * len(header)
-    body = [element("tr", *(_table_cell(cell, label) for cell, label in zip(row, labels, strict=True))) for row in rows]
+    body = [element("tr", *(element("td", cell) for cell, _ in zip(row, header, strict=True))) for row in rows]
     title = (element("caption", caption),) if caption else ()
-    inner = element("table", *title, element("thead", head), element("tbody", *body))
-    return element("div", inner, class_="scroll wide" if wide else "scroll")
-
-
-def _table_cell(text: str, label: str) -> Markup:
-    is_number = bool(text) and (text.lstrip("-−+<≈ ")[:1].isdigit())
-    attributes = ({"class_": "number"} if is_number else {}) | ({"data-label": label} if label else {})
-    return element("td", text, **attributes)
+    return element("div", element("table", *title, element("thead", head), element("tbody", *body)), class_="scroll")
 
 
 def details(summary: str, *content: Markup) -> Markup:
@@ -107,34 +91,18 @@ def draw_or_raise(name: str, drawer: Callable[[], bytes]) -> bytes:
 
 
 def figure(image: bytes, caption: str) -> Markup:
-    """Build a figure that embeds a PNG or an SVG; b"" could not be drawn."""
+    """Build a figure that embeds a PNG, a GIF or an SVG; b"" could not be drawn."""
     if not image:
         return element("figure", paragraph("This figure could not be drawn."), element("figcaption", caption))
-    kind, size = "svg+xml", ""
-    if not image.startswith(b"<svg"):
-        with Image.open(io.BytesIO(image)) as picture:
-            dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
-            # Below 0.9 of the width as drawn (CSS px), a PNG's text is too small.
-            kind, size = "png", f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
+    kind = "svg+xml" if image.startswith(b"<svg") else "gif" if image.startswith(b"GIF") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    shown = Markup(f'<img src="{source}" alt="{html.escape(caption)}"{size}>')
-    return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
+    shown = element("div", Markup(f'<img src="{source}" alt="{html.escape(caption)}">'), class_="drawing")
+    return element("figure", shown, element("figcaption", caption))
 
 
 def figures(drawn: Mapping[str, bytes], captions: Mapping[str, str]) -> dict[str, Markup]:
     """Build the figures that have a caption, by file name."""
     return {name: figure(drawn[name], caption) for name, caption in captions.items() if name in drawn}
-
-
-def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
-    """Build a slideshow of pictures, each with a line of text; without scripts the last one is shown."""
-    *earlier, last = (element("div", figure(image, text), class_="slide") for image, text in slides)
-    hidden = (Markup(slide.replace("<div", "<div hidden", 1)) for slide in earlier)
-    n = len(slides)
-    slider = Markup(
-        f'<label hidden>step <input type="range" min="1" max="{n}" value="{n}"> <output>{n} of {n}</output></label>'
-    )
-    return element("div", slider, *hidden, last, paragraph(caption), class_="slideshow")
 
 
 def page(
@@ -143,21 +111,14 @@ def page(
     answer: str,
     key_figure: Markup,
     sections: Sequence[Section],
-    terms_in: str | None = None,
+    with_terms: bool = False,
     reload_s: int | None = None,
 ) -> str:
     """Return the HTML of a page whose first screen is the answer in one sentence and the picture that shows it.
 
     A table of contents precedes the sections, which are in reading order, if there are four or more, parts included.
-    With `terms_in`, the text of the first screen, technical terms are explained below its picture and in the section
-    that first uses them. The page is loaded again after `reload_s` seconds; None: never.
+    `with_terms` adds what technical terms mean. The page is loaded again after `reload_s` seconds; None: never.
     """
-    if terms_in is not None:
-        known: set[str] = set()
-        key_figure = fragment(key_figure, *_explain_new_terms(terms_in, known))
-        sections = [
-            replace(s, body=(*s.body, *_explain_new_terms(" ".join((s.heading, *s.elements)), known))) for s in sections
-        ]
     listed = sum(1 + len(s.parts) for s in sections) >= _FEWEST_LISTED
     entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
     body = fragment(
@@ -165,6 +126,7 @@ def page(
         key_figure,
         *([element("nav", element("ol", *entries), aria_label="contents")] if listed else []),
         *(_section_element(s, str(k), 2) for k, s in enumerate(sections, start=1)),
+        *([details("What the terms mean", definition_list(_TERMS.items()))] if with_terms else []),
     )
     again = () if reload_s is None else (Markup(f'<meta http-equiv="refresh" content="{reload_s}">'),)
     head = fragment(
@@ -173,75 +135,35 @@ def page(
         element("title", title),
         element("style", Markup(_STYLE)),
     )
-    script = (element("script", Markup(_SLIDER)),) if 'class="slideshow"' in body else ()
-    document = element("html", element("head", head), element("body", element("main", body), *script), lang="en")
+    document = element("html", element("head", head), element("body", element("main", body)), lang="en")
     return f"<!doctype html>\n{document}\n"
-
-
-def _explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
-    """Build the paragraph on an HTML text's terms not in `known`, empty if there is none; add the terms to `known`."""
-    text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
-    new: list[str] = []
-    while text:  # an explanation may use a term itself
-        used = [term for term, (pattern, _) in _TERMS.items() if term not in known and re.search(pattern, text)]
-        known.update(used)
-        new += used
-        text = " ".join(_TERMS[term][1] for term in used)
-    parts = [part for term in new for part in (element("b", term), f": {_TERMS[term][1]}. ")]
-    return (paragraph(*parts, class_="terms"),) if parts else ()
 
 
 def _section_element(section: Section, number: str, level: int) -> Markup:
     parts = (_section_element(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
     heading = element(f"h{level}", section.heading)
-    return element("section", heading, *section.elements, *parts, id=_section_id(number))
+    return element("section", heading, *section.elements, *parts, id=f"part-{number}")
 
 
 def _contents_entry(section: Section, number: str) -> Markup:
     parts = [_contents_entry(part, f"{number}.{k}") for k, part in enumerate(section.parts, start=1)]
-    link = element("a", section.heading, href=f"#{_section_id(number)}")
+    link = element("a", section.heading, href=f"#part-{number}")
     return element("li", link, element("ol", *parts)) if parts else element("li", link)
 
 
-def _section_id(number: str) -> str:
-    return f"part-{number.replace('.', '-')}"
-
-
-_TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "residual": (r"(?i)\bresiduals?\b", "recorded minus predicted reading"),
-        "p": (r"\bp\s[=<]", "p-value: how often chance alone gives at least this, with nothing missing"),
-        "SSF": (r"\bSSF\b", "spatial sensitivity function: how strongly the sensor sees each point beneath it"),
-        "sd": (r"\bsds?\b", "standard deviation"),
-        "rms": (r"\brms\b", "root of the mean square"),
-        "nat": (r"\bnats?\b", "unit of evidence, a natural logarithm: 3 nats are odds of 20 to 1"),
-        "held-out": (r"\bheld-out\b", "kept for testing: not used in the fit"),
-        "λ": (
-            r"λ|\blambda\b",
-            "size of an effect: norm of its change in the readings after a full refit without it, in noise sds",
-        ),
-        "aliased": (
-            r"(?i)\balias(es|ed)?\b",
-            "two effects that change these readings in the same way while they are small",
-        ),
-        "cosine": (r"\bcosine\b", "1 where two effects change the readings in the same proportions, 0 where unrelated"),
-        "unknown": (r"\bunknown\b", "something that no effect which this program knows explains"),
-    }
-)
-"""For each term: a pattern that finds its uses in a text, and its explanation."""
-
-# The slider is hidden until this has run: without scripts only the last slide is shown.
-_SLIDER = """
-for (const show of document.querySelectorAll("div.slideshow")) {
-  const slides = show.querySelectorAll("div.slide"), label = show.querySelector("label");
-  const slider = label.querySelector("input"), said = label.querySelector("output");
-  label.hidden = false;
-  slider.addEventListener("input", () => {
-    slides.forEach((slide, k) => { slide.hidden = k !== slider.value - 1; });
-    said.value = `${slider.value} of ${slides.length}`;
-  });
+_TERMS = {
+    "residual": "recorded minus predicted reading",
+    "p": "p-value: how often chance alone gives at least this, with nothing missing",
+    "SSF": "spatial sensitivity function: how strongly the sensor sees each point beneath it",
+    "sd": "standard deviation",
+    "rms": "root of the mean square",
+    "nat": "unit of evidence, a natural logarithm: 3 nats are odds of 20 to 1",
+    "held-out": "kept for testing: not used in the fit",
+    "λ": "size of an effect: norm of its change in the readings after a full refit without it, in noise sds",
+    "aliased": "two effects that change these readings in the same way while they are small",
+    "cosine": "1 where two effects change the readings in the same proportions, 0 where unrelated",
+    "unknown": "something that no effect which this program knows explains",
 }
-"""
 
 _STYLE = """
 :root { color-scheme: light; --ink: #1b1b1b; --soft: #5a5a5a; --line: #d8d8d8; --paper: #ffffff; --accent: #0072b2; }
@@ -256,30 +178,22 @@ nav > ol { columns: 2 20rem; margin: 0; padding-left: 1.2rem; } nav li { break-i
 nav ol ol { margin: 0 0 .5rem; padding-left: 0; list-style: none; }
 nav ol ol li { font-weight: 400; font-size: .95rem; }
 a { color: var(--accent); }
-.slideshow label:not([hidden]) { display: flex; gap: .8rem; align-items: center; margin-bottom: .4rem; }
-.slideshow input { flex: 1; max-width: 34rem; } .slide figcaption { font-variant-numeric: tabular-nums; }
 p.answer { font-size: 1.45rem; line-height: 1.3; font-weight: 600; margin: .3rem 0 1rem; max-width: 46rem; }
 figure { margin: .8rem 0 1.2rem; }
 figure img { display: block; max-width: 100%; height: auto; }
 figcaption, caption { color: var(--soft); font-size: .9rem; text-align: left; margin-top: .35rem; max-width: 46rem; }
 p { max-width: 46rem; }
-p.terms { font-size: .85rem; color: var(--soft); }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; margin: .6rem 0 1rem; font-size: .95rem; }
 th, td { padding: .3rem .9rem .3rem 0; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
-td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
+td { font-variant-numeric: tabular-nums; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; font-size: .95rem; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 code, pre { font: .9em ui-monospace, Menlo, Consolas, monospace; }
 pre { overflow-x: auto; background: #f5f5f5; padding: .7rem .9rem; }
 @media (max-width: 34rem) {
   p.answer { font-size: 1.2rem; } dl { grid-template-columns: 1fr; } dt { margin-top: .4rem; }
-  .drawing { overflow-x: auto; } .drawing img[style] { min-width: var(--least); max-width: none; }
-  figure:has(img[style]) figcaption::before { content: "← scroll → "; }
-  .wide thead { display: none; } .wide table, .wide tbody, .wide tr, .wide td, .wide caption { display: block; }
-  .wide tr { border-bottom: 1px solid var(--line); padding: .4rem 0; }
-  .wide td { border: 0; padding: .1rem 0; white-space: normal; }
-  .wide td[data-label]::before { content: attr(data-label) ": "; color: var(--soft); }
+  .drawing { overflow-x: auto; } .drawing img { min-width: 34rem; max-width: none; }
 }
 @media print { main { max-width: none; padding: 0; } h2, figure, table { break-inside: avoid; } }
 """

@@ -17,7 +17,7 @@ from probewise.investigation import Investigation, Round
 from probewise.recordings import write_recording
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report.headline import headline
-from probewise.report.html import Markup, Section, figure, page, seed_fact, table
+from probewise.report.html import Section, figure, page, seed_fact, table
 from probewise.report.plots.canvas import png
 from probewise.report.plots.probabilities import probabilities_by_round
 from probewise.report.words import probability_text, typeset_numbers
@@ -29,16 +29,6 @@ _LEAST_TOLD = 0.005
 def draw_probabilities_by_round(found: Investigation) -> Axes:
     """Draw the probability of each explanation after each round; return the axes."""
     return probabilities_by_round({_round_title(each): _probability_by_explanation(each) for each in found.rounds})
-
-
-def probabilities_png(found: Investigation) -> bytes:
-    """Draw the probability of each explanation after each round; return a PNG."""
-    return png(draw_probabilities_by_round(found))
-
-
-def probabilities_figure_html(image: bytes) -> Markup:
-    """Build the HTML of the figure of `probabilities_png`, with its caption."""
-    return figure(image, "Probability of each explanation after each round, given all readings so far.")
 
 
 def summary_sentence(found: Investigation) -> str:
@@ -64,7 +54,10 @@ def page_html(
     `concealed` are the effects that a simulated world concealed, None for any other arm.
     """
     hidden = ", ".join(map(spoken_name, concealed or ())) or "nothing"
-    bars, diagnosis = probabilities_figure_html(drawn["by_round.png"]), found.last.diagnosis
+    diagnosis, said = (
+        found.last.diagnosis,
+        "Probability of each explanation after each round, given all readings so far.",
+    )
     n_readings, rounds = sum(len(each.recording) for each in found.rounds), count_with_noun(len(found.rounds), "round")
     run = {"arm": source, "readings": f"{n_readings} in {rounds}", **seed_fact(seed)}
     run |= {} if concealed is None else {"the world concealed": hidden}
@@ -76,9 +69,9 @@ def page_html(
     return page(
         f"Investigation: {diagnosis.verdict.replace('_', ' ')} after {rounds}",
         answer=summary_sentence(found),
-        key_figure=bars,
+        key_figure=figure(drawn["by_round.png"], said),
         sections=sections,
-        terms_in=bars,
+        with_terms=True,
     )
 
 
@@ -141,5 +134,5 @@ def output_of(
         write_recording(join([each.recording for each in value.rounds]), stage / "recording.csv")
 
     page = partial(page_html, value, source=source, seed=seed, concealed=concealed)
-    by_round = {"by_round.png": partial(probabilities_png, value)}
+    by_round = {"by_round.png": lambda: png(draw_probabilities_by_round(value))}
     return last._replace(files=write_files, drawers={**last.drawers, **by_round}, page=page)

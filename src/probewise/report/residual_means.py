@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, distinct_values
 
 _STEPS = 24
-_MOST_STEPS = 60
 _LEAST_ROWS = 4
-_FEW_STEPS = 6
 _NEVER_LESS = 0.05  # of the variance of a mean: the least width of the band, however much the fit absorbs
 _NEGLIGIBLE = 0.01  # correlation
 
@@ -22,7 +19,7 @@ _NEGLIGIBLE = 0.01  # correlation
 class ResidualMeans:
     """Mean residuals per bin; all arrays have shape (n_bins,).
 
-    `at` is the covariate's mean in the bin, or 0, 1, 2 ... for a categorical covariate. `before` and `after` are the
+    `at` is the covariate's mean in the bin. `before` and `after` are the
     mean residuals of the calibrated and of the repaired model (`after` None: nothing was repaired), `chance` half the
     width of the 95 % band of chance, `size` the number of readings. `by_value`: each bin is one value of a covariate
     that has few.
@@ -49,24 +46,22 @@ def mean_residuals(
     sd: FloatArray | float,
     rho: float = 0.0,
     scan: IntArray | None = None,
-    names: Mapping[float, str] | None = None,
     window: tuple[float, float] | None = None,
     absorbed: FloatArray | None = None,
 ) -> ResidualMeans:
     """Average residuals in bins of a covariate, with the 95 % band of chance.
 
     All have the shape (n_points,): the covariate, the residuals of both models, NaN where there is no reading, the
-    noise `sd` of one reading, and `scan` numbers, within which successive noise has the correlation `rho`. `names` are
-    those of a categorical covariate's values: each is a bin. No bin straddles the ends of `window`. `absorbed`,
-    (n_samples, n_points), are posterior samples of the predictions, whose variance the fit absorbs from the noise: it
-    narrows the band.
+    noise `sd` of one reading, and `scan` numbers, within which successive noise has the correlation `rho`. No bin
+    straddles the ends of `window`. `absorbed`, (n_samples, n_points), are posterior samples of the predictions, whose
+    variance the fit absorbs from the noise: it narrows the band.
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]
-    few = [np.flatnonzero(values == value) for value in np.unique(values)] if names else rows_by_value(values)
-    groups = _groups_in_steps(values, window) if few is None else few
+    few = rows_by_value(values)
+    groups = _groups_beside_window(values, window) if few is None else few
     rows = [ok[group] for group in groups]
-    at = np.arange(len(groups), dtype=np.float64) if names else np.array([values[g].mean() for g in groups])
+    at = np.array([values[g].mean() for g in groups])
     sd_of_row = np.broadcast_to(np.asarray(sd, dtype=np.float64), before.shape)
     scan = np.zeros(len(before), dtype=np.int64) if scan is None else scan
     variance = np.array([_variance_of_mean(r, sd_of_row, scan, rho) for r in rows])
@@ -101,40 +96,20 @@ def groups_of_neighbours(values: FloatArray, n: int) -> list[IntArray]:
     return [rows for rows in np.split(order, cuts) if rows.size]
 
 
-def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
-    """List row numbers by equal steps of the covariate; groups of few rows are joined, not across the window's ends."""
-    if values.size == 0:
-        return []
+def _groups_beside_window(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
+    """List row numbers by equal steps of the covariate, none across an end of the window; groups of few are joined."""
     low, high = window or (-np.inf, np.inf)
-    inside = (values >= low) & (values <= high)
-    least = int(np.clip(inside.sum(), 1, _LEAST_ROWS)) if window else _LEAST_ROWS
-    parts = [np.flatnonzero(part) for part in (values < low, inside, values > high)]
-    return [group for part in parts if part.size for group in _groups_of_rows(values, part, least)]
-
-
-def _groups_of_rows(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
-    """Split `rows` by equal steps of the covariate; into equal numbers where most of them share a few values."""
-    there = values[rows]
-    span = float(np.ptp(there))
-    n = int(np.clip(round(_STEPS * (span / max(float(np.ptp(values)), 1e-300))), 1, _MOST_STEPS))
-    step = np.minimum((n * (there - there.min()) / max(span, 1e-300)).astype(int), n - 1)
-    groups = _merged_groups([rows[step == k] for k in range(n)], least)
-    if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
-        return groups
-    # Where most readings share a few values, groups of equal size show more than bins of equal width.
-    return [rows[group] for group in groups_of_neighbours(there, min(n, rows.size // least))]
-
-
-def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
-    """Join successive groups until each has `least` rows; what remains joins the last."""
+    part = (values >= low).astype(np.int64) + (values > high)
+    span = max(float(np.ptp(values)) if values.size else 0.0, 1e-300)
+    step = np.minimum(_STEPS * (values - values.min(initial=np.inf)) / span, _STEPS - 1).astype(np.int64)
+    place = part * _STEPS + step
     groups: list[IntArray] = []
-    waiting = np.empty(0, dtype=np.int64)
-    for part in parts:
-        waiting = np.concatenate([waiting, part])
-        if waiting.size >= least:
-            groups.append(waiting)
-            waiting = waiting[:0]
-    return groups if not waiting.size else [*groups[:-1], np.concatenate([*groups[-1:], waiting])]
+    for at in np.unique(place):
+        rows = np.flatnonzero(place == at)
+        if groups and groups[-1].size < _LEAST_ROWS and part[groups[-1][0]] == part[rows[0]]:
+            rows = np.concatenate([groups.pop(), rows])
+        groups.append(rows)
+    return groups
 
 
 def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float) -> float:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 
-from probewise._words import count_with_noun, unit_of_name
+from probewise._words import count_with_noun, unit_of_name, value_with_sd
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number_text(value: float, digits: int) -> str:
-    """Write a number with fixed decimals and a true minus sign; a dash if it is not finite."""
-    return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
+    """Write a number with fixed decimals, a true minus sign, none before zero; a dash if it is not finite."""
+    return f"{value:z.{digits}f}".replace("-", "−") if math.isfinite(value) else "–"
 
 
 def decimals_to_show(value: float, least: int) -> int:
@@ -23,28 +23,8 @@ def decimals_to_show(value: float, least: int) -> int:
 
 
 def value_with_error(value: float, error: float, unit: str = "") -> str:
-    """Write a value with its error, both to the error's second significant digit, so that no error shows as zero.
-
-    A dash if the value is not finite; the value alone if the error is not above zero.
-    """
-    if not math.isfinite(value):
-        return "–"
-    if not (math.isfinite(error) and error > 0):
-        written = f"{value:.6g}"
-    elif -6 < (digits := 1 - math.floor(math.log10(error))) <= 8:
-        written = f"{number_unsigned_zero(value, max(digits, 0))} ± {number_text(error, max(digits, 0))}"
-    else:
-        written = f"{value:.3g} ± {error:.1g}"
-    return typeset_numbers(f"{written} {unit}".rstrip()).replace("-", "−")
-
-
-def interval_text(low: float, high: float) -> str:
-    """Write the ends of an interval, both to the third significant digit of its width; one number if the width is 0."""
-    width = high - low
-    if not (math.isfinite(width) and width > 0):
-        return "–" if not math.isfinite(low) else f"{low:.6g}"
-    digits = min(max(2 - math.floor(math.log10(width)), 0), 8)
-    return f"{number_unsigned_zero(low, digits)} to {number_unsigned_zero(high, digits)}"
+    """Write a value with its error as `value_with_sd` does, typeset; a dash if the value is not finite."""
+    return typeset_numbers(value_with_sd(value, error, unit)) if math.isfinite(value) else "–"
 
 
 def digits_of_range(low: float, high: float, least: int) -> int:
@@ -68,20 +48,15 @@ def range_text(low: float, high: float, scale: float = 0.0) -> str:
 
 def value_and_interval_texts(value: float, low: float, high: float) -> tuple[str, str]:
     """Return texts of a value and of its interval, to the third significant digit of the interval's width."""
-    ends = interval_text(low, high)
-    decimals = len(ends.partition(" ")[0].partition(".")[2])
-    return (number_unsigned_zero(value, decimals) if high > low else f"{value:.6g}"), ends
+    digits = digits_of_range(low, high, 3)
+    value_text, *ends = (typeset_numbers(f"{number:.{digits}g}") for number in (value, low, high))
+    return value_text, " to ".join(ends)
 
 
 def words_without_unit(name: str) -> str:
     """Write a parameter's name without its unit, spaces for underscores and dots."""
     stem = name.rpartition("_")[0] if unit_of_name(name) else name
     return stem.replace("_", " ").replace(".", " ")
-
-
-def number_unsigned_zero(value: float, digits: int) -> str:
-    """Write a number with fixed decimals as `number_text` does, but without a minus sign if it rounds to zero."""
-    return number_text(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
 
 
 def typeset_numbers(text: str) -> str:
@@ -102,11 +77,6 @@ def duration_text(minutes: float) -> str:
     """Write a duration in the largest unit, from minutes to years, of which it has three or more; at least a minute."""
     noun = [unit for unit, length in _MINUTES.items() if unit == "minute" or minutes >= _LEAST_OF_A_UNIT * length][-1]
     return count_with_noun(max(round(minutes / _MINUTES[noun]), 1), noun)
-
-
-def rounded_count_text(n: float) -> str:
-    """Write a number of two significant digits in full, as in "640,000"."""
-    return f"{float(f'{n:.2g}'):,.0f}"
 
 
 def probability_text(p: float) -> str:

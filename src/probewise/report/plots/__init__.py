@@ -3,8 +3,7 @@
 Without axes, a function opens a pyplot figure of suitable size, so that `plt.savefig` and `plt.show` find it; no global
 style is set. A file is imported when one of its functions is first used.
 
-The arm and its sensor (figure 1 of the paper), the sensor's orientations and the quadrant patterns (figures 3 and 4),
-data of the four orientations (figure 5 of the paper), SSF by number of Gaussians (figure 6),
+The arm (figure 1 of the paper), data of the four orientations (figure 5), SSF by number of Gaussians (figure 6),
 predicted against recorded (figure 7), the entropy map with its hypotheses (figures 2 and 8);
 and also: progress towards the target precision, results of a diagnosis, and diagnostics of nested sampling.
 """
@@ -13,13 +12,12 @@ import importlib
 from typing import Any
 
 _FILES = {
-    "apparatus": "arm_and_sensor reach_map",
+    "apparatus": "draw_arm_lengths reach_map",
     "canvas": "AxesGrid PAGE_IN SMALL_PT grid_of_axes png stack_of_axes svg",
     "nested": "corner_plot insertion_plot run_plot trace_plot",
     "probabilities": "audit_matrix effect_probabilities_by_reading hypothesis_probabilities probabilities_by_round",
-    "readings": "predicted_and_recorded_by_scan quadrant_patterns readings_by_orientation residuals_by_scan "
-    "sensor_orientations standardised_residuals",
-    "residuals": "heldout_gain_by_scan lost_readings_against_predicted mean_residuals_along readings_in_order "
+    "readings": "predicted_and_recorded_by_scan readings_by_orientation standardised_residuals",
+    "residuals": "heldout_gain_by_scan mean_residuals_along readings_in_order "
     "readings_modulo_step recorded_against_predicted residual_autocorrelation residual_histogram "
     "residuals_against_covariates scan_with_residuals spread_by_level",
     "search": "draw_field_legend information_gained playing_field posterior_widths",

@@ -7,12 +7,11 @@ Without axes, a plot function opens a pyplot figure, so that `plt.savefig` and `
 from __future__ import annotations
 
 import io
-import math
 import re
 import textwrap
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, TypeAlias, cast
+from typing import Any, Literal, TypeAlias, cast
 from weakref import WeakSet
 
 import matplotlib as mpl
@@ -26,13 +25,11 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FuncFormatter, ScalarFormatter
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageChops, ImageOps
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
-from probewise.report.words import typeset_numbers
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILLION, PURPLE, GREY = "#0072b2", "#d55e00", "#cc79a7", "#8c8c8c"
@@ -52,12 +49,11 @@ _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _MARGIN_IN = 0.1  # about a cropped picture, as matplotlib leaves it
 _EMPTY_BRACKETS = re.compile(r"\s*\(\)$")
-_LEAST_IN_FULL = 1e-5  # of an axis' length: shorter ones have labels with a power of ten
 
 AxesGrid: TypeAlias = NDArray[Any]
 
-PAGE_IN = 9.6
-"""Width of a report's column: a wider drawing is shrunk, and its text with it."""
+PAGE_IN, PANEL_IN = 9.6, 6.8
+"""Width of a report's column: a wider drawing is shrunk, and its text with it; width of a drawing of one column."""
 
 LETTERS_PER_IN = 16.2
 """Letters in an inch of the smallest font, about."""
@@ -77,7 +73,7 @@ COPPER: Colormap = LinearSegmentedColormap.from_list(
 )
 
 
-def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -> Axes:
+def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (PANEL_IN, 2.7)) -> Axes:
     """Return the axes given, or those of a new figure; ParameterError for anything else, such as a figure."""
     if ax is not None:
         require_kind("ax", ax, Axes, _AXES)
@@ -85,49 +81,29 @@ def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -
 
 
 def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any) -> AxesGrid:
-    """Open a figure and return its axes, (n_rows, n_columns); options go to `Figure.subplots`."""
-    return np.asarray(
-        new_figure(size_in, layout="constrained").subplots(n_rows, n_columns, squeeze=False, **options),
-        dtype=np.object_,
-    )
+    """Open a pyplot figure, which `png` or `svg` will close; return its axes, (n_rows, n_columns).
 
-
-def grid_of_frames(
-    n_rows: int, n_columns: int, *, size_in: tuple[float, float], margins_in: tuple[float, float, float, float]
-) -> AxesGrid:
-    """Return axes, (n_rows, n_columns), each of a part of this size within fixed margins: left, bottom, right, top.
-
-    To measure what the margins must hold would take as long as to draw.
+    The options go to `Figure.subplots`.
     """
-    (width, height), (left, bottom, right, top) = size_in, margins_in
-    sheet = Figure((n_columns * width, n_rows * height))
-    axes = sheet.subplots(n_rows, n_columns, squeeze=False)
-    sheet.subplots_adjust(
-        left=left / (n_columns * width),
-        right=1.0 - right / (n_columns * width),
-        bottom=bottom / (n_rows * height),
-        top=1.0 - top / (n_rows * height),
-        wspace=(left + right) / (width - left - right),
-        hspace=(bottom + top) / (height - bottom - top),
-    )
-    return np.asarray(axes, dtype=np.object_)
+    sheet = plt.figure(figsize=size_in, layout="constrained")
+    _OPENED.add(sheet)
+    return np.asarray(sheet.subplots(n_rows, n_columns, squeeze=False, **options), dtype=np.object_)
+
+
+def stack_of_axes(heights_in: Sequence[float]) -> AxesGrid:
+    """Open a figure and return its axes of these heights, one above the other, (n_axes,)."""
+    size_in = (PANEL_IN, sum(heights_in))
+    return grid_of_axes(len(heights_in), 1, size_in=size_in, height_ratios=list(heights_in))[:, 0]
 
 
 @lru_cache(maxsize=1)
-def axes_of_frame(size_in: tuple[float, float], margins_in: tuple[float, float, float, float]) -> Axes:
-    """Return the axes of an animation's frames, the same for each, within fixed margins.
+def axes_of_frame() -> Axes:
+    """Return the axes of an animation's frames, the same for each, with room for colour bar and legend.
 
-    Who draws a frame replaces what was drawn before: new axes, with new ticks, take most of the time of a frame.
+    Who draws a frame replaces what was drawn before: new axes, with new ticks, take most of the time of a frame, and a
+    layout that measures the labels as long again.
     """
-    axes: Axes = grid_of_frames(1, 1, size_in=size_in, margins_in=margins_in)[0, 0]
-    return axes
-
-
-def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
-    """Open a pyplot figure, which `png` or `svg` will close, and return it."""
-    sheet = plt.figure(figsize=size_in, layout=layout)
-    _OPENED.add(sheet)
-    return sheet
+    return Figure((8.4, 4.7)).add_axes((0.09, 0.24, 0.77, 0.69))
 
 
 def figure_of(drawing: Axes | AxesGrid | Figure) -> Figure:
@@ -152,108 +128,41 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
         sheet.dpi = own_dpi
     if sheet in _OPENED:
         plt.close(sheet)
-    pixels = np.asarray(agg.buffer_rgba())[..., :3]
-    if tight:
+    picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
+    if tight and (inked := ImageChops.invert(picture).getbbox()) is not None:
         margin = round(_MARGIN_IN * dpi)
-        rows, columns = (np.flatnonzero((pixels != pixels[0, 0]).any(axis=axis)) for axis in ((1, 2), (0, 2)))
-        within = (slice(max(at[0] - margin, 0), at[-1] + margin + 1) for at in (rows, columns) if at.size)
-        pixels = pixels[tuple(within)]
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, "PNG", dpi=(dpi, dpi))
+        picture = ImageOps.expand(picture.crop(inked), margin, "white")
+    picture.save(buffer, "PNG", dpi=(dpi, dpi))
     return buffer.getvalue()
-
-
-def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
-    """Open a figure and return its axes of these heights, one above the other, (n_axes,); `svg` sets their margins.
-
-    Until then they are as high as the figure: in lower axes, tick labels are not longer, and need no second layout.
-    """
-    sheet = new_figure((width_in, sum(heights_in)))
-    axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
-    sheet.subplots_adjust(bottom=0.0, top=1.0, hspace=0.0)
-    return np.asarray(axes[:, 0], dtype=np.object_)
-
-
-def axes_or_panel(ax: Axes | None, *, height_in: float = 2.7) -> Axes:
-    """Return the axes given, or those of a new figure of one panel, for `svg`."""
-    panel: Axes = ax if ax is not None else stack_of_axes([height_in])[0]
-    return panel
-
-
-def lay_out(drawing: Axes | AxesGrid) -> Axes | AxesGrid:
-    """Give a stack of axes margins for its labels; return the drawing."""
-    figure_of(drawing).tight_layout(pad=0.4, h_pad=0.9)
-    return drawing
 
 
 def svg(drawing: Axes | AxesGrid) -> bytes:
     """Render a drawing's figure as SVG, reproducible byte for byte; a figure that a plot function opened is closed."""
-    sheet = figure_of(lay_out(drawing))
-    buffer, own = io.BytesIO(), sheet.canvas
-    canvas: Any = FigureCanvasSVG(sheet)
+    sheet, buffer = figure_of(drawing), io.BytesIO()
+    own, canvas = sheet.canvas, cast(Any, FigureCanvasSVG(sheet))
     with mpl.rc_context({"svg.hashsalt": "probewise"}):
         canvas.print_svg(buffer, metadata={"Date": None})  # `savefig` would draw everything twice
     sheet.set_canvas(own)
     if sheet in _OPENED:
         plt.close(sheet)
-    text = buffer.getvalue()
-    return text[text.index(b"<svg") :]
+    return buffer.getvalue()[buffer.getvalue().index(b"<svg") :]
 
 
-def legend_above(ax: Axes, *, title: str = "") -> int:
-    """Place the legend above the axes, in as many columns as fit, so that it never covers data.
-
-    A label that is wider than the axes is broken into lines: otherwise the layout would leave no room for the axes.
-    Returns the number of lines of text in the longest column, 0 without labels.
-    """
+def legend_above(ax: Axes, *, title: str = "") -> None:
+    """Place the legend above the axes, in as many columns as fit, so that it never covers data; long labels wrap."""
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
-        return 0
+        return
     room = LETTERS_PER_IN * ax.get_position().width * figure_of(ax).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
-
-    def lines_by_column(n: int) -> list[list[str]]:
-        """Return the lines of text in each of `n` columns; a legend is filled column by column."""
-        columns = np.array_split(np.array(labels, dtype=np.object_), n)
-        return ["\n".join(column).split("\n") for column in columns]
-
-    def width(n: int) -> int:
-        return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in lines_by_column(n))
-
-    n_columns = next((n for n in range(len(labels), 1, -1) if width(n) < room), 1)
-    ax.legend(
-        handles,
-        labels,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        ncols=n_columns,
-        frameon=False,
-        fontsize=SMALL_PT,
-        title=title or None,
-        title_fontsize=SMALL_PT,
-        alignment="left",
-        borderaxespad=0.1,
-        columnspacing=1.2,
-    )
-    return max(map(len, lines_by_column(n_columns)))
-
-
-def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
-    """Write tick labels in full, without a factor or offset; with a power of ten if the axis spans less than 1e-5."""
-    for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
-        low, high = axis.get_view_interval()
-        if high - low > _LEAST_IN_FULL:
-            in_full = ScalarFormatter(useOffset=False)
-            in_full.set_scientific(False)
-            axis.set_major_formatter(in_full)
-        else:
-            digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
-            axis.set_major_formatter(
-                FuncFormatter(lambda v, _, digits=digits: typeset_numbers(f"{round(v, digits) + 0.0:g}"))
-            )
+    widest = max(len(line) for label in labels for line in label.split("\n")) + _LINE_SAMPLE
+    style: dict[str, Any] = {"frameon": False, "fontsize": SMALL_PT, "title_fontsize": SMALL_PT, "alignment": "left"}
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
+    ax.legend(handles, labels, ncols=max(int(room / widest), 1), title=title or None, **place, **style)
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
-    """Draw one legend for all axes of a figure with constrained layout, below them, with text of the colour `ink`."""
+    """Draw one legend for all axes of a figure, below them, with text of the colour `ink`."""
     every: list[Axes] = list(axes.flat) if isinstance(axes, np.ndarray) else [axes]
     handles = {label: handle for ax in every for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     sheet = figure_of(every[0])
@@ -284,18 +193,13 @@ def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
     return ax
 
 
-def finish(ax: Axes, *, x: str, y: str, plain: str = "xy") -> Axes:
-    """Label axes, write the ticks of the axes in `plain` in full, place the legend above; return the axes."""
+def finish(ax: Axes, *, x: str, y: str, plain: Literal["x", "y", "both"] | None = "both") -> Axes:
+    """Label axes, write the ticks of the axes `plain` without an offset, place the legend above; return the axes."""
     label_axes(ax, x=x, y=y)
-    set_plain_tick_labels(ax, x="x" in plain, y="y" in plain)
+    if plain:
+        ax.ticklabel_format(axis=plain, useOffset=False)
     legend_above(ax)
     return ax
-
-
-def hide_unused(axes: AxesGrid, n: int) -> None:
-    """Hide all axes of a grid after the first `n`."""
-    for ax in list(axes.flat)[n:]:
-        ax.set_visible(False)
 
 
 def draw_map(ax: Axes, values: FloatArray, x: FloatArray, y: FloatArray, **style: Any) -> AxesImage:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
+from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
@@ -29,11 +27,8 @@ Posterior: TypeAlias = NestedResult | Weighted
 _WEIGHT: Colormap = LinearSegmentedColormap.from_list(
     "probewise_weight", ["#dcdcdc", "#8fbbdb", canvas.BLUE, "#00233b"]
 )
-_SSF_UNITS = {"u": "mm", "v": "mm", "A": "mm⁻²", "B": "mm⁻²", "C": "mm⁻²"}  # units of the paper's symbols
 _MASSES = (0.68, 0.95)
 _SHADES = ("#aecfe6", "#4d9bcb")  # colours of the larger and of the smaller mass
-_MOST_POINTS = 4000
-_LEFT_IN, _BOTTOM_IN, _TOP_IN, _RIGHT_IN, _GAP_IN = 0.9, 0.9, 0.65, 0.2, 0.06  # points in a panel of a corner plot
 _A_RUN, _NEW = "a NestedResult, as nested.run returns it", "new points"
 _DEPTH = "−ln X (X: prior mass left)"
 _FEW = 6  # parameters up to which a corner plot fits a page and has numbers
@@ -42,51 +37,23 @@ _FEW = 6  # parameters up to which a corner plot fits a page and has numbers
 def trace_plot(result: NestedResult, *, parameters: Sequence[str] | None = None) -> canvas.AxesGrid:
     """Draw each parameter of the dead points against the remaining log volume, darker where the posterior mass is.
 
-    On top: posterior mass per nat of log volume. To the right of each trace: the parameter's marginal posterior, on a
-    scale of its own. `parameters` are the names to draw, in this order; default: all.
+    On top: posterior mass per nat of log volume. `parameters` are the names to draw, in this order; default: all.
 
-    Return the axes, (1 + number of parameters drawn, 2). ParameterError for an unknown name or none.
+    Return the axes, (1 + number of parameters drawn, 1). ParameterError for an unknown name or none.
     """
     columns = _checked_parameter_columns(result, parameters)
-    n = len(columns)
-    height, first = (1.5, 1.2) if n <= _FEW else (1.15, 1.6)
-    shares: dict[str, Any] = {"width_ratios": (4.0, 1.0), "height_ratios": (first, *[1.0] * n)}
-    axes = canvas.grid_of_axes(n + 1, 2, size_in=(8.6, 1.9 + height * n), **shares)
+    axes = canvas.grid_of_axes(len(columns) + 1, 1, size_in=(canvas.PANEL_IN, 1.9 + 1.3 * len(columns)), sharex=True)
     depth, mass = _depth_and_mass_per_nat(result)
-    shown = np.unique(np.linspace(0, result.n_dead - 1, min(result.n_dead, _MOST_POINTS)).astype(np.int64))
-    shown = shown[np.argsort(mass[shown], kind="stable")]
-    top, key = axes[0]
-    _draw_mass(top, depth, mass, linewidth=1.2)
-    canvas.label_axes(top, x="", y="posterior\nper nat", title=_evidence_text(result))
-    key.axis("off")
-    place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
-    scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
-    bar = key.figure.colorbar(scale, cax=place, orientation="horizontal", ticks=[0, 1])
-    bar.set_label("posterior per nat,\nshare of its peak", fontsize=canvas.SMALL_PT)
-    bar.ax.tick_params(labelsize=canvas.SMALL_PT)
-    colours: dict[str, Any] = {"c": mass[shown] / mass.max(), "cmap": _WEIGHT, "vmin": 0, "vmax": 1}
-    for (trace, side), i in zip(axes[1:], columns, strict=True):
-        values, span = result.theta[:, i], _axis_limits(result, i)
-        trace.scatter(depth[shown], values[shown], s=5, linewidths=0, rasterized=True, **colours)
-        canvas.label_axes(trace, x="", y=_parameter_label(result.names[i]))
-        centres, density = _centres_and_smoothed_density(values, result.weight, span, result.n_eff)
-        side.fill_betweenx(centres, density, **canvas.FILLED)
-        side.plot(density, centres, color=canvas.BLUE, linewidth=1.2)
-        side.set_xlim(left=0)
-        side.set_ylim(span)
-        canvas.label_axes(side, x="", y="")
-        side.set_xticks([])
-        side.yaxis.tick_right()
-        side.tick_params(labelsize=canvas.SMALL_PT)
-        for ax in (trace, side):
-            ax.yaxis.set_major_locator(MaxNLocator(3))
-    for ax in axes[:, 0]:
-        ax.set_xlim(0, depth[-1])
-    for ax in axes[:-1, 0]:
-        ax.set_xticklabels([])
-    axes[-1, 0].set_xlabel(_DEPTH)
-    axes[-1, 1].set_xlabel("posterior")
-    top.figure.align_ylabels(list(axes[:, 0]))
+    shown = np.argsort(mass, kind="stable")
+    _draw_mass(axes[0, 0], depth, mass)
+    canvas.label_axes(axes[0, 0], x="", y="posterior\nper nat", title=_evidence_text(result))
+    for ax, i in zip(axes[1:, 0], columns, strict=True):
+        ax.scatter(
+            depth[shown], result.theta[shown, i], s=5, linewidths=0, rasterized=True, c=mass[shown], cmap=_WEIGHT
+        )
+        canvas.label_axes(ax, x="", y=_parameter_label(result.names[i]))
+    axes[-1, 0].set(xlim=(0, depth[-1]), xlabel=_DEPTH)
+    canvas.figure_of(axes).align_ylabels(list(axes[:, 0]))
     return axes
 
 
@@ -102,45 +69,37 @@ def corner_plot(result: Posterior, *, parameters: Sequence[str] | None = None) -
     none.
     """
     columns = _checked_parameter_columns(result, parameters)
-    n = len(columns)
-    side = (min(1.9, (canvas.PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
-    width, height, size = _LEFT_IN + n * side + _RIGHT_IN, _BOTTOM_IN + n * side + _TOP_IN, side - _GAP_IN
-    sheet, drawn = canvas.new_figure((width, height)), np.full((n, n), None, dtype=np.object_)
-    spans = [_axis_limits(result, i) for i in columns]
-    for row, column in zip(*np.tril_indices(n), strict=True):
-        left, bottom = _LEFT_IN + column * side, _BOTTOM_IN + (n - 1 - row) * side
-        ax = drawn[row, column] = sheet.add_axes((left / width, bottom / height, size / width, size / height))
+    n, spans = len(columns), [_axis_limits(result, i) for i in columns]
+    side = min(1.9, canvas.PAGE_IN / n) if n <= _FEW else 1.25
+    axes = canvas.grid_of_axes(n, n, size_in=(max(n * side, 3.6), max(n * side, 3.6)))
+    for (row, column), ax in np.ndenumerate(axes):
+        if column > row:
+            ax.remove()
+            axes[row, column] = None
+            continue
         if row == column:
             _draw_marginal(ax, result, columns[row], spans[row], titled=n <= _FEW)
         else:
             _draw_pair(ax, result, (columns[column], columns[row]), (spans[column], spans[row]))
             ax.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
         ax.set_xlim(spans[column])
-        ax.tick_params(labelsize=canvas.SMALL_PT, length=3)
+        ax.tick_params(labelsize=canvas.SMALL_PT)
         ax.tick_params(axis="x", labelrotation=45)
         ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
-        if row == n - 1:
-            ax.set_xlabel(_parameter_label(result.names[columns[column]]))
-            ax.xaxis.set_label_coords(0.5, -0.6 / size)
-        else:
-            ax.set_xticklabels([])
-        if column == 0 and row > 0:
-            ax.set_ylabel(_parameter_label(result.names[columns[row]]))
-            ax.yaxis.set_label_coords(-0.65 / size, 0.5)
-        elif row != column:
-            ax.set_yticklabels([])
+        ax.set_xlabel(_parameter_label(result.names[columns[column]]))
+        ax.set_ylabel(_parameter_label(result.names[columns[row]]) if row != column else "")
+        ax.label_outer()
     if n > 1:
         shades = zip(_MASSES, reversed(_SHADES), strict=True)
-        sheet.legend(
+        canvas.figure_of(axes[0, 0]).legend(
             handles=[Patch(facecolor=colour, label=f"{100 * mass:.0f} %") for mass, colour in shades],
             title=f"{_evidence_text(result)}\nposterior within",
             loc="upper right",
             frameon=False,
             fontsize=canvas.SMALL_PT,
             title_fontsize=canvas.SMALL_PT,
-            alignment="left",
         )
-    return drawn
+    return axes
 
 
 def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
@@ -167,11 +126,10 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
     colour = np.where((counts < low) | (counts > high), canvas.VERMILLION, _SHADES[0])
     ax.bar(edges[:-1], counts, 1.0 / n_bars, align="edge", color=colour, edgecolor="white", linewidth=0.6)
-    ax.axhspan(low, high, color=canvas.GREY, alpha=0.25, lw=0, label="99 % of correct runs")
-    ax.axhline(n / n_bars, color=canvas.BLACK, linewidth=0.9, label="uniform")
-    ax.set(xlim=(0, 1), ylim=(0, 1.3 * max(high, counts.max())))  # room for the text above every bar
-    ax.legend(frameon=False, fontsize=canvas.SMALL_PT, loc="upper right", ncols=2)
-    ax.set_title(f"{n} {_NEW}, p = {result.insertion_p_value:.2g}", **canvas.TITLE)
+    ax.axhspan(low, high, label="99 % of correct runs", **canvas.BAND)
+    ax.axhline(n / n_bars, color=canvas.BLACK, label="uniform")
+    ax.set(xlim=(0, 1), xlabel=f"{ax.get_xlabel()}; {n} {_NEW}, p = {result.insertion_p_value:.2g}")
+    canvas.legend_above(ax)
     return ax
 
 
@@ -187,20 +145,18 @@ def run_plot(result: NestedResult) -> canvas.AxesGrid:
     peak = float(result.log_likelihood.max())
     below = max(20.0 * (peak - float(result.log_likelihood[int(np.argmax(mass))])), 30.0)
     floor = max(float(result.log_likelihood.min()), peak - below)
-    likelihood.plot(depth, result.log_likelihood, color=canvas.BLUE, linewidth=1.4)
+    likelihood.plot(depth, result.log_likelihood, color=canvas.BLUE)
     likelihood.set_ylim(floor - 0.03 * (peak - floor), peak + 0.05 * (peak - floor))
     canvas.label_axes(likelihood, x="", y="ln likelihood", title=_evidence_text(result))
-    _draw_mass(posterior, depth, mass, linewidth=1.4)
+    _draw_mass(posterior, depth, mass)
     canvas.label_axes(posterior, x="", y="posterior per nat")
-    alive.plot(depth, result.n_at_death, color=canvas.BLUE, linewidth=0.8)
+    alive.plot(depth, result.n_at_death, color=canvas.BLUE)
     alive.set_ylim(0, 1.1 * float(result.n_at_death.max()))
     canvas.label_axes(alive, x="", y="live points")
     error = result.log_z_error
-    evidence.axhspan(
-        result.log_z - error, result.log_z + error, color=canvas.GREY, alpha=0.35, lw=0, label="ln Z ± its error"
-    )
+    evidence.axhspan(result.log_z - error, result.log_z + error, label="ln Z ± its error", **canvas.BAND)
     so_far = np.logaddexp.accumulate(result.log_weight) + result.log_z
-    evidence.plot(depth, so_far, color=canvas.BLUE, linewidth=1.4, label="from the points so far")
+    evidence.plot(depth, so_far, color=canvas.BLUE, label="from the points so far")
     evidence.set_ylim(result.log_z - max(6.0, 4 * error), result.log_z + max(1.0, 2 * error))
     evidence.legend(frameon=False, fontsize=canvas.SMALL_PT, loc="lower right")
     evidence.set_xlim(0, depth[-1])
@@ -209,9 +165,9 @@ def run_plot(result: NestedResult) -> canvas.AxesGrid:
     return axes
 
 
-def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray, *, linewidth: float) -> None:
+def _draw_mass(ax: Axes, depth: FloatArray, mass: FloatArray) -> None:
     ax.fill_between(depth, mass, **canvas.FILLED)
-    ax.plot(depth, mass, color=canvas.BLUE, linewidth=linewidth)
+    ax.plot(depth, mass, color=canvas.BLUE)
     ax.set_ylim(bottom=0)
 
 
@@ -230,16 +186,9 @@ def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | No
 
 
 def _parameter_label(name: str) -> str:
-    """Return a parameter's axis label: its name, its unit in brackets, an index as a subscript."""
+    """Return a parameter's axis label: its name, its unit in brackets."""
     unit = unit_of_name(name)
-    if unit:
-        return f"{words_without_unit(name)} ({unit})"
-    symbol = re.fullmatch(r"([A-Za-z])_(\w+)", name)
-    if symbol:
-        letter, index = symbol.groups()
-        lowered = rf"${letter}_{{{index}}}$" if index.isdigit() else rf"${letter}_\mathrm{{{index}}}$"
-        return f"{lowered} ({_SSF_UNITS[letter]})" if index.isdigit() and letter in _SSF_UNITS else lowered
-    return words_without_unit(name)
+    return words_without_unit(name) + (f" ({unit})" if unit else "")
 
 
 def _depth_and_mass_per_nat(result: NestedResult) -> tuple[FloatArray, FloatArray]:
@@ -279,7 +228,7 @@ def _centres_and_smoothed_density(
 def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
     centres, density = _centres_and_smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
-    ax.plot(centres, density, color=canvas.BLUE, linewidth=1.2)
+    ax.plot(centres, density, color=canvas.BLUE)
     for (low, high), colour in zip(cuts, _SHADES, strict=True):
         ax.fill_between(centres, density, where=list((centres >= low) & (centres <= high)), color=colour, lw=0)
     ax.set_ylim(0, 1.1 * max(float(density.max()), 1e-300))

@@ -1,6 +1,6 @@
 """Residuals of the calibrated and of the repaired model: along covariates, in one scan, by held-out part.
 
-And tests of the noise against white noise: autocorrelation, spread by predicted reading, tails, lost and rounded ones.
+And tests of the noise against white noise: autocorrelation, spread by predicted reading, tails, rounding.
 Residuals and predictions have the shape (n_points,), NaN where there is no usable reading; `unit` is the readings'.
 """
 
@@ -13,20 +13,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray
+from probewise.errors import require
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots import canvas
 from probewise.report.residual_means import ResidualMeans, groups_of_neighbours, rows_by_value
-from probewise.report.words import number_text, number_unsigned_zero
+from probewise.report.words import number_text
 
 _CHANCE = "95 % by chance alone"
 _STYLES = ((canvas.VERMILLION, "o", "-"), (canvas.BLUE, "s", (0, (4, 1.5))))
 _CROWDED = 500  # number of dots from which they are paler
 _MANY = 1500  # number of dots from which they are an image inside the SVG
-_ASIDE = 0.15  # offset of the means before and after from a categorical value's position
-_LEAST_SHADE = 0.008  # least width of a shaded interval, as a share of the axes' width
-_MOST_SHADE = 0.5  # the largest, from which on the rest of the axis is what stands out
+_MOST_LABELS = 24  # of categories on an axis
 _MOST_SCANS = 12
 _RUNNING_MEANS = 20
 _MOST_LAGS = 12
@@ -36,9 +35,7 @@ _SD_95 = 1.96
 _WHITE = "95 % of white noise"
 
 
-def draw_running_mean(
-    ax: Axes, x: FloatArray, y: FloatArray, *, colour: str, line: Any = "-", width: float = 1.6, name: str = ""
-) -> None:
+def draw_running_mean(ax: Axes, x: FloatArray, y: FloatArray, *, colour: str, line: Any = "-", name: str = "") -> None:
     """Draw means of y, (n,), over up to 20 groups of neighbours in x as a curve, named after the model `name`.
 
     Where x has few values, no curve joins them: each has its mean with the 95 % interval of that.
@@ -46,15 +43,11 @@ def draw_running_mean(
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]
     few = rows_by_value(x)
-    groups = groups_of_neighbours(x, max(1, min(_RUNNING_MEANS, len(x) // 4))) if few is None else few
+    groups = few or groups_of_neighbours(x, max(1, min(_RUNNING_MEANS, len(x) // 4)))
     at, means = (np.array([values[g].mean() for g in groups]) for values in (x, y))
-    if few is None:
-        label = f"running mean, {name}" if name else None
-        ax.plot(at, means, color=colour, linewidth=width, linestyle=line, label=label)
-        return
-    half = [_SD_95 * float(y[g].std()) / np.sqrt(g.size) for g in groups]
-    label = f"mean with 95 %, {name}" if name else None
-    ax.errorbar(at, means, yerr=half, fmt="o", color=colour, markersize=4.5, linewidth=width, capsize=3, label=label)
+    half = [_SD_95 * float(y[g].std()) / np.sqrt(g.size) for g in groups] if few else None
+    style = {"fmt": "o", "capsize": 3} if few else {"linestyle": line}
+    ax.errorbar(at, means, yerr=half, color=colour, label=f"means, {name}" if name else None, **style)
 
 
 def mean_residuals_along(
@@ -64,7 +57,7 @@ def mean_residuals_along(
     unit: str,
     each: tuple[FloatArray, FloatArray] | None = None,
     window: tuple[float, float] | None = None,
-    names: Sequence[str] | None = None,
+    names: Sequence[str] = (),
     before: str = "as calibrated",
     after: str = "repaired",
     ax: Axes | None = None,
@@ -72,38 +65,32 @@ def mean_residuals_along(
     """Draw mean residuals against a covariate, the 95 % band of chance, and the interval that is significant.
 
     `each` holds covariate and residual of every reading, (n_points,) each, drawn as dots behind; `window` is the
-    significant interval, shaded unless it takes up most of the axis; `names` are those of the values 0, 1, 2 ... of a
-    categorical covariate; `before` and `after` are the names of the two models.
+    significant interval, shaded; `names` are those of the values 0, 1, 2 ... of a categorical covariate; `before` and
+    `after` are the names of the two models.
     """
-    ax = canvas.axes_or_panel(ax)
+    ax = canvas.axes_or_new(ax)
     if each is not None:
         _draw_dots(ax, *each, canvas.GREY, "one reading")
     ax.axhline(0, **canvas.THIN)
     band: dict[str, Any] = {"color": canvas.GREY, "alpha": 0.3, "label": _CHANCE}
-    if names:
-        ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, **band)
-    elif len(means.at) == 1 or means.by_value:
+    if means.by_value:
         ax.errorbar(means.at, np.zeros(len(means.at)), yerr=means.chance, fmt="none", elinewidth=8, **band)
     else:
-        ax.fill_between(means.at, -means.chance, means.chance, linewidth=0, **band)
-    aside = _ASIDE if names and means.after is not None else 0.0
+        ax.fill_between(means.at, -means.chance, means.chance, **band)
     mean = "mean, " if each is not None else ""
-    drawn = ((means.before, canvas.VERMILLION, "o", before, -aside), (means.after, canvas.BLUE, "s", after, aside))
-    for values, colour, marker, name, step in drawn:
+    line = "none" if means.by_value else "-"
+    for values, (colour, marker, _), name in zip((means.before, means.after), _STYLES, (before, after), strict=True):
         if values is not None:
-            line = marker if means.by_value else f"{marker}-"
-            ax.plot(means.at + step, values, line, color=colour, ms=4.5, lw=1.4, label=f"{mean}{name}")
+            ax.plot(means.at, values, marker=marker, linestyle=line, color=colour, label=f"{mean}{name}")
     if names:
-        _label_x_by_name(ax, names)
+        every = 1 + len(names) // _MOST_LABELS
+        at = np.arange(len(names))[::every]
+        ax.set_xticks(at, [name.replace("_", " ") for name in names[::every]], fontsize=canvas.SMALL_PT, rotation=30)
     if window is not None:
-        low, high = ax.get_xlim()
-        middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
-        if 2 * half < _MOST_SHADE * (high - low):  # nothing stands out where nearly all is shaded
-            ends = (middle - half, middle + half)
-            ax.axvspan(*ends, color=canvas.SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
+        ax.axvspan(*window, color=canvas.SKY, alpha=0.25, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
     y = f"{'mean residual' if averaged else 'residual'} ({unit})"
-    return canvas.finish(ax, x=label, y=y, plain="y" if names else "xy")
+    return canvas.finish(ax, x=label, y=y, plain="y" if names else "both")
 
 
 def scan_with_residuals(
@@ -120,15 +107,13 @@ def scan_with_residuals(
     `along`, `readings` and the predictions of the `models` (name and predictions, the calibrated model first) have the
     shape (n_rows,), NaN where there is no usable reading. Without `joined`, no curve joins the rows.
     """
-    axes = canvas.stack_of_axes([2.5, 2.0])
-    above, below = axes
-    above.plot(along, readings, "o", color=canvas.BLACK, markersize=3, alpha=0.7, label="recorded", zorder=1)
+    above, below = axes = canvas.stack_of_axes([2.5, 2.0])
+    above.plot(along, readings, "o", color=canvas.BLACK, markersize=3, alpha=0.7, label="recorded")
     below.axhline(0, **canvas.THIN)
     for (name, predicted), (colour, marker, line) in zip(models, _STYLES, strict=False):
-        style = {"color": colour, "marker": marker, "markersize": 3.2, "alpha": 0.8, "linestyle": "none"}
-        curve = {"color": colour, "linewidth": 1.6, "linestyle": line}
-        above.plot(along, predicted, label=f"predicted, {name}", **curve if joined else {**style, "markersize": 6.0})
-        below.plot(along, readings - predicted, label=f"residual, {name}", **{**style, "alpha": 0.5})
+        style = {"linestyle": line} if joined else {"linestyle": "none", "marker": marker}
+        above.plot(along, predicted, color=colour, label=f"predicted, {name}", **style)
+        below.plot(along, readings - predicted, marker, color=colour, ms=3, alpha=0.5, label=f"residual, {name}")
         if joined:
             draw_running_mean(below, along, readings - predicted, colour=colour, line=line)
     below.sharex(above)
@@ -140,13 +125,11 @@ def scan_with_residuals(
 def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     """Draw usable readings by reading number, for recordings too short for any other figure."""
     require_recording(recording)
-    ax = canvas.axes_or_panel(ax)
+    ax = canvas.axes_or_new(ax)
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=canvas.BLUE, markersize=5)
-    canvas.label_axes(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
-    canvas.set_plain_tick_labels(ax)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return ax
+    return canvas.finish(ax, x="reading number", y=f"reading ({recording.plan.instrumentation.unit_after_number})")
 
 
 def residuals_against_covariates(
@@ -161,7 +144,7 @@ def residuals_against_covariates(
         ax.axhline(0, **canvas.THIN)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
             _draw_dots(ax, at, residuals, colour, "")
-            draw_running_mean(ax, at, residuals, colour=colour, line=line, width=2.0, name=name)
+            draw_running_mean(ax, at, residuals, colour=colour, line=line, name=name)
         canvas.finish(ax, x=label, y=f"residual ({unit})")
     return axes
 
@@ -177,12 +160,12 @@ def heldout_gain_by_scan(
     ranked = sorted(scans, key=lambda pair: -pair[1])
     if len(ranked) > _MOST_SCANS:
         ranked = [*ranked[: _MOST_SCANS // 2], *ranked[-_MOST_SCANS // 2 :]]
-    ax = canvas.axes_or_panel(ax, height_in=1.0 + 0.28 * max(len(ranked), 3))
+    ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, 1.0 + 0.28 * max(len(ranked), 3)))
     gains = np.array([gain for _, gain in ranked])
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[canvas.BLUE if gain >= 0 else canvas.VERMILLION for gain in gains])
     ax.axvspan(mean - sd, mean + sd, zorder=0, **canvas.BAND)
-    total = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number_text(sd, 3)} nats per reading"
+    total = f"all {part}s: {number_text(mean, 3)} ± {number_text(sd, 3)} nats per reading"
     ax.axvline(mean, color=canvas.GREY, linewidth=1.4, label=total)
     ax.axvline(0, **canvas.THIN)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
@@ -197,13 +180,14 @@ def recorded_against_predicted(
 
     `label` and `unit` are those of the readings.
     """
-    ax = canvas.axes_or_panel(ax, height_in=4.2)
     there = np.isfinite(readings)
+    require(there.any(), "readings", readings, "one reading or more")
+    ax = canvas.axes_or_new(ax, size_in=(canvas.PANEL_IN, 4.2))
     x, y = predicted[there], readings[there]
     ax.errorbar(x, y, yerr=sd[there], fmt="o", ms=3, lw=0.8, color=canvas.BLUE, alpha=0.6, label="readings, ± 1 sd")
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     ax.plot(ends, ends, color=canvas.BLACK, lw=0.9, label="as predicted")
-    return canvas.finish(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})", plain="")
+    return canvas.finish(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})", plain=None)
 
 
 def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
@@ -214,17 +198,6 @@ def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) 
     ax.scatter(x[ok], y[ok], size, color=colour, alpha=alpha, linewidth=0, label=label or None, rasterized=n > _MANY)
 
 
-def _label_x_by_name(ax: Axes, names: Sequence[str]) -> None:
-    """Label the positions 0, 1, 2 ... of the x axis by name; slanted and thinned where names do not fit."""
-    width_in = canvas.figure_of(ax).get_figwidth()
-    fits = sum(len(name) + 2 for name in names) < 12 * width_in
-    skip = max(1, round(len(names) / (4 * width_in)))
-    slant: dict[str, Any] = {} if fits else {"rotation": 35, "ha": "right", "rotation_mode": "anchor"}
-    at = np.arange(len(names))
-    ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize=canvas.SMALL_PT, **slant)
-    ax.set_xlim(-0.6, len(names) - 0.4)
-
-
 def residual_autocorrelation(
     residuals: FloatArray, scan: IntArray, *, rho: float | None = None, ax: Axes | None = None
 ) -> Axes:
@@ -232,7 +205,7 @@ def residual_autocorrelation(
 
     `scan` holds scan numbers, (n_points,). Powers of `rho`, the estimated correlation of neighbours, are drawn too.
     """
-    ax = canvas.axes_or_panel(ax)
+    ax = canvas.axes_or_new(ax)
     lags = np.arange(1, min(_MOST_LAGS, max(len(residuals) // 4, 1)) + 1)
     variance = float(np.nanmean(residuals**2)) or 1.0
     correlation, chance = np.full(len(lags), np.nan), np.full(len(lags), np.nan)
@@ -263,7 +236,7 @@ def spread_by_level(
 
     `model_sd`, (n_points,), is the noise sd of each reading under the noise model, which is drawn too.
     """
-    ax = canvas.axes_or_panel(ax)
+    ax = canvas.axes_or_new(ax)
     ok = np.flatnonzero(np.isfinite(residuals) & np.isfinite(predicted))
     parts = [ok[group] for group in groups_of_neighbours(predicted[ok], max(1, min(_STEPS, len(ok) // 8)))]
     at = np.array([predicted[p].mean() for p in parts])
@@ -283,7 +256,7 @@ def spread_by_level(
 
 def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
     """Draw a histogram of residuals in noise sds (`sd`, tails left out) on a log scale, with a normal distribution."""
-    ax = canvas.axes_or_panel(ax)
+    ax = canvas.axes_or_new(ax)
     z = residuals[np.isfinite(residuals)] / sd
     most = float(np.clip(np.abs(z).max(initial=4.0), 4.0, 30.0))
     edges = np.arange(-np.ceil(most), np.ceil(most) + 0.25, 0.5)
@@ -297,20 +270,9 @@ def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = No
     return canvas.finish(ax, x="residual (sds of the noise)", y="readings per half sd", plain="x")
 
 
-def lost_readings_against_predicted(
-    predicted: FloatArray, readings: FloatArray, lost: BoolArray, *, unit: str, ax: Axes | None = None
-) -> Axes:
-    """Draw recorded against predicted readings, (n_points,) each; those where the mask `lost` is True are marked."""
-    ax = canvas.axes_or_panel(ax)
-    ax.plot(predicted[~lost], readings[~lost], "o", color=canvas.GREY, markersize=3, label="reading")
-    ax.plot(predicted[lost], readings[lost], "X", color=canvas.VERMILLION, markersize=7, label="lost reading")
-    ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, **canvas.THIN)
-    return canvas.finish(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
-
-
 def readings_modulo_step(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
     """Draw a histogram of readings' distances from the nearest multiple of `step`; rounded ones share one bin."""
-    ax = canvas.axes_or_panel(ax)
+    ax = canvas.axes_or_new(ax)
     finite = readings[np.isfinite(readings)]
     counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, _BINS, (-0.5, 0.5))
     ax.bar((edges[:-1] + edges[1:]) / 2, counts, 0.9 / _BINS, color=canvas.VERMILLION, label="readings")

@@ -15,7 +15,6 @@ from probewise._arrays import FloatArray
 from probewise._words import count_with_noun
 from probewise.report.plots import canvas
 
-_LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
 _NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
 _CARD_YELLOW = "#ffd54a"
 _OUTLINE_BLUE = "#3fa7ff"  # likewise; hypotheses are blue, as in the paper
@@ -38,7 +37,6 @@ def playing_field(
     cards_mm: Sequence[FloatArray] = (),
     title: str = "",
     utility_label: str = "entropy (bits)",
-    lego_scale: bool = False,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the field with the utility map, hypotheses and readings (paper, figures of the entropy map).
@@ -57,13 +55,9 @@ def playing_field(
         Reading of black and of white, for the brightness of the squares.
     cards_mm
         Corners of each card whose place and albedo are known, (4, 2).
-    lego_scale
-        Whether to add the paper's coordinates, LEGO distance units, at the top.
     """
     ax = canvas.axes_or_new(ax, size_in=(8.2, 5.2))
-    top = float(np.nanmax(utility))
-    if top <= _NOTHING:
-        top = 1.0  # a scale of nothing would have a power of ten
+    top = max(float(np.nanmax(utility)), _NOTHING)
     for earlier in (*ax.collections, *ax.lines, *ax.patches):  # of a frame before; its map and colour bar are kept
         earlier.remove()
     if ax.images:
@@ -103,14 +97,8 @@ def playing_field(
         ax.scatter(*next_mm, s=52, marker="s", **style)
     left, right, low, high = ax.images[0].get_extent()
     ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
-    if lego_scale:
-        lego = ax.secondary_xaxis(
-            "top", functions=(lambda mm: np.divide(mm, _LEGO_UNIT_MM), lambda units: np.multiply(units, _LEGO_UNIT_MM))
-        )
-        lego.set_xlabel("LEGO distance units (8 mm)", fontsize=canvas.SMALL_PT)
-        lego.tick_params(labelsize=canvas.SMALL_PT)
     if title:
-        ax.set_title(title, **canvas.TITLE | ({"y": None} if lego_scale else {}))  # above the scale
+        ax.set_title(title, **canvas.TITLE)
     return ax
 
 
@@ -128,22 +116,14 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     for k, (name, sd) in enumerate(widths_mm.items()):
         label = f"{name}: {count_with_noun(len(sd), 'reading')}"
         ax.plot(np.arange(1, len(sd) + 1), sd, label=label, **_dots_and_line(k))
+    set_up_width_axes(ax, target_mm)
     canvas.legend_above(ax)
-    return set_up_width_axes(ax, target_mm)
+    return ax
 
 
 def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
     """Label axes of posterior sds (log scale, mm) by number of readings, draw the target's line; return the axes."""
-    ax.axhline(target_mm, color=canvas.BLACK, linewidth=0.9, linestyle="--")
-    ax.annotate(
-        f"{target_mm:g} mm,\ntarget",
-        (1.0, target_mm),
-        xycoords=("axes fraction", "data"),
-        xytext=(4, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=canvas.SMALL_PT,
-    )
+    ax.axhline(target_mm, color=canvas.BLACK, linestyle="--", label=f"target: {target_mm:g} mm")
     ax.set_yscale("log")
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
@@ -160,7 +140,7 @@ def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None
         label = f"{name}: {per_reading:.2f} bits per reading"
         ax.plot(np.arange(len(gained) + 1), np.r_[0.0, gained], label=label, **_dots_and_line(k))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return canvas.finish(ax, x="number of readings", y="information about the shape (bits)", plain="")
+    return canvas.finish(ax, x="number of readings", y="information about the shape (bits)", plain=None)
 
 
 def _dots_and_line(k: int) -> dict[str, Any]:

@@ -18,8 +18,7 @@ from matplotlib.patches import Rectangle
 
 from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
-from probewise.report.plots.apparatus import draw_sensor_face
-from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
+from probewise.report.plots.canvas import BLACK, VERMILLION, draw_map
 from probewise.report.sheets import (
     BOTTOM_MM,
     LEFT_MM,
@@ -28,7 +27,6 @@ from probewise.report.sheets import (
     Sheet,
     Tile,
     lines_of_crosses,
-    points_of_lines,
     tiles_of,
 )
 from probewise.scene import region_of
@@ -39,8 +37,8 @@ _SHEETS_PER_COVER = 5
 _PIXEL_MM = 0.25  # pixel size for patterns that have no outline
 _ROUND = np.linspace(0.0, 2 * np.pi, 721)[:-1]
 _SMALL, _USUAL, _LARGE = 7.5, 9.0, 14.0
-_THUMB_MM = 38.0
-_LETTER_MM, _COVER_LETTERS = 1.6, 66  # of small print; letters on a line beside an overview
+_LETTER_MM, _COVER_LETTERS = 1.6, 90  # of small print; letters on a line of a cover
+_APART_MM = 25.0  # from an origin, whose text would touch another
 
 _PRINT = ("Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",)
 _GLUE = (
@@ -54,7 +52,6 @@ _LAY = (
     "anticlockwise.",
 )
 _PLACES = ("Numbers are mm from the origin that each sheet names, x to the right, y up.",)
-_LABEL_MM = 15.0  # half the length of the text on a glue strip
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
@@ -91,62 +88,25 @@ def _new_page_axes(page_mm: tuple[float, float]) -> Axes:
 def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
     page = PAPERS_MM[paper]
     ax = _new_page_axes(page)
-    top = page[1] - 18.0
-    ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
-    instructions = list(_PRINT)
-    if any(len(tiles) > 1 for (_, tiles), _ in batch):
-        instructions += _GLUE
-    instructions += _LAY if any(sheet.is_pattern for (sheet, _), _ in batch) else _PLACES
-    for k, line in enumerate(instructions):
-        ax.text(LEFT_MM, top - 8.0 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
-    y = top - 8.0 - 4.6 * len(instructions) - 4.0
+    lines = [*_PRINT, *(_GLUE if any(len(tiles) > 1 for (_, tiles), _ in batch) else ())]
+    lines += _LAY if any(sheet.is_pattern for (sheet, _), _ in batch) else _PLACES
     for (sheet, tiles), first in batch:
-        _draw_thumbnail(ax, sheet, tiles, (LEFT_MM, y - _THUMB_MM))
-        x = LEFT_MM + 72.0
-        last = first + len(tiles) - 1
-        pages, grid = f"page {first}", []
-        if len(tiles) > 1:
+        (width, height), last = sheet.size_mm, first + len(tiles) - 1
+        pages = f"page {first}"
+        if last > first:
             columns, rows = (1 + max(getattr(tile, name) for tile in tiles) for name in ("column", "row"))
-            pages = f"pages {first} to {last}"
-            grid = [f"{columns} side by side, {rows} one above the other, from the lower left"]
-            grid += ["blank ones are left out"] if len(tiles) < columns * rows else []
-        width, height = sheet.size_mm
+            pages = f"pages {first} to {last}, {columns} side by side, {rows} one above the other, from the lower left"
+            pages += "; blank ones are left out" if len(tiles) < columns * rows else ""
         said = [line for text in sheet.lines for line in textwrap.wrap(text, _COVER_LETTERS)]
-        lines = [f"{width:g} x {height:g} mm; {pages}", *grid, *said, f"origin: {sheet.frame}"]
+        lines += ["", sheet.name, f"{width:g} x {height:g} mm; {pages}", *said, f"origin: {sheet.frame}"]
         if sheet.orientations_rad:
             turns = ", ".join(f"{np.degrees(turn):.4g}" for turn in sheet.orientations_rad)
             lines.append(f"the sensor stands at {turns} degrees")
-        ax.text(x, y - 5.0, sheet.name, fontsize=11, fontweight="bold", va="baseline")
-        for k, line in enumerate(lines):
-            ax.text(x, y - 10.5 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
-        y -= max(_THUMB_MM, 10.5 + 4.6 * len(lines)) + 6.0
+    ax.text(LEFT_MM, page[1] - 18.0, title, fontsize=_LARGE)
+    ax.text(LEFT_MM, page[1] - 26.0, "\n".join(lines), fontsize=_USUAL, va="top", linespacing=1.4)
     _draw_ruler(ax, LEFT_MM, 11.0)
     ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
     return ax.figure  # type: ignore[return-value]
-
-
-def _draw_thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float, float]) -> None:
-    """Draw a small overview of a sheet: its pages, its origin, and the sensor at orientation 0."""
-    width, height = sheet.size_mm
-    scale = min(66.0 / width, (_THUMB_MM - 2.0) / height)
-    low = np.array(sheet.low_mm)
-
-    def to_thumbnail_mm(points: FloatArray) -> FloatArray:
-        return np.asarray((np.asarray(points) - low) * scale + np.array(at_mm))
-
-    frame = Rectangle(at_mm, width * scale, height * scale, fc="none", ec=GREY, lw=0.6, zorder=4)
-    clip = ax.add_patch(Rectangle(at_mm, width * scale, height * scale, fc="none", ec="none"))
-    _draw_sheet_part(ax, sheet, sheet.low_mm, sheet.high_mm, to_thumbnail_mm, clip, named=False)
-    ax.add_patch(frame)
-    for tile in tiles:
-        corner = to_thumbnail_mm(np.array(tile.low_mm))
-        size = (np.array(tile.high_mm) - tile.low_mm) * scale
-        ax.add_patch(Rectangle(tuple(corner), *size, fc="none", ec=GREY, lw=0.4, ls=(0, (3, 2)), zorder=4))
-    if (low <= 0).all() and (np.array(sheet.high_mm) >= 0).all():
-        x, y = to_thumbnail_mm(np.zeros(2))
-        if sheet.orientations_rad:
-            draw_sensor_face(ax, center=(x, y), size=8.0, zorder=5)
-        ax.plot(x, y, marker="+", ms=7, mew=1.2, color=VERMILLION, zorder=7, clip_on=False)
 
 
 def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
@@ -156,60 +116,35 @@ def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, numb
     far = near + (high - low)
     clip = ax.add_patch(Rectangle((LEFT_MM, BOTTOM_MM), *(high - low + beyond), fc="none", ec="none"))
     _draw_sheet_part(ax, sheet, tuple(low), tuple(high + beyond), tile.on_page_mm, clip)
-    line: dict[str, Any] = {"color": BLACK, "lw": 0.4, "solid_capstyle": "butt"}
-    said: dict[str, Any] = {"fontsize": _SMALL, "va": "center", "ha": "center"}
 
-    def draw_marks(axis: int, at: float, gap: float, style: dict[str, Any]) -> None:
-        """Draw the marks of a place along x (axis 0) or y in both margins."""
+    def mark(axis: int, at: float, text: str, gap: float = 1.0, **style: Any) -> None:
+        """Mark a place along x (axis 0) or y in both margins, and write a text beside the mark before the sheet."""
         begin, end, (before, after) = near[1 - axis], (far + beyond)[1 - axis], ((4.0, 4.0), (8.0, 5.0))[axis]
         for ends in ([begin - before, begin - gap], [end + gap, end + after]):
-            ax.plot(*(([at, at], ends) if axis == 0 else (ends, [at, at])), **style)
-
-    def write(axis: int, at: float, text: str, **style: Any) -> None:
-        """Write a text beside the mark of a place."""
+            places = ([at, at], ends) if axis == 0 else (ends, [at, at])
+            ax.plot(*places, **{"color": BLACK, "lw": 0.4, "solid_capstyle": "butt", **style})
         x, y = (at, near[1] - 6.0) if axis == 0 else (near[0] - 10.0, at)
-        ax.text(x, y, text, rotation=90 * axis, **{**said, **style})
+        ax.text(x, y, text, rotation=90 * axis, fontsize=_SMALL, va="center", ha="center")
 
-    for axis in (1, 0):
-        for at in (near[axis], far[axis]):
-            draw_marks(axis, at, 1.0, line)
     for axis, name in enumerate("xy"):
-        # Away from the corner, where both are written.
-        for at, value, aside in (
-            (near[axis], low[axis], ("left", "bottom")),
-            (far[axis], high[axis], ("right", "top")),
-        ):
-            if abs(value) > 25 or value == 0:  # else two texts would touch
-                write(axis, at, f"{name} = {value:.4g} mm", **{("ha", "va")[axis]: aside[axis]})
-    for axis, name in enumerate("xy"):
-        if low[axis] < 0 < high[axis]:
-            draw_marks(axis, near[axis] - low[axis], 0.5, line | {"lw": 1.2, "color": VERMILLION})
-            write(axis, near[axis] - low[axis], f"{name} = 0", color=VERMILLION)
+        for at, value in ((near[axis], low[axis]), (far[axis], high[axis])):
+            mark(axis, at, f"{value:.4g} mm" if abs(value) > _APART_MM else "")  # else two texts would touch
+        if low[axis] <= 0 <= high[axis]:
+            mark(axis, near[axis] - low[axis], f"{name} = 0", gap=0.5, lw=1.2, color=VERMILLION)
     _draw_ruler(ax, LEFT_MM, 6.5)
     place = f", {number}, column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
     title = f"{sheet.name}{place}: {sheet.lines[0]}"
     ax.text(LEFT_MM + 3.0, tile.page_mm[1] - 6.0, title, fontsize=_USUAL, va="center")
     ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
-    _label_glue_strips(ax, sheet, tiles, tile, first)
-    return ax.figure  # type: ignore[return-value]
-
-
-def _label_glue_strips(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
-    """Print on each glue strip, where the sheet's lines leave room, the number of the page to be glued on it."""
-    number = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
-    (left, bottom), (right, top) = tile.on_page_mm(np.array([tile.low_mm, tile.high_mm])).tolist()
-    upright = ((tile.column + 1, tile.row), (right + OVERLAP_MM / 2, bottom), (right + OVERLAP_MM / 2, top))
-    level = ((tile.column, tile.row + 1), (left, top + OVERLAP_MM / 2), (right, top + OVERLAP_MM / 2))
+    numbers = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
     white = {"boxstyle": "square,pad=0.2", "fc": "white", "ec": "none"}  # legible on black
-    text: dict[str, Any] = {"fontsize": _SMALL, "ha": "center", "va": "center", "bbox": white, "zorder": 5}
-    lines = tile.on_page_mm(points_of_lines(sheet))
-    for neighbour, start, end in (upright, level):
-        if neighbour in number:
-            turned = start[0] == end[0]
-            half = np.array([OVERLAP_MM / 2, _LABEL_MM] if turned else [_LABEL_MM, OVERLAP_MM / 2])
-            places = [np.array(start) + share * np.subtract(end, start) for share in (0.5, 0.3, 0.7, 0.15, 0.85)]
-            x, y = min(places, key=lambda place: int((np.abs(lines - place) < half).all(axis=1).sum()))
-            ax.text(x, y, f"page {number[neighbour]} lies here", rotation=90.0 if turned else 0.0, **text)
+    for axis, there in enumerate(((tile.column + 1, tile.row), (tile.column, tile.row + 1))):
+        if there in numbers:  # on the strip that the neighbour covers
+            x, y = (near + far) / 2
+            x, y = (far[0] + OVERLAP_MM / 2, y) if axis == 0 else (x, far[1] + OVERLAP_MM / 2)
+            style: dict[str, Any] = {"fontsize": _SMALL, "ha": "center", "va": "center", "bbox": white, "zorder": 5}
+            ax.text(x, y, f"page {numbers[there]} lies here", rotation=90 * (1 - axis), **style)
+    return ax.figure  # type: ignore[return-value]
 
 
 def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
@@ -220,13 +155,10 @@ def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
     ax.text(x_mm + _RULER_MM + 3.0, y_mm + 1.0, "100 mm", fontsize=_SMALL, va="center")
 
 
-def _draw_sheet_part(
-    ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True
-) -> None:
+def _draw_sheet_part(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any) -> None:
     """Draw the part of a sheet between two corners: pattern, lines, crosses and texts.
 
-    `place` maps points, (n, 2), from the sheet to the page; nothing is drawn beyond the patch `clip`; without `named`,
-    crosses have their numbers only.
+    `place` maps points, (n, 2), from the sheet to the page; nothing is drawn beyond the patch `clip`.
     """
     for corners, albedo in _outlines_with_albedo(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))
@@ -234,28 +166,18 @@ def _draw_sheet_part(
         patch.set_clip_path(clip)
     if not isinstance(sheet.pattern, Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes):
         _draw_raster(ax, sheet.pattern, low_mm, high_mm, place)
-    if sheet.outline_mm is not None:
-        line = ax.add_patch(Outline(place(sheet.outline_mm), closed=True, fc="none", ec=BLACK, lw=0.4, zorder=2))
-        line.set_clip_path(clip)
-    for line in lines_of_crosses(sheet):
-        (drawn,) = ax.plot(*place(line).T, color=BLACK, lw=0.35, solid_capstyle="butt", zorder=2)
+    outline = [] if sheet.outline_mm is None else [np.concatenate([sheet.outline_mm, sheet.outline_mm[:1]])]
+    for line in (*outline, *lines_of_crosses(sheet), *sheet.strokes_mm):
+        (drawn,) = ax.plot(*place(line).T, color=BLACK, lw=0.4, solid_capstyle="butt", zorder=2)
         drawn.set_clip_path(clip)
-    for k, mark in enumerate([] if sheet.crosses_mm is None else sheet.crosses_mm):
-        (x, y), (left, _), (right, _) = place(np.array([mark + 10.0, mark - 10.0, high_mm])).tolist()
-        if (low_mm[0] <= mark[0] < high_mm[0]) and (low_mm[1] <= mark[1] < high_mm[1]):
-            name = sheet.cross_names[k] if sheet.cross_names else f"{k + 1}: ({mark[0]:g}, {mark[1]:g})"
-            if not named:
-                name = "" if sheet.cross_names else f"{k + 1}"
-            fits = x + _LETTER_MM * len(name) < right
-            written = ax.text(x if fits else left, y, name, ha="left" if fits else "right", fontsize=_SMALL, zorder=2)
-            written.set_clip_path(clip)
-    for stroke in sheet.strokes_mm:
-        (drawn,) = ax.plot(*place(stroke).T, color=BLACK, lw=0.5, solid_capstyle="butt", zorder=2)
-        drawn.set_clip_path(clip)
-    for x, y, words in sheet.words if named else ():
+    crosses = [] if sheet.crosses_mm is None else sheet.crosses_mm.tolist()
+    names = sheet.cross_names or [f"{k}: ({x:g}, {y:g})" for k, (x, y) in enumerate(crosses, start=1)]
+    beside = [(x + 10.0, y + 10.0, name) for (x, y), name in zip(crosses, names, strict=True)]
+    for x, y, words in (*beside, *sheet.words):
         if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
             at_x, at_y = place(np.array([[x, y]]))[0].tolist()
-            written = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, clip_on=True)
+            fits = at_x + _LETTER_MM * len(words) < place(np.array([high_mm]))[0, 0]
+            written = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, ha="left" if fits else "right")
             written.set_clip_path(clip)
 
 
@@ -307,17 +229,5 @@ def _draw_raster(ax: Axes, pattern: Pattern, low_mm: Any, high_mm: Any, place: A
     x = low_mm[0] + (np.arange(n_x) + 0.5) * (high_mm[0] - low_mm[0]) / n_x
     y = low_mm[1] + (np.arange(n_y) + 0.5) * (high_mm[1] - low_mm[1]) / n_y
     shades = region_of(pattern).albedo(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))[0].reshape(n_y, n_x)
-    (left, bottom), (right, top) = place(np.array([low_mm, high_mm], dtype=np.float64))
-    ax.imshow(
-        np.clip(shades, 0.0, 1.0),
-        cmap="gray",
-        vmin=0.0,
-        vmax=1.0,
-        origin="lower",
-        extent=(left, right, bottom, top),
-        interpolation="none",
-        aspect="auto",
-        zorder=1,
-    )
-    page = ax.figure.get_size_inches() * _MM_PER_IN  # type: ignore[union-attr]
-    ax.set(xlim=(0.0, page[0]), ylim=(0.0, page[1]))
+    off_x, off_y = place(np.zeros((1, 2)))[0]
+    draw_map(ax, shades, x + off_x, y + off_y, cmap="gray", vmin=0.0, vmax=1.0, aspect="auto", zorder=1)

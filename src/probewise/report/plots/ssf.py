@@ -60,7 +60,8 @@ def ssf_by_n_gaussians(
     for ax, n in zip(drawn, orders, strict=True):
         name = count_with_noun(n, "Gaussian") + (", most probable" if n == best and len(orders) > 1 else "")
         spatial_sensitivity(fields[n], ax=ax, title=f"{name}\nln Z = {value_with_error(log_z[n], log_z_error[n])}")
-    canvas.hide_unused(axes, len(orders))
+    for ax in list(axes.flat)[len(orders) :]:
+        ax.set_visible(False)
     widest = max(ax.get_xlim()[1] for ax in drawn)
     for ax in drawn:
         _set_half_width(ax, widest)

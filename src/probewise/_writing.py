@@ -28,6 +28,7 @@ from probewise.progress import Progress, silent
 PAGE = "report.html"
 _STAGED, _COMPLETE = ".probewise-writing", ".probewise-complete"  # no person's folder has such a name
 _OUTDATED = ".outdated"  # ends the name of an empty file: the file of that name without it is to be removed
+_KEPT = "_kept"  # ends the name, without its ending, of a person's file that a result would have replaced
 _MOST_FAILED = 3  # drawings that a message names
 _MAIN_FILES = {
     "diagnosis.json": "a diagnosis", "fit.json": "a fit", "audit.json": "an audit", "result.json": "a search",
@@ -237,8 +238,8 @@ def staged_output(
     """Yield an empty directory; move its files into `out`, made if missing, only if the block succeeds.
 
     If the file `main` is in `out`, or for None, other files there are of an earlier run: they are replaced, and removed
-    if they are to be `drawn` later or have one of the patterns `outdated`. Without it they are a person's: one that
-    results or drawings would replace gets another name, as does one of the `inputs` of this run. FileError if `out`
+    if they are to be `drawn` later or have one of the patterns `outdated`. Without it they are a person's: such a file
+    gets another name, as does one of the `inputs` of this run that a result would replace. FileError if `out`
     cannot be made or written to, another process writes there for too long, a directory has the name of a result, or a
     symbolic link that of a directory.
     """
@@ -276,15 +277,15 @@ def _complete(
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another folder, or none there")
     replaced = [out / name for name in names if os.path.realpath(out / name) in inputs]
-    outdated = [*outdated, *map(glob.escape, drawn)]
+    earlier = [path for pattern in (*outdated, *map(glob.escape, drawn)) for path in out.glob(pattern)]
     if main is not None and not (main and (out / main).exists()):
         folder = os.path.realpath(out)  # behind a link lies nothing that a result could destroy
-        standing = (name for name in (*names, *drawn) if os.path.realpath(out / name) == os.path.join(folder, name))
-        persons = [name for name in standing if (out / name).is_file() and os.path.join(folder, name) not in inputs]
-        replaced += [out / name for name in persons]
-        outdated = [glob.escape(name) for name in persons]
+        standing = dict.fromkeys([*(out / name for name in names), *earlier])
+        plain = [path for path in standing if os.path.realpath(path) == os.path.join(folder, path.relative_to(out))]
+        earlier = [path for path in plain if path.is_file() and os.path.realpath(path) not in inputs]
+        replaced += earlier
     stage.replaces = any(os.path.lexists(out / name) for name in names if out / name not in replaced)
-    for ending in itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2))):
+    for ending in itertools.chain([_KEPT], (f"{_KEPT}_{k}" for k in itertools.count(2))):
         stage.kept = {path: path.with_stem(path.stem + ending) for path in replaced}
         if not any(os.path.lexists(path) for path in stage.kept.values()):
             break
@@ -292,9 +293,9 @@ def _complete(
         name = new.relative_to(out).as_posix()
         stage.write(name, path.read_bytes())
         shutil.copystat(path, stage / name)
-    for path in itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated):
-        name = path.relative_to(out).as_posix()
-        if os.path.realpath(path) not in inputs and name not in names and not path.is_dir():
+    for path in earlier:
+        name, is_persons = path.relative_to(out).as_posix(), _KEPT in path.stem
+        if os.path.realpath(path) not in inputs and not (name in names or is_persons or path.is_dir()):
             _require_ordinary(path.parents[: name.count("/")])
             mark = stage / (name + _OUTDATED)
             mark.parent.mkdir(exist_ok=True)

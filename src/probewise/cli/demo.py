@@ -8,7 +8,7 @@ import time
 from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from probewise.diagnosis import Diagnosis, generators_of_diagnosis
 from probewise.experiment import (
     Exploration,
     HiddenShape,
-    Model,
+    ModelName,
     arm_over,
     experiment_for,
     run_from_place,
@@ -34,11 +34,8 @@ from probewise.scene import Circle, Field, outlines
 from probewise.world import saturation
 from probewise.world.shipped import true_world as world_behind
 
-if TYPE_CHECKING:
-    pass
-
 DIAGNOSIS = "diagnosis"  # folder of the second recording's diagnosis
-_MODELS: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
+_MODELS: dict[ModelName, str] = {"naive": "naive", "ssf": "SSF"}
 _TRUSTS = {"trusting": 1.0, "doubting": 0.9}
 N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
 N_LIVE_ROBOT = 100

@@ -196,7 +196,7 @@ def _device_names(files: Sequence[Path]) -> list[str]:
     ]
     twice = next((name for name in names if names.count(name) > 1), None)
     require(twice is None, "recordings", twice, "files of different names, which name their folders")
-    taken = next((name for name in names if name in (".", "..", *_OF_ALL)), None)
+    taken = next((name for name in names if name in _OF_ALL or name.startswith(".")), None)
     require(taken is None, "recordings", taken, "another name of that file, which names its folder")
     return names
 

@@ -48,7 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
     if journal.exists() and not arguments.resume:
         raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
-    written_as_it_goes = (out / name for name in ("frames", *["live.html"] * arguments.live))
+    shipped_sensor = [_SHIPPED] * (arguments.sensor is None)
+    written_as_it_goes = (out / name for name in ("frames", *["live.html"] * arguments.live, *shipped_sensor))
     for path in written_as_it_goes if not arguments.resume and not (out / "result.json").exists() else ():
         if path.exists():
             raise FileError(path, "it exists already, and no search is in that folder", "another --out, or none there")
@@ -364,7 +365,15 @@ def remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
     Without a result.json there are none, but perhaps somebody's calibration or files of such names.
     """
     spared = {os.path.realpath(path) for path in files}
-    names = ("report.html", "run.gif", "live.html", "frames/[0-9]*.png", "samples.csv", "sensor.json", "result.json")
+    names = (
+        "report.html",
+        "run.gif",
+        "live.html",
+        "frames/[0-9][0-9][0-9].png",
+        "samples.csv",
+        "sensor.json",
+        "result.json",
+    )
     for pattern in names if (out / "result.json").exists() else ():
         for path in out.glob(pattern):
             if os.path.realpath(path) not in spared:

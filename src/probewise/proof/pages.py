@@ -468,7 +468,7 @@ def challenge_page(
             "intervals.",
         )
         sections.append(_how_it_was_made(command))
-        return page("How good a diagnosis is", answer=sentence, key_figure=honest, sections=sections, terms_in=honest)
+        return page("How good a diagnosis is", answer=sentence, key_figure=honest, sections=sections, with_terms=True)
 
     return CampaignPage(challenge_csv(rows), html, sentence)
 

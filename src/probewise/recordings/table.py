@@ -296,8 +296,8 @@ def read_table(
     progress(f"reading {path.name}", len(rows), len(rows))
     if not header:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
-    for row, cells in enumerate(layout.units, layout.at + 2):
-        unit = dict(zip(header, cells, strict=False)).get(time or "", "").strip("[(]) ")
+    for row, units in enumerate(layout.units, layout.at + 2):
+        unit = dict(zip(header, units, strict=False)).get(time or "", "").strip("[(]) ")
         if is_other_unit_of_time(unit, time_unit):
             raise FileError(path, shown(unit), f'times in {time_unit}, or time_unit = "{unit}"', row=row, column=time)
     notes = layout.notes()

@@ -240,9 +240,9 @@ def test_a_table_of_which_no_row_has_what_it_needs_is_refused():
         predicted(model, _with_missing_power(table, 0))
 
 
-@pytest.mark.parametrize("name", ["drifting_noise.growth", "lag.smooth"])
+@pytest.mark.parametrize("name", ["drifting_noise.growth", "lag.shape"])
 def test_an_effect_or_a_parameter_that_no_model_keeps_is_refused(name):
-    """Noise that changes in time is a nuisance of the search; a lag was smooth in an earlier version."""
+    """Noise that changes in time is a nuisance of the search; a lag has no shape."""
     model = fitted(("lag",))  # a model that keeps its recording
     model = dataclasses.replace(
         model,

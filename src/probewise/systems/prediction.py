@@ -389,7 +389,9 @@ def _chain_samples_and_whether_drawn(
     fixed = {f"{form.name}.{name}" for form in chain.effects for name in getattr(form, "fixed", ())}
     out = np.empty((n, len(chain.names)))
     of_effects = [name for name in at if any(name.startswith(f"{own}.") for own in fitted.effects)]
-    lost = next((name for name in of_effects if name not in chain.names), None)  # of a model of an earlier version
+    # Of a model of an earlier version; a variant that it did not take, 0 to 1e-9, changes nothing.
+    unknown = (name for name in of_effects if name not in chain.names)
+    lost = next((name for name in unknown if np.abs(fitted.samples[:, at[name]]).max() > 1e-6), None)
     require(lost is None, "names", lost, "a parameter that this version knows; diagnose again with it")
     for k, name in enumerate(chain.names):
         if name in at:

@@ -28,15 +28,59 @@ from probewise.systems.forms.reference import (
     Clipping,
     Form,
     ReferenceFit,
+    flag,
+    prior_sizes,
     switch_points,
 )
 from probewise.systems.table import RunTable, covariate_of_column
 
+_SMOOTH = "smooth"  # name of the parameter that is 0 for the first variant, and 1 for the smooth one
+_ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what matters
+_APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
 _VISIBLE = 4.0  # lambda of an effect that a test at level .01 sees more often than not
 _NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
 _OUTLYING = 5.0  # medians of the residual's size
+
+
+def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the cubic in the time since the row before of each gap, highest power first, (4, n_samples, n - 1).
+
+    They are splines through values (n_samples, n); of rows at the same time the last counts. They are NaN where a
+    sample has a value that is not finite.
+    """
+    from scipy.interpolate import CubicSpline  # a third of a second, which few diagnoses need
+
+    out, passes = np.zeros((4, len(values), len(time) - 1)), np.diff(time) > 0
+    out[3] = values[:, :-1]
+    if passes.any():
+        last, finite = np.append(passes, True), np.asarray(np.isfinite(values).all(axis=1))
+        smooth = np.where(finite[:, None], values, 0.0)  # SciPy refuses other numbers, though of one sample alone
+        out[:, :, passes] = CubicSpline(time[last], smooth[:, last], axis=1).c.transpose(0, 2, 1)
+        out[:, ~finite] = np.nan
+    return out
+
+
+def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says: str) -> Iterator[Form]:
+    """Yield the form of a reading that comes late, with a smooth variant where rows tell it."""
+
+    def at_rows(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+        return np.asarray(act(value, np.append(theta, np.zeros_like(theta), axis=1), table))
+
+    prior = about.log_uniform_size_prior(Stage.LAG, at_rows, about.table.median_gap * tried)
+    if prior is None:
+        return
+    variants: list[Form] = []
+    for is_smooth in (False, True):
+        value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
+        own: Declared = {"tau_s": (prior, about.time_unit), _SMOOTH: (of_flag, "1")}
+        words = in_words(f"{about.system.simulator.reading} {says}", about.time_unit)
+        given = (name, Stage.LAG, own, ("previous",), act, words, single_column_bank(prior_sizes(prior), value))
+        variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
+    first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
+    apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
+    yield replace(variants[0], alternatives=(variants[1],)) if apart.max() > _APART else variants[0]
 
 
 def within_runs(change: Act) -> Act:
@@ -54,17 +98,46 @@ def within_runs(change: Act) -> Act:
 
 @within_runs
 def lagged_readings(x: FloatArray, theta: FloatArray, time: FloatArray) -> FloatArray:
-    """Return readings that lag by first order, of a time constant theta[:, 0], (n_samples, n_points).
+    """Return readings that lag by first order, (n_samples, n_points); each run begins without a lag.
 
-    They are held between the rows; each run begins without a lag.
+    `theta` (n_samples, 2) is the time constant, and above 0.5 for readings that are smooth between the rows.
     """
     if len(time) < 2:
         return x
-    tau, gaps = theta[:, :1], np.diff(time)
+    tau, smooth, gaps = theta[:, :1], theta[:, 1:2] > 0.5, np.diff(time)
     with np.errstate(divide="ignore"):
         carry = np.where(tau > 0, np.exp(-gaps / np.where(tau > 0, tau, 1.0)), 0.0)
-    added, kept = np.insert((1 - carry) * x[:, 1:], 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
+    gain = (1 - carry) * x[:, 1:]
+    if smooth.any():
+        gain = np.where(smooth & (gaps > 0), _gain_of_smooth_readings(time, x, tau, carry), gain)
+    added, kept = np.insert(gain, 0, x[:, 0], axis=1), np.insert(carry, 0, 0.0, axis=1)
     return decaying_sum(added, kept, longest=len(time))
+
+
+def _gain_of_smooth_readings(time: FloatArray, x: FloatArray, tau: FloatArray, carry: FloatArray) -> FloatArray:
+    """Return what each gap adds to `carry` times the lagging reading before it, (n_samples, n - 1).
+
+    Of a cubic x the lagging reading is x - tau x' + tau^2 x'' - tau^3 x''' once the start is forgotten.
+    """
+    (third, second, first, start), gap = _cubics(time, x), np.diff(time)
+    twist = 6 * tau**3 * third
+    begin = start - tau * first + 2 * tau**2 * second - twist
+    slope, bend = first + gap * (2 * second + 3 * gap * third), 2 * second + 6 * gap * third
+    return np.asarray(x[:, 1:] - tau * slope + tau**2 * bend - twist - carry * begin)
+
+
+def delayed_readings(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Return readings after a dead time, (n_samples, n_points); before it is over, a run's first reading holds.
+
+    `theta` (n_samples, 2) is the dead time, and above 0.5 for readings that are smooth between the rows.
+    """
+    out: FloatArray = delayed_values(value, theta, table)
+    smooth = np.flatnonzero(theta[:, 1] > 0.5)
+    if smooth.size:
+        by, own = theta[smooth, 0], value[smooth] if len(value) > 1 else value
+        for rows in table.rows_by_scan():
+            out[np.ix_(smooth, rows)] = values_at_earlier_times(table.time_s[rows], own[:, rows], by, smooth=True)
+    return out
 
 
 @within_runs
@@ -73,20 +146,30 @@ def delayed_values(values: FloatArray, theta: FloatArray, time: FloatArray) -> F
     return values_at_earlier_times(time, values, theta[:, 0])
 
 
-def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
+def values_at_earlier_times(
+    time: FloatArray, values: FloatArray, by: FloatArray, *, smooth: bool = False
+) -> FloatArray:
     """Interpolate values (1 or n_samples, n), given at times (n,), at times earlier by `by`: (n_samples, n).
 
-    Before the first time, the first value holds. Values lie on straight lines.
+    Before the first time, the first value holds. Values lie on straight lines, or on a spline if they are `smooth`.
     """
     if len(time) < 2:
         return np.broadcast_to(values, (len(by), len(time)))
     asked = np.maximum(time - by[:, None], time[0])
     before = np.clip(np.searchsorted(time, asked.ravel(), side="right").reshape(asked.shape), 1, len(time) - 1) - 1
-    every, gap = np.broadcast_to(values, asked.shape), time[before + 1] - time[before]
-    share = np.clip((asked - time[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
-    low, high = (np.take_along_axis(every, row, axis=1) for row in (before, before + 1))
+    every = np.broadcast_to(values, asked.shape)
+    if smooth:
+        since, found = asked - time[before], np.zeros(asked.shape)
+        for power in _cubics(time, values):
+            gaps = np.broadcast_to(power, (len(by), len(time) - 1))
+            found = found * since + np.take_along_axis(gaps, before, axis=1)
+    else:
+        gap = time[before + 1] - time[before]
+        share = np.clip((asked - time[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+        low, high = (np.take_along_axis(every, row, axis=1) for row in (before, before + 1))
+        found = low + share * (high - low)
     # Where two rows have the same time, interpolation would take the last for the first.
-    return np.where(by[:, None] == 0, every, low + share * (high - low))
+    return np.where(by[:, None] == 0, every, found)
 
 
 def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
@@ -113,13 +196,8 @@ def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
         yield from added("interference", sinusoid_modulation(about, *reading))
         yield from _settling_form(about)
         lags, dead = np.geomspace(0.02, 200.0, 33), np.geomspace(1e-3, 100.0, 41)
-        for name, act, tried, says in (
-            ("lag", lagged_readings, lags, "lags with a time constant of {0}"),
-            ("delay", delayed_values, dead, "is delayed by {0}"),
-        ):
-            tau, words = ("tau_s", about.time_unit), in_words(f"{own.reading} {says}", about.time_unit)
-            given = (name, Stage.LAG, tau, ("previous",), act, words, about.table.median_gap * tried)
-            yield from about.sized(*given, needs_rising_time=True)
+        yield from _late_form(about, "lag", lagged_readings, lags, "lags with a time constant of {0}")
+        yield from _late_form(about, "delay", delayed_readings, dead, "is delayed by {0}")
     for name in about.varying_columns:
         yield from added(f"sensitivity:{name}", column_proportional_modulation(about, *reading, name))
         yield from _curve_form(about, name)

@@ -34,6 +34,7 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
+_FLAG_WIDTH = 1e-9  # of its prior
 _BY_CHANCE = 1e-4  # probability below which sorted readings are no chance
 _LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
 _LEAST_CUT = 0.003  # of a range, that is cut off at least by what is looked for
@@ -85,6 +86,12 @@ class BlockForm(StepEffect):
         chosen = rng.choice(len(weights), len(theta), p=weights)
         drawn = low[chosen] + (high - low)[chosen] * rng.random((len(theta), 3))[:, 1:]
         return np.concatenate([theta[:, :1], drawn], axis=1)
+
+
+def flag(on: bool, odds: float = 1.0) -> tuple[float, Fixed]:
+    """Return the value of a parameter that distinguishes two variants of a form, 0 or 1 to 1e-9, and its prior."""
+    value = 1.0 - 0.5 * _FLAG_WIDTH if on else 0.5 * _FLAG_WIDTH
+    return value, Fixed(value - 0.5 * _FLAG_WIDTH, value + 0.5 * _FLAG_WIDTH, odds)
 
 
 def period_with_sd(frequency: float, sd: float, time_unit: str) -> str:

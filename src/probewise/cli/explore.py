@@ -48,8 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise FileError(journal, "no such file", "a journal to resume; omit --resume to begin a new run")
     if journal.exists() and not arguments.resume:
         raise FileError(journal, "this journal exists already", "--resume to continue it, or another --out")
-    shipped_sensor = [_SHIPPED] * (arguments.sensor is None)
-    written_as_it_goes = (out / name for name in ("frames", *["live.html"] * arguments.live, *shipped_sensor))
+    written_as_it_goes = (out / name for name in ("frames", *["live.html"] * arguments.live))
     for path in written_as_it_goes if not arguments.resume and not (out / "result.json").exists() else ():
         if path.exists():
             raise FileError(path, "it exists already, and no search is in that folder", "another --out, or none there")

@@ -82,16 +82,16 @@ def test_a_law_whose_time_constant_the_readings_tell_keeps_its_step():
     system, found, sd = fit_system(System.of(simulator, table), recording)
     assert not system.stiff
     # The step fails at 0.01 s, which the readings exclude: there it may.
-    assert with_step_for_likely_parameters(system, table, recording, found, sd) is system
+    assert with_step_for_likely_parameters(system, table, found, sd) is system
     assert not np.isfinite(system.chain(table, ()).predict(np.array([[0.01, 3.0]]), table)).all()
 
 
 def test_a_law_that_needs_more_steps_than_are_taken_says_so(stiff, monkeypatch):
-    table, recording, _, found, sd = stiff
+    table, _, _, found, sd = stiff
     monkeypatch.setattr("probewise.systems.system._MOST_STEPS", 20)
     first = System.of(_simulator(), table)
     assert not first.integrations.too_stiff
-    assert with_step_for_likely_parameters(first, table, recording, found, sd).integrations.too_stiff
+    assert with_step_for_likely_parameters(first, table, found, sd).integrations.too_stiff
 
 
 @pytest.mark.parametrize("sets_step", [True, False])

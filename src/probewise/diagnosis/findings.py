@@ -10,8 +10,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.best_repair import BestRepair
-from probewise.diagnosis.evidence import Linearised, linearised_sizes
-from probewise.diagnosis.fit import fit, fit_each_start, with_prior
+from probewise.diagnosis.evidence import linearised_sizes
+from probewise.diagnosis.fit import fit
 from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import ALARM, significant_places
 from probewise.diagnosis.noise import n_rows_since_previous_usable, noise_statistics, previous_usable
@@ -82,7 +82,7 @@ def effects_found(
     """Return the findings on every effect with a name and a probability above 0.001, most probable first.
 
     `best`, `samples`: the repair and its posterior samples, which give size and parameters of its effects; those of
-    other effects are from the most probable fit that contains them or, if there is none, from the linearised null.
+    other effects are from the most probable fit that contains them or, if there is none, from the prior.
     """
     prepared, out, plan = searched.prepared, [], searched.prepared.everything.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
@@ -105,7 +105,8 @@ def effects_found(
             continue
         holder, noise = (best.fit, best.noise) if name in samples.effects else likeliest_with(name)
         if holder is None:
-            effect, values, size = _samples_of_insignificant(searched, effect, rng=rng)
+            effect, size = effect.variants()[0], 0.0
+            values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))
         else:
             effect = next((e for e in holder.found.model.effects if e.name == name), effect)
             own = samples if name in samples.effects else drawn.get((holder, noise))
@@ -125,33 +126,6 @@ def effects_found(
 def _samples_about(searched: Searched, fit: WeighedFit, noise: Names, *, rng: np.random.Generator) -> ModelSamples:
     evidence, recording = fit.evidence[noise], searched.prepared.recording
     return sample_model(fit.found, evidence, recording, weights=fit.weights, rng=rng, annealed=False)
-
-
-def _samples_of_insignificant(
-    searched: Searched, effect: Effect, *, rng: np.random.Generator
-) -> tuple[Effect, FloatArray, float]:
-    """Draw parameters of an effect that no refit contains: amplitudes by the linearised null, others from the prior."""
-    null, misfit_templates = searched.null, searched.misfit_templates
-    best = max(null.evidence.values(), key=lambda e: e.log_z)
-    problem = Linearised.of(null.found, best.likeliest_law)
-    templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
-    middle = len(templates.columns) // 2
-    effect = templates.variant_of_entry(middle)
-    values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))
-    if not effect.amplitudes:
-        return effect, values, 0.0
-    projected = problem.project(templates.columns[middle])
-    # A ridge of one prior scale keeps undetectable amplitudes finite.
-    precision = with_prior(projected.T @ projected)
-    amount = np.linalg.solve(precision, projected.T @ problem.residual)
-    spread = np.linalg.cholesky(np.linalg.inv(precision))
-    draws = amount + rng.standard_normal((N_SAMPLES, len(amount))) @ spread.T
-    for k in effect.amplitudes:
-        values[:, k] = draws @ templates.settings[middle][:, k]
-    # Amplitudes of an excluded sign are reflected.
-    inside = np.isfinite(effect.prior.log_prob(values))
-    values[~inside] = np.abs(values[~inside])
-    return effect, values, float(np.linalg.norm(projected @ amount))
 
 
 def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
@@ -183,13 +157,6 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = law.likeliest_sigma_of(found.residuals)
     refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
-    if not math.isfinite(refit.objective):
-        # Without the effect these parameters predict no readings to start from; those of the null do.
-        null = searched.evidences.fits[holder.n_gaussians, ()].found.z
-        others = found.z[stay][len(null) :]
-        starts = [np.concatenate([null, share * others]) for share in (1.0, 0.0)]
-        again = fit_each_start(model, noise_free, starts, law.with_least_sigma(sigma), tolerance=0.02)
-        refit = min(again, key=lambda one: one.objective)
     if not math.isfinite(refit.objective):
         return next(linearised_sizes(found, law, prepared.usable_rows, [name]))
     return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.fisher_information)

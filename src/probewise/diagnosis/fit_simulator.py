@@ -17,7 +17,13 @@ from probewise.diagnosis.diagnose_simulator import notes_on_declared_noise, prep
 from probewise.diagnosis.diagnosis import Diagnosis
 from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import Fit, Model, fit_each_start
-from probewise.diagnosis.noise import HIDDEN, LEAST_SCALE, NoiseLaw, NoiseModel, white_noise_of_recording
+from probewise.diagnosis.noise import (
+    LEAST_SCALE,
+    NoiseLaw,
+    NoiseModel,
+    rounding_that_hides_noise,
+    white_noise_of_recording,
+)
 from probewise.diagnosis.outlying import note_on_improbable_rows
 from probewise.diagnosis.posterior import NUMBERS, HypothesisProblem, draw_by_importance
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node
@@ -204,8 +210,7 @@ def fit_simulator(
     first = cast(FloatArray, cast(System, prepared.null).first)
     modes, n_even = modes_of(system, recording, law, first)
     fits = _distinct(fit_each_start(Model(system, (), recording.plan), recording, [first, *modes], law), law)
-    step = recording.plan.instrumentation.step or 0.0
-    rounding = step if fits[0].sd < HIDDEN * step else 0.0
+    rounding = rounding_that_hides_noise(recording, recording.plan.instrumentation.step or 0.0, fits[0].sd)
     noise = laplace_evidence(fits[0], NoiseModel((), recording, {}, rounding))
     problem = HypothesisProblem(fits[0].model, recording, noise)
     progress("sampling the posterior")

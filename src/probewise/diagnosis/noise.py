@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.linalg.lapack import dpbtrf, dpttrf, dpttrs, dtbtrs
@@ -34,7 +34,6 @@ LEAST_SCALE = 1e-150
 """Least sd, for readings that are exactly as predicted."""
 
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
-_LOG_HALVES = np.linspace(math.log(0.01), math.log(1000.0), 116)  # at which the information is tabulated
 _EM_STEPS = 12
 
 
@@ -136,33 +135,13 @@ class RoundedNormal:
     A rounded reading means that the unrounded one was within half a step: the density has a flat top, within which a
     residual carries no information, and never exceeds one over the step. The methods are those of `Tail`.
 
-    `half`, `sigma`: the noise of a reading of relative sd 1; `sd`: sds of the readings relative to that one, (n_points,
-    1), 1 for lost readings; 1.0 if all are equal. All readings are rounded to one step, so that the flat top of one
-    with a smaller sd is wider in units of that sd. Residuals are whitened by `whitening_sd`, so that each tells as much
-    of the mean as one of relative sd 1.
+    Readings of unequal declared sds have no such noise: there the floor of the sd stands for the rounding.
     """
 
     half: float | FloatArray
     sigma: float | FloatArray
-    sd: float | FloatArray = 1.0
 
     is_normal = False
-
-    @cached_property
-    def normal_sd(self) -> float | FloatArray:
-        """Sd of the normal part of each whitened residual, in sigma, (n_points, k); 1.0 if all sds are equal."""
-        if np.ndim(self.sd) == 0:
-            return 1.0
-        return np.asarray(np.exp(0.5 * (_log_fisher_information(self._halves) - _log_fisher_information(self.half))))
-
-    @property
-    def whitening_sd(self) -> float | FloatArray:
-        """Relative sd by which the residual of each reading is divided, (n_points, k); 1.0 if all are equal."""
-        return self.sd / self.normal_sd
-
-    @cached_property
-    def _halves(self) -> FloatArray:
-        return np.asarray(self.half / self.sd)
 
     @cached_property
     def fisher_information(self) -> FloatArray:
@@ -177,16 +156,16 @@ class RoundedNormal:
         return np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (k,)).copy()
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
-        """As of `Tail`: that of the readings over their relative sds, whatever the whitening."""
-        density = _log_density_of_rounded(whitened / sigma / self.normal_sd, self._halves) + _LOG_ROOT_2_PI
-        at_zero = _log_density_of_rounded(np.zeros((1, 1)), np.asarray(self.half))[0] + _LOG_ROOT_2_PI
+        """As of `Tail`."""
+        half = np.asarray(self.half)
+        density = _log_density_of_rounded(whitened / sigma, half) + _LOG_ROOT_2_PI
+        at_zero = _log_density_of_rounded(np.zeros((1, 1)), half)[0] + _LOG_ROOT_2_PI
         of_kept = density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * np.log(sigma) - of_kept)
 
     def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """As of `Tail`."""
-        score = _score(whitened / sigma / self.normal_sd, self._halves) / self.normal_sd
-        return np.asarray(sigma * score / self.fisher_information)
+        return np.asarray(sigma * _score(whitened / sigma, np.asarray(self.half)) / self.fisher_information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return 2 pi, (k,): Laplace's integral over log sigma is then 1, since sigma is known."""
@@ -210,17 +189,6 @@ def _fisher_information_of_rounded(half: float) -> float:
     return float(np.sum(_score(x, width) ** 2 * density) * (x[1, 0] - x[0, 0]))
 
 
-@cache
-def _tabulated_log_information() -> FloatArray:
-    return np.log([_fisher_information_of_rounded(half) for half in np.exp(_LOG_HALVES).tolist()])
-
-
-def _log_fisher_information(half: float | FloatArray) -> FloatArray:
-    log_half = np.log(half)
-    beyond = np.maximum(log_half - _LOG_HALVES[-1], 0.0)
-    return np.asarray(np.interp(log_half, _LOG_HALVES, _tabulated_log_information()) - beyond)
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseLaw:
     """The joint distribution of all readings' noise, up to its overall sd; all arrays are (n_points,).
@@ -233,7 +201,7 @@ class NoiseLaw:
     `sd`: sds relative to the overall one; `carry`: correlation with the previous reading, 0 for the first of a scan;
     `lost`: mask of lost readings, which carry no information; `share`, `times`: the heavy tail; `log_extra`: log
     probability of the lost readings; `flat`, `sigma`: rounding, without a tail: a uniform part of half width `flat`
-    times a known sigma, in every reading whatever its relative sd; `least`: least sd of a reading, given those before
+    times a known sigma; `least`: least sd of a reading, given those before
     it; not used if sigma is known; `walk`: variance of the increments of a random walk of the offset from row to row,
     also between runs, relative to the overall variance; empty without one, and without another correlation with one;
     `before`: number of the reading with which each has the correlation `carry`, where that is not 0; empty: the reading
@@ -278,7 +246,7 @@ class NoiseLaw:
     @property
     def whitening_key(self) -> tuple[bytes, ...]:
         """Key of the whitening: distributions with the same key differ only in tails or rounding."""
-        arrays = self._whitening_sd, self.carry, self.lost, self.walk, self.before
+        arrays = self.sd, self.carry, self.lost, self.walk, self.before
         return tuple(values.tobytes() for values in arrays)
 
     def is_practically_equal(self, other: NoiseLaw) -> bool:
@@ -383,18 +351,6 @@ class NoiseLaw:
         """Density of one whitened reading."""
         return stacked_density([self])
 
-    @cached_property
-    def sd_beside_rounding(self) -> float | FloatArray:
-        """Relative sds as `RoundedNormal` takes them: (n_points, 1), 1 where none counts; 1.0 if all are equal."""
-        return np.where(self._counted, self.sd, 1.0)[:, None] if np.any(self.sd != 1) else 1.0
-
-    @cached_property
-    def _whitening_sd(self) -> FloatArray:
-        density = self.whitened_density
-        if isinstance(density, RoundedNormal) and np.ndim(density.sd):
-            return np.asarray(density.whitening_sd)[:, 0]
-        return self.sd
-
     @property
     def fisher_information(self) -> float:
         """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
@@ -470,8 +426,7 @@ class NoiseLaw:
         if not density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
             if isinstance(density, RoundedNormal):
-                uniform = rng.uniform(-1.0, 1.0, eps.shape)
-                eps = np.asarray(eps * density.normal_sd + density.half / density.whitening_sd * uniform)
+                eps = np.asarray(eps + density.half * rng.uniform(-1.0, 1.0, eps.shape))
             eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.fisher_information)
         return eps * self._counted[:, None]
 
@@ -485,7 +440,7 @@ def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
         return Tail(0.0, 1.0)
     pairs = [(law.flat, law.sigma) if laws[0].flat else (law.share, law.times) for law in laws]
     first, second = pairs[0] if len(laws) == 1 else np.array(pairs).T
-    return RoundedNormal(first, second, laws[0].sd_beside_rounding) if laws[0].flat else Tail(first, second)
+    return RoundedNormal(first, second) if laws[0].flat else Tail(first, second)
 
 
 def whiten_under_each(laws: Sequence[NoiseLaw], columns: FloatArray) -> FloatArray:
@@ -510,7 +465,7 @@ def whiten_under_each(laws: Sequence[NoiseLaw], columns: FloatArray) -> FloatArr
         out = np.zeros((len(laws), *columns.shape))
         out[there] = solved
         return out
-    y = columns * (kept / np.stack([law._whitening_sd for law in laws]))[:, :, None]
+    y = columns * (kept / np.stack([law.sd for law in laws]))[:, :, None]
     carry = np.stack([law.carry for law in laws])[:, :, None]
     if np.any(carry):
         before = max((law.before for law in laws), key=len)
@@ -828,9 +783,7 @@ class NoiseModel:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
             half_step = 0.5 * self.rounding
-            halves, log_weights = _sd_nodes_with_rounding(
-                law(self._readings - predicted), half_step, law.n_kept, law.sd_beside_rounding
-            )
+            halves, log_weights = _sd_nodes_with_rounding(law(self._readings - predicted), half_step, law.n_kept)
             laws = tuple(replace(law, flat=x, sigma=half_step / x) for x in halves)
             settings = np.repeat(settings, len(laws), axis=0)
         return NoiseNodes(settings, laws, log_weights)
@@ -958,20 +911,16 @@ def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -
     return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
 
 
-def _sd_nodes_with_rounding(
-    residuals: FloatArray, half_step: float, n_points: int, sd: float | FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _sd_nodes_with_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
     """Return nodes for the noise sd of rounded readings, as half steps per sd, and log weights, (n,) both.
 
-    `residuals` are over the relative sds, (n_readings,), and `sd` those sds as `RoundedNormal` takes them.
     Nodes are coarse, and refined about the best to the accuracy of log sigma without rounding. They extend to the
     residual rms, in case the mean is incomplete.
     """
 
     def log_likelihood(halves: FloatArray) -> FloatArray:
         sigma = half_step / halves
-        density = RoundedNormal(halves, sigma, sd)
-        return -density.minus_log_likelihood(residuals[:, None] * density.normal_sd, sigma, n_points)
+        return -RoundedNormal(halves, sigma).minus_log_likelihood(residuals[:, None], sigma, n_points)
 
     rms = math.sqrt(float(residuals @ residuals) / n_points)
     widest = math.floor(math.log(half_step / (2 * rms)) / _APART) if rms > 0 else _NARROWEST
@@ -986,6 +935,12 @@ def _sd_nodes_with_rounding(
     log_weights = np.log(np.gradient(x))
     likely = height > height.max() - _UNLIKELY
     return np.exp(x[likely]), log_weights[likely]
+
+
+def rounding_that_hides_noise(recording: Recording, step: float, sd: float) -> float:
+    """Return a rounding step that exceeds the noise sd so far that it shapes the noise, else 0: also of unequal sds."""
+    relative_sd = recording.relative_sd[recording.usable]
+    return step if sd < HIDDEN * step and np.all(relative_sd == relative_sd[:1]) else 0.0
 
 
 def rough_sd(recording: Recording) -> float:

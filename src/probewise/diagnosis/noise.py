@@ -297,7 +297,7 @@ class NoiseLaw:
     def _own_and_before(self) -> tuple[FloatArray, FloatArray, IntArray]:
         """Return the factors by which whitening without a walk takes each reading, and off it the one `before` it."""
         before = self.before if self.before.size else np.maximum(np.arange(len(self.sd)) - 1, 0)
-        weight, free = self.kept / self._whitening_sd, np.sqrt(1 - self.carry**2)
+        weight, free = self.kept / self.sd, np.sqrt(1 - self.carry**2)
         return weight / free, self.carry / free * weight[before], before
 
     def adjoint(self, columns: FloatArray) -> FloatArray:

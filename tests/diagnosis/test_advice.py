@@ -22,7 +22,7 @@ from probewise.diagnosis.advice import (
     measurement_separating_rivals,
     mutual_information_lower_bound,
 )
-from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS
+from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_ADVISED_READINGS
 from probewise.diagnosis.fit import Model
 from probewise.diagnosis.light_sensor import LightSensorApparatus, target_swaps
 from probewise.diagnosis.locate import Place
@@ -96,7 +96,7 @@ def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
         [rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan, LightSensorApparatus()
     )
     assert asked is not None
-    assert len(asked.plan) <= MOST_READINGS
+    assert len(asked.plan) <= MOST_ADVISED_READINGS
     assert {asked.plan.pattern_names[k] for k in asked.plan.pattern} - plan.patterns.keys()
     assert asked.expected_log_bayes_factor > 3
     assert asked.between == tuple(name.replace("_", " ") for name in rivals)

@@ -9,7 +9,7 @@ import pytest
 from heater import SIMULATOR, runs
 
 from probewise.diagnosis.advice import COUNTS, Alias, pairs_with_separating_scans
-from probewise.diagnosis.apparatus import MOST_READINGS
+from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model, fit
@@ -76,7 +76,7 @@ SEPARABLE = [("gain_drift", "nonlinearity"), ("drifts:gain", "input_offset:power
 @pytest.mark.parametrize("names", SEPARABLE)
 def test_the_advised_readings_add_three_nats_and_fewer_do_not(names):
     alias = advised(*names)
-    assert 0 < alias.readings < MOST_READINGS
+    assert 0 < alias.readings < MOST_ADVISED_READINGS
     (scan,) = (s for s in SCANS if s.description == alias.settle_by)
     assert gained(scan, alias.readings, *names) >= 3
     fewer = int(COUNTS[np.searchsorted(COUNTS, alias.readings) - 1])
@@ -89,7 +89,7 @@ def test_the_advised_readings_add_three_nats_and_fewer_do_not(names):
 def test_no_readings_are_advised_for_effects_that_are_the_same(names):
     alias = advised(*names)
     assert (alias.settle_by, alias.readings) == (NOTHING, 0)
-    assert max(gained(scan, MOST_READINGS, *names) for scan in SCANS) < 0.01
+    assert max(gained(scan, MOST_ADVISED_READINGS, *names) for scan in SCANS) < 0.01
 
 
 def test_a_value_per_run_separates_nothing_that_a_start_of_each_run_absorbs():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.samples import HypothesisSamples, ModelSamples, can_share_one_model, mix
-from probewise.diagnosis.search.hypotheses import Posterior
+from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import RARE_EFFECTS, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
@@ -97,7 +97,7 @@ def samples(probabilities, own=frozenset()):
     fits = {(0, names): candidate(names, log_z) for names, log_z in [((), 0.0), (("lag",), 1.0), (("drift",), 9.0)]}
     searched = SimpleNamespace(
         evidences=SimpleNamespace(fits=fits),
-        posterior=Posterior(probabilities),
+        posterior=HypothesisProbabilities(probabilities),
         prior=SimpleNamespace(log_prior_on_mean=lambda names: 0.0),
         prepared=SimpleNamespace(effects={}, apparatus=SimpleNamespace(user_effect_names=lambda effects: own)),
     )

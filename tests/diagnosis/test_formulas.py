@@ -10,7 +10,7 @@ import pytest
 
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.diagnosis import diagnose_prepared
-from probewise.diagnosis.search.hypotheses import Posterior
+from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
 from probewise.diagnosis.search.search import needs_more_than_memoryless_noise, search
 from probewise.diagnosis.verdict import run_global_test
 from probewise.systems import RunTable, Simulator, table_for
@@ -92,7 +92,7 @@ def test_products_are_of_time_and_the_columns_that_vary_most():
 )
 def test_formulas_are_weighed_wherever_more_than_noise_without_a_memory_leads(mean, noise, asked):
     """A walk takes up what changes slowly, and one name part of what a formula does."""
-    searched = SimpleNamespace(posterior=Posterior({(mean, noise): 0.95, (("drag",), ()): 0.05}))
+    searched = SimpleNamespace(posterior=HypothesisProbabilities({(mean, noise): 0.95, (("drag",), ()): 0.05}))
     assert needs_more_than_memoryless_noise(searched) is asked
 
 

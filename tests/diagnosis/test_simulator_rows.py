@@ -17,7 +17,7 @@ from probewise.diagnosis.fit import Model
 from probewise.diagnosis.locate import Covariate, places_of_effect, significant_places
 from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.outlying import FAR_OUT, clustering_log_bayes_factors
-from probewise.diagnosis.simulator_rows import SimulatorApparatus, possible_run_commands
+from probewise.diagnosis.simulator_rows import SimulatorApparatus, candidate_runs
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects
 from probewise.recordings import Plan
 from probewise.systems import (
@@ -38,7 +38,7 @@ TABLE = runs()
 
 def offered(controls=("power_w",), table=TABLE, by_law=True):
     simulator = SimpleNamespace(reading="temp_c", controls=controls, time_unit="s", law=by_law or None)
-    commands = possible_run_commands(table, simulator)
+    commands = candidate_runs(table, simulator)
     return {command.plan.scan_names[0]: command for command in commands}
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from probewise.diagnosis.advice import Alias
-from probewise.diagnosis.search.hypotheses import Posterior
+from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
 from probewise.diagnosis.verdict import (
     Hypothesis,
     Judged,
@@ -66,7 +66,7 @@ def test_a_rare_effect_is_decided_where_hardly_anything_else_out_of_vocabulary_e
 
 def searched(probabilities):
     """A search with these probabilities by effects on mean and noise, of which all out of vocabulary are unknown."""
-    posterior = Posterior(probabilities)
+    posterior = HypothesisProbabilities(probabilities)
     rare = [mean for mean, _ in probabilities if mean in (("arm_knock",), ("bent_rails",))]
     return SimpleNamespace(
         posterior=posterior,

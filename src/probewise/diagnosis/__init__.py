@@ -3,12 +3,16 @@
 The paper, section "Efficacy of Sensor Model", shows that a better likelihood makes better inferences; this package
 finds a poor likelihood: it tests and locates residuals, explains them by named effects, repairs the model, and measures
 the gain on held-out readings.
+
+Reading order: `prepared` (the input), `fit` and `noise` (the model), `search` (evidences), `verdict`, `best_repair`,
+`samples` and `posterior` (draws), `locate`, `advice`; `diagnosis.diagnose_prepared` calls them. `apparatus` is what
+they ask of a light sensor (`light_sensor`) or of a simulator (`simulator_rows`).
 """
 
 from __future__ import annotations
 
 from probewise.diagnosis.advice import Alias, NextMeasurement
-from probewise.diagnosis.apparatus import MOST_READINGS, SETTLED
+from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, SETTLED
 from probewise.diagnosis.audit import (
     CURE_PLAN,
     Cure,
@@ -47,7 +51,7 @@ from probewise.diagnosis.words import p_in_words
 __all__ = [
     "ALARM",
     "CURE_PLAN",
-    "MOST_READINGS",
+    "MOST_ADVISED_READINGS",
     "NEXT_PLAN",
     "SETTLED",
     "TO_SEPARATE",

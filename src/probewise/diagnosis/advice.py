@@ -17,7 +17,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import ENOUGH_NATS, MOST_READINGS, NOTHING_NATS, SETTLED, Apparatus, rows_by_command
+from probewise.diagnosis.apparatus import (
+    ENOUGH_NATS,
+    MOST_ADVISED_READINGS,
+    NOTHING_NATS,
+    SETTLED,
+    Apparatus,
+    rows_by_candidate,
+)
 from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covariance_root
 from probewise.diagnosis.fit import Fit, Model, residual_degrees_of_freedom
 from probewise.diagnosis.locate import Place
@@ -27,7 +34,7 @@ from probewise.diagnosis.words import hypothesis_in_words
 from probewise.effects import Effect, name_of_first_copy
 from probewise.recordings.plan import Plan, Recording
 
-COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_READINGS])
+COUNTS = np.array([0, 1, 2, 3, 4, 6, 8, 12, 18, 26, 36, 51, 72, MOST_ADVISED_READINGS])
 """Numbers of further readings that are tried."""
 
 _NEARLY_FLAT = 1e-6  # prior precision of a rival's amplitudes, in changes of one noise sd: the fit decides
@@ -181,8 +188,8 @@ def pairs_with_separating_scans(
 
     columns = {name: columns_of(*entries[name]) for name in sorted({name for p in pairs for name in p.effects})}
     sized = {pair.effects: _collinear_amounts(problem, *(columns[name] for name in pair.effects)) for pair in pairs}
-    best = {pair.effects: (MOST_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
-    for scan, rows in zip(scans, rows_by_command(scans), strict=True):
+    best = {pair.effects: (MOST_ADVISED_READINGS + 1, -NOTHING_NATS, pair) for pair in pairs}  # the least is best
+    for scan, rows in zip(scans, rows_by_candidate(scans), strict=True):
         slopes = before, further[rows]
         for effects, (one, other) in sized.items():
             gained = [nats_against(slopes, *acting, rows) for acting in ((one, other), (other, one))]
@@ -190,10 +197,12 @@ def pairs_with_separating_scans(
             if not nats[-1] > NOTHING_NATS:
                 continue
             enough = np.flatnonzero(nats >= ENOUGH_NATS)
-            needed = int(COUNTS[enough[0]]) if enough.size else MOST_READINGS + 1
+            needed = int(COUNTS[enough[0]]) if enough.size else MOST_ADVISED_READINGS + 1
             most = float(nats[enough[0] if enough.size else -1])
             if (needed, -most) < best[effects][:2]:
-                asked = replace(best[effects][2], settle_by=scan.description, readings=min(needed, MOST_READINGS))
+                asked = replace(
+                    best[effects][2], settle_by=scan.description, readings=min(needed, MOST_ADVISED_READINGS)
+                )
                 best[effects] = (needed, -most, asked)
     return [alias for _, _, alias in best.values()]
 
@@ -303,7 +312,7 @@ def measurement_separating_rivals(
     weights /= weights.sum()
     if not offered:
         return None
-    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
+    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_candidate(offered)
     predictives = [rival.predict(everywhere, sd) for rival in rivals]
 
     def of_readings(taken: IntArray) -> list[PredictiveNormal]:
@@ -316,7 +325,7 @@ def measurement_separating_rivals(
         gains = np.zeros(len(offered))
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
-            if k not in chosen and len(together) <= MOST_READINGS:
+            if k not in chosen and len(together) <= MOST_ADVISED_READINGS:
                 gains[k] = mutual_information_lower_bound(of_readings(together), weights) - told
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
@@ -365,7 +374,7 @@ def measurement_at_place(
     planned = apparatus.settings_of(apparatus.plan_of_alternatives(commands, plan))[:, varies] / scale[varies]
     apart, nearest = KDTree(known[:, varies] / scale[varies]).query(planned, p=np.inf)
     squares = np.where(apart <= _NEAR, shown[nearest], 0.0) ** 2
-    nats = np.array([0.5 * float(squares[rows].sum()) for rows in rows_by_command(commands)])
+    nats = np.array([0.5 * float(squares[rows].sum()) for rows in rows_by_candidate(commands)])
     per_minute = np.where(nats >= ENOUGH_NATS, nats, 0.0) / [command.minutes for command in commands]
     best = int(np.argmax(per_minute))
     if per_minute[best] == 0.0:

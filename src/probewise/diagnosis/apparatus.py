@@ -20,17 +20,18 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.effects import Effect
 from probewise.recordings.plan import Plan, Recording
 
-MOST_READINGS = 102
+MOST_ADVISED_READINGS = 102
+"""Most readings that one advised measurement may have."""
 SETTLED = 0.95
 """Probability from which a hypothesis, or the fewest that hold it, leave no question open."""
 ENOUGH_NATS = 3.0
 """Expected log Bayes factor that tells two hypotheses apart, as odds of 20 to 1; readings for less are not advised."""
 NOTHING_NATS = 0.5
-"""Expected log Bayes factor below which readings do not tell two hypotheses apart at all: they are aliases."""
+"""Expected log Bayes factor below which planned readings do not separate two hypotheses at all."""
 
 
 @dataclass(frozen=True, eq=False)
-class Command:
+class Candidate:
     """A possible next measurement: kind in a word or two, an instruction, its rows, and minutes with the break before.
 
     Kinds of a scan: "repeat", "reverse", "respeed", "rotate", "relight", "raise", "across" or, with another sheet,
@@ -43,7 +44,7 @@ class Command:
     minutes: float
 
 
-def rows_by_command(commands: Sequence[Command]) -> list[IntArray]:
+def rows_by_candidate(commands: Sequence[Candidate]) -> list[IntArray]:
     """Return the row numbers of each command in the plan that concatenates all commands, (n_rows,) each."""
     ends = np.cumsum([len(command.plan) for command in commands])
     return [np.arange(end - len(command.plan), end) for end, command in zip(ends.tolist(), commands, strict=True)]
@@ -185,16 +186,16 @@ class Apparatus(ABC):
     @abstractmethod
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-    ) -> Sequence[Command]:
+    ) -> Sequence[Candidate]:
         """List the possible next measurements after a plan.
 
         With stride k, only every k-th reading is taken; `level` (n_points,) are the expected readings of the plan.
         """
 
     @abstractmethod
-    def plan_of_alternatives(self, commands: Sequence[Command], after: Plan) -> Plan:
+    def plan_of_alternatives(self, commands: Sequence[Candidate], after: Plan) -> Plan:
         """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
 
     @abstractmethod
-    def plan_of_sequence(self, commands: Sequence[Command], after: Plan) -> Plan:
+    def plan_of_sequence(self, commands: Sequence[Candidate], after: Plan) -> Plan:
         """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""

@@ -22,7 +22,7 @@ from probewise._display import Reported
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.advice import LAMBDA, LEAST_SHARE, classes_of
-from probewise.diagnosis.apparatus import ENOUGH_NATS, Command, Words
+from probewise.diagnosis.apparatus import ENOUGH_NATS, Candidate, Words
 from probewise.diagnosis.evidence import orthonormalise_groups
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.light_sensor import LightSensorApparatus, candidate_scans, scan_started_after, target_swaps
@@ -228,7 +228,7 @@ class EffectAudit:
 
 
 @dataclass(frozen=True, eq=False)
-class Cure(Command):
+class Cure(Candidate):
     """One scan to add, and the effects that it makes fine."""
 
     cured: tuple[str, ...]
@@ -434,13 +434,13 @@ _STRIDES = (1, 4)
 
 def choose_cure_scans(
     plan: Plan, expected: Expected, ailing: Sequence[str], progress: Progress = silent
-) -> list[Command]:
+) -> list[Candidate]:
     """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
 
     They are timed one after another, in the order chosen.
     """
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
-    chosen: list[Command] = []
+    chosen: list[Candidate] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)

@@ -21,7 +21,7 @@ from probewise.diagnosis.fit import Fit, with_prior
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import find_lost_readings
-from probewise.diagnosis.prepared import MOST_READINGS, Prepared, positions_in_stretches
+from probewise.diagnosis.prepared import MOST_DIAGNOSED_READINGS, Prepared, positions_in_stretches
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.simulator_fit import fit_system, is_noise_sd_known_beside_misfit
 from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
@@ -60,7 +60,7 @@ def recording_from_table(simulator: Simulator, table: RunTable) -> RunRecording:
     table.require_moderate_numbers()
     whole = as_recording(simulator, table)
     usable = np.flatnonzero(whole.usable)
-    chosen = usable[positions_in_stretches(table.scan[usable], MOST_READINGS)]
+    chosen = usable[positions_in_stretches(table.scan[usable], MOST_DIAGNOSED_READINGS)]
     if len(chosen) == len(usable):
         return whole
     note = f"{len(chosen):,} of {len(usable):,} readings are used, in stretches of six spread over the whole table"

@@ -1,7 +1,7 @@
 """A diagnosis: its pipeline, from recordings to a `Diagnosis`, that result, and the content of diagnosis.json.
 
-prepared -> searched -> tested -> judged -> repaired -> located -> advised -> reported. Each step takes the values of
-the steps before it and returns a new one.
+`diagnose_prepared` searches, tests, judges, repairs (which may change the verdict), draws samples, locates, and
+advises. Each step takes the values of the steps before it and returns a new one.
 """
 
 from __future__ import annotations

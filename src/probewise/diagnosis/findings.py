@@ -125,7 +125,7 @@ def effects_found(
 
 def _samples_about(searched: Searched, fit: WeighedFit, noise: Names, *, rng: np.random.Generator) -> ModelSamples:
     evidence, recording = fit.evidence[noise], searched.prepared.recording
-    return sample_model(fit.found, evidence, recording, weights=fit.weights, rng=rng, annealed=False)
+    return sample_model(fit.found, evidence, recording, weights=fit.weights, rng=rng, laplace_only=True)
 
 
 def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Command, Words
+from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
 from probewise.diagnosis.fit import Fit, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
@@ -36,13 +36,13 @@ LAY_S = 60.0  # additional seconds to lay a new sheet
 _LAY = "lay"  # the kind of a scan over another sheet
 
 
-def scan_command(kind: str, description: str, plan: Plan) -> Command:
+def scan_command(kind: str, description: str, plan: Plan) -> Candidate:
     """Return a scan that the arm could take."""
     minutes = (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 + (LAY_S if kind == _LAY else 0.0) / 60.0
-    return Command(kind, description, plan, minutes)
+    return Candidate(kind, description, plan, minutes)
 
 
-def scan_started_after(scan: Command, plan: Plan) -> Command:
+def scan_started_after(scan: Candidate, plan: Plan) -> Candidate:
     """Move a scan to after a plan, with time to lay its sheet."""
     start_s = _earliest_start_s(plan) + (LAY_S if scan.kind == _LAY else 0.0)
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + (start_s - float(scan.plan.time_s[0]))))
@@ -79,12 +79,12 @@ def excerpts_of_scan(scan: IntArray, strides: Sequence[int], level: FloatArray |
     """
     out = []
     for stride in [s for s in strides if len(scan[::s]) >= LEAST_ROWS] or [1]:
-        rows = scan[::stride][:MOST_READINGS]
+        rows = scan[::stride][:MOST_ADVISED_READINGS]
         if rows.size >= LEAST_ROWS:
             every, fast = ("second", "twice") if stride == 2 else (f"{stride}th", f"{stride} times")
             words = "" if stride == 1 else f" (every {every} reading, {fast} as fast)"
-            if len(scan[::stride]) > MOST_READINGS:
-                words += f", {MOST_READINGS} readings from its start"
+            if len(scan[::stride]) > MOST_ADVISED_READINGS:
+                words += f", {MOST_ADVISED_READINGS} readings from its start"
             out.append(Excerpt("" if stride == 1 else f"_{stride}", words, rows, stride))
     if level is not None and scan.size > _NEAR:
         change = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(level)))])
@@ -94,19 +94,19 @@ def excerpts_of_scan(scan: IntArray, strides: Sequence[int], level: FloatArray |
     return out
 
 
-def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Command]:
+def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Candidate]:
     """List the scans that could follow a plan, each timed to start after it.
 
     `level`: expected readings, (n_points,): adds the part of each scan where they change most.
     """
     controls, height_mm = plan.instrumentation.controls, plan.instrumentation.height_mm
-    out: list[Command] = []
+    out: list[Candidate] = []
     for scan in rows_of_distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
         degrees, take = math.degrees(float(plan.orientation_rad[scan[0]])) + _TURN_DEG, f"take scan {name}"
         for suffix, every, rows, stride in excerpts_of_scan(scan, strides, None if level is None else level[scan]):
             once = rows_as_next_scan(plan, rows, name)
-            half = rows[: MOST_READINGS // 2 * 2 : 2]
+            half = rows[: MOST_ADVISED_READINGS // 2 * 2 : 2]
             both = rows_as_next_scan(plan, np.concatenate([half, half[::-1]]), name)
             # Of every second reading, with unchanged time per reading.
             faster = f"at {2 * stride} times the speed (every {2 * stride}th reading)"
@@ -168,7 +168,7 @@ _STRIPES = (5, 10)  # numbers of stripes per scan
 _STRIDE = 4
 
 
-def target_swaps(plan: Plan) -> list[Command]:
+def target_swaps(plan: Plan) -> list[Candidate]:
     """List scans over a white and a black sheet, along the other axis, and over moved or turned edges and stripes.
 
     Sheets and the other axis take the places of the plan's first moving scan; edges and stripes those of its first scan
@@ -192,7 +192,7 @@ def target_swaps(plan: Plan) -> list[Command]:
     return [*out, *next(filter(None, laid), [])]
 
 
-def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Command]:
+def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Candidate]:
     """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
     beyond = _distance_inside_edge_mm(plan, edge)[scan]
@@ -386,15 +386,15 @@ class LightSensorApparatus(Apparatus):
                 return part.reshape(-1), tuple(f"{pattern}, {turn:.0f} degrees" for pattern, turn in named)
         return scan, plan.scan_names
 
-    def plan_of_alternatives(self, commands: Sequence[Command], after: Plan) -> Plan:
+    def plan_of_alternatives(self, commands: Sequence[Candidate], after: Plan) -> Plan:
         plan = join_plans([command.plan for command in commands])
         # What cannot be commanded, such as battery voltage, keeps its last known value until it is measured.
         read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
         kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
         return replace(plan, covariates={**kept, **plan.covariates})
 
-    def plan_of_sequence(self, commands: Sequence[Command], after: Plan) -> Plan:
-        out: list[Command] = []
+    def plan_of_sequence(self, commands: Sequence[Candidate], after: Plan) -> Plan:
+        out: list[Candidate] = []
         for scan in commands:
             out.append(scan_started_after(scan, out[-1].plan if out else after))
         return self.plan_of_alternatives(out, after)
@@ -405,7 +405,7 @@ class LightSensorApparatus(Apparatus):
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-    ) -> list[Command]:
+    ) -> list[Candidate]:
         if self.hands:
             return [*candidate_scans(plan, strides=strides, level=level), *target_swaps(plan)]
         # Over the last reading's pattern and, unless the arm turns the sensor, in its orientation.

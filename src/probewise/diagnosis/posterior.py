@@ -632,18 +632,18 @@ def posterior_draws(
     recording: Recording,
     n_samples: int,
     *,
-    annealed: bool = True,
+    laplace_only: bool = False,
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> FloatArray:
     """Draw coordinates, (n_samples, n_params), from the posterior about a fit, under one noise model.
 
-    Unless `annealed`, they are draws of Laplace's approximation, or of its linear amplitudes where it has any.
-    Otherwise, where many samples cost little more than one, they are drawn by adaptive importance sampling; so are
-    those of a simulator that is called for each sample and has an effect with a size and a shape, by its tangent. Else
-    samples of Laplace's approximation are moved to the posterior in two stages, the first through a quadratic
-    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse. The
-    parameters are those of `sample_model`.
+    In this order: by Laplace's approximation, if `laplace_only`, or by its linear amplitudes where it has any; by
+    adaptive importance sampling, if many samples cost little more than one, or if a tangent serves (of a simulator that
+    is called for each sample and has an effect with a size and a shape); otherwise by importance resampling, through a
+    quadratic surrogate and then under the model, each replaced by annealing where too few draws are effective: with
+    several Gaussians the posterior is curved, and Laplace's samples predict new angles far worse. The parameters are
+    those of `sample_model`.
     """
     model, law, usable = found.model, noise.likeliest_law, np.flatnonzero(recording.usable)
     # Laplace's approximation: normal, of covariance steps.T @ steps, with `slopes` and `residual` in noise sds.
@@ -667,7 +667,7 @@ def posterior_draws(
         is_possible = np.isfinite(model.predict_rows(usable, center[None, :])).all()
         return np.asarray(center) if is_possible else found.z
 
-    if not annealed:
+    if laplace_only:
         linear = draws_of_linear_amplitudes(found, slopes, residual, n_samples, rng=rng)
         return mode() + rng.standard_normal((n_samples, len(found.z))) @ steps if linear is None else linear
     normal = rng.standard_normal((_N_NEAR, len(found.z)))

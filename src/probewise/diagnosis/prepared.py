@@ -170,7 +170,7 @@ def _is_same_recording(one: Recording, other: Recording) -> bool:
     )
 
 
-MOST_READINGS = 2400
+MOST_DIAGNOSED_READINGS = 2400
 _FEWEST_SCANS = 8
 _STRETCH = 6  # readings
 _SEED = 0  # the same rows of the same recording, whatever the seed of its diagnosis
@@ -185,9 +185,9 @@ def rows_to_diagnose(recording: Recording) -> IntArray:
     Returns row numbers, ascending.
     """
     n_usable, scan, n_scans = int(recording.usable.sum()), recording.plan.scan, len(recording.plan.scan_names)
-    if n_usable <= MOST_READINGS:
+    if n_usable <= MOST_DIAGNOSED_READINGS:
         return np.arange(len(recording))
-    share = MOST_READINGS / n_usable
+    share = MOST_DIAGNOSED_READINGS / n_usable
     n_kept = math.floor(n_scans * share)
     if n_kept >= _FEWEST_SCANS:
         # One of each n_scans / n_kept, with the first and the last: scans that go there and back must not all go there.

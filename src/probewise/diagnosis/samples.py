@@ -137,7 +137,7 @@ def sample_model(
     *,
     weights: Mapping[str, FloatArray],
     rng: np.random.Generator,
-    annealed: bool = True,
+    laplace_only: bool = False,
     progress: Progress = silent,
 ) -> ModelSamples:
     """Draw 500 samples of a model from its posterior about a fit, under one noise model.
@@ -145,18 +145,18 @@ def sample_model(
     `posterior_draws` draws their coordinates. Parameters of noise effects, variants and the noise's sd are drawn here.
 
     `weights`: by effect, the probability of each of its variants (discrete choices, such as of scans), (n_variants,),
-    when it was added; `annealed`: whether samples are of the posterior; otherwise of Laplace's approximation, with
+    when it was added; `laplace_only`: whether samples are of Laplace's approximation instead of the posterior, with
     `draws_of_linear_amplitudes`.
     """
     law, model, null = noise.likeliest_law, found.model, found.model.sensor
     usable = np.flatnonzero(recording.usable)
     readings = recording.readings[usable]
     weights = weights_beside_other_effects(found, law, usable, weights)
-    draws = posterior_draws(found, noise, recording, N_SAMPLES, annealed=annealed, rng=rng, progress=progress)
+    draws = posterior_draws(found, noise, recording, N_SAMPLES, laplace_only=laplace_only, rng=rng, progress=progress)
     z = np.clip(draws, -FARTHEST, FARTHEST)
-    # Samples that are not annealed serve for the effects only: their noise is that of the fit. Where each sample is a
-    # call, those that were tried serve for all.
-    predicted = model.predict_rows(usable, z[: n_tried(model)]) if annealed else found.predicted[None, :]
+    # Laplace's samples serve for the effects only: their noise is that of the fit. Where each sample is a call, those
+    # that were tried serve for all.
+    predicted = found.predicted[None, :] if laplace_only else model.predict_rows(usable, z[: n_tried(model)])
     residuals = np.resize(readings - predicted, (N_SAMPLES, len(usable)))
     noise_sd = draw_noise_sd(law, residuals, rng=rng)
     largest = float(np.abs(readings).max()) or 1.0

@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.apparatus import MOST_READINGS, Apparatus, Command, Words
+from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
@@ -44,21 +44,21 @@ _BREAK = 0.5  # minutes, before a run
 _RUN = "run"
 
 
-def possible_run_commands(table: RunTable, simulator: Simulator) -> list[Command]:
+def candidate_runs(table: RunTable, simulator: Simulator) -> list[Candidate]:
     """List the runs that could be recorded: recorded runs again, reversed, slower, or with a control moved otherwise.
 
     At most four recorded runs are taken, those that differ in their controls; without any, runs can only be repeated. A
     function of the time may hold for constant controls alone, as a step response does: unless the simulator is a law,
     only a control that varies in a recorded run does so again.
     """
-    out, run = list[Command](), table.run or unused_name(_RUN, table.columns)
+    out, run = list[Candidate](), table.run or unused_name(_RUN, table.columns)
     reading, settable = simulator.reading, [name for name in simulator.controls if name in table.covariates]
     ends = {k: (float(np.nanmin(table.covariates[k])), float(np.nanmax(table.covariates[k]))) for k in settable}
     varies = {name for name in settable for rows in table.rows_by_scan() if np.ptp(table.covariates[name][rows]) > 0}
     free = set(settable) if simulator.law is not None or table.time is None else varies
     for rows in _rows_of_distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
-        kept = rows[:: -(-len(rows) // MOST_READINGS)]
+        kept = rows[:: -(-len(rows) // MOST_ADVISED_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
         for kind, words, columns, slower in _variations_of_run(table, kept, ends, free, of):
             called = unused_name(f"{name} {kind}", table.scan_names)
@@ -73,7 +73,7 @@ def possible_run_commands(table: RunTable, simulator: Simulator) -> list[Command
             made = replace(taken, columns={**taken.columns, **changed}, run=run, like=like, first_row=len(table))
             unit = _minutes_of_time_unit(made, simulator.time_unit)
             minutes = len(made) * _A_READING if unit is None else float(np.ptp(made.time_s)) * unit
-            out.append(Command(kind, words, cast(Plan, made), _BREAK + minutes))
+            out.append(Candidate(kind, words, cast(Plan, made), _BREAK + minutes))
     return out
 
 
@@ -325,15 +325,15 @@ class SimulatorApparatus(Apparatus):
 
     def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
-    ) -> list[Command]:
-        return possible_run_commands(cast(RunTable, plan), self.system.simulator)
+    ) -> list[Candidate]:
+        return candidate_runs(cast(RunTable, plan), self.system.simulator)
 
-    def plan_of_alternatives(self, commands: Sequence[Command], after: Plan) -> Plan:
+    def plan_of_alternatives(self, commands: Sequence[Candidate], after: Plan) -> Plan:
         first, *more = (cast(RunTable, command.plan) for command in commands)
         return cast(Plan, append_tables(first, more))
 
-    def plan_of_sequence(self, commands: Sequence[Command], after: Plan) -> Plan:
-        recorded, out = cast(RunTable, after), list[Command]()
+    def plan_of_sequence(self, commands: Sequence[Candidate], after: Plan) -> Plan:
+        recorded, out = cast(RunTable, after), list[Candidate]()
         for command in commands:
             table = cast(RunTable, command.plan)
             if table.time is not None and not recorded.time_begins_anew and out:

@@ -126,9 +126,9 @@ class Hypothesis:
 class Judged:
     """The verdict on a recording, with probabilities.
 
-    `combination`: the most probable set of effects, sorted; () if clean or none is named, ("unknown",) if unknown. Of a
-    simulator, if only the `shared` effects, which nearly all hypotheses have, can be named, these and others of the
-    `leader`, the set by which the model is repaired, with more than half the probability. `p_value`: of the global test
+    `combination`: the effects of the verdict, sorted; () if clean or none is named, ("unknown",) if unknown. Where no
+    hypothesis decides but nearly all have some effects, the `shared` ones, it holds these, and those of the `leader`
+    with a probability above one half. The model is repaired by the `leader`. `p_value`: of the global test
     of the mean, under the noise model found. `hypotheses`: all, most probable first. `unknown_shares`: probability of
     each form, such as "place", that an unknown effect could have. `too_little`: whether there are too few readings for
     a verdict, or all are equal. `withdrawn`: whether the leader predicts held-out readings far worse than the null.

@@ -14,7 +14,7 @@ from probewise._writing import Output, StagedFiles
 from probewise.calibration import write_sensor
 from probewise.diagnosis import (
     ALARM,
-    MOST_READINGS,
+    MOST_ADVISED_READINGS,
     NEXT_PLAN,
     TO_SEPARATE,
     Alias,
@@ -384,7 +384,11 @@ def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
             " and ".join(map(effect_in_words, a.effects)),
             number_text(a.cosine, 3),
             typeset_numbers(a.settle_by),
-            "–" if not a.readings else str(a.readings) if a.readings < MOST_READINGS else f"{MOST_READINGS} or more",
+            "–"
+            if not a.readings
+            else str(a.readings)
+            if a.readings < MOST_ADVISED_READINGS
+            else f"{MOST_ADVISED_READINGS} or more",
         )
         for a in aliases
     )

@@ -19,7 +19,7 @@ from probewise.diagnosis.search.hypotheses import (
     Evidences,
     Refits,
     _amplitudes_in_residual,
-    posterior_of,
+    hypothesis_probabilities,
 )
 from probewise.diagnosis.search.search import search_with_formulas
 from probewise.effects import Extent
@@ -197,7 +197,7 @@ def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):
 def _refit_favoured(state):
     def posterior():
         own = Evidences(state.candidates, state.screened_log_evidences())
-        return posterior_of(own, state.prior, certain=(), n_forms=1)
+        return hypothesis_probabilities(own, state.prior, certain=(), n_forms=1)
 
     searching._refit_favoured_by_screening(state, posterior)
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.hypotheses import Evidences, Searched, posterior_of
+from probewise.diagnosis.search.hypotheses import Evidences, Searched, hypothesis_probabilities
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 
@@ -35,7 +35,7 @@ EVIDENCES = Evidences(
 
 
 def posterior(evidences=EVIDENCES):
-    return posterior_of(evidences, PRIOR, certain=(), n_forms=2)
+    return hypothesis_probabilities(evidences, PRIOR, certain=(), n_forms=2)
 
 
 def test_probabilities_are_prior_times_evidence_summed_over_orders():

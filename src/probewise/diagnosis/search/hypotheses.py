@@ -50,9 +50,9 @@ from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-# Nats that are expected between two hypotheses, below which readings do not tell them apart: the contract's odds of 20
-# to 1. A noise model, SSF order or proposal that is as far behind the best does not say what to refit next. This may
-# miss hypotheses: a refit sometimes gains 8 nats over its screening.
+# Nats that are expected between two hypotheses, below which readings do not tell them apart: odds of 20 to 1. A noise
+# model, SSF order or proposal that is as far behind the best does not say what to refit next. This may miss hypotheses:
+# a refit sometimes gains 8 nats over its screening.
 ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 # Nats behind the best refit: a fit so far behind is weighed once, and one of a law that stays there is given up. Where
@@ -65,7 +65,7 @@ _MANY = 12  # nodes of one effect above which they are thinned before combinatio
 # Nats behind the best to which refined nodes must be able to raise a noise model: further back it does not count.
 _NOISE_NODES_REFINED_WITHIN = 10.0
 
-Hypothesis: TypeAlias = tuple[Names, Names]
+EffectNames: TypeAlias = tuple[Names, Names]
 """Names of the effects on the mean, and on the noise."""
 
 K = TypeVar("K", bound=Hashable)
@@ -360,12 +360,12 @@ _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicate
 class Refits:
     """The refits of one recording, each made once; a second search of the recording reuses them.
 
-    `sensor` is the given null, if any; `templates` caches the templates of effects about fits; `known` are candidates
-    with their refits with one more effect, by the candidate's form and names, the effect, and the nats against it;
-    `plain` are refits of the null under the simplest noise.
+    `given_null` is there if one is given; `templates` caches the templates of effects about fits; `known` are
+    candidates with their refits with one more effect, by the candidate's form and names, the effect, and the nats
+    against it; `plain` are refits of the null under the simplest noise.
     """
 
-    sensor: Null | None
+    given_null: Null | None
     noises: NoiseModels
     templates: TemplateCache
     known: dict[tuple[int, Names, Effect, float], tuple[WeighedFit, Extended]] = field(default_factory=dict, repr=False)
@@ -433,7 +433,7 @@ class Refits:
         if self.plain and self.plain[-1].evidence[certain].log_z > null.evidence[certain].log_z:
             return self.plain[-1]
         law = null.evidence[certain].likeliest_law
-        starts = np.stack([null.found.z, *cast(Null, self.sensor).starts])
+        starts = np.stack([null.found.z, *cast(Null, self.given_null).starts])
         found = self._fit_from_best_start(null.found.model, starts, law)
         self.plain.append(WeighedFit(found, law, self.noises.evidence_by_noise(found), 0.0, 0.0, {}))
         return self.plain[-1]
@@ -522,9 +522,9 @@ class Refits:
                     start = np.concatenate([z, model.z_of_last_effect(setting[None, :])[0]])
                     if all(np.abs(start - other).max() > _SAME_START for other in starts):
                         starts.append(start)
-        if self.sensor is not None and len(self.sensor.starts) > 1:
+        if self.given_null is not None and len(self.given_null.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
-            starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
+            starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.given_null.starts]
         fitted = [self.fit_and_weigh(model, np.stack(starts), seen[0][0].law, beyond=parent)]
         if seen[0][0].law.has_memory:  # to a walk a slow effect is noise: its amplitude would stay at 0
             plain = self.noises.certain
@@ -587,7 +587,7 @@ class Evidences:
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
-    screened: Mapping[Hypothesis, float] = field(default_factory=dict)
+    screened: Mapping[EffectNames, float] = field(default_factory=dict)
     unknown: Mapping[tuple[int, Names, Names], float] = field(default_factory=dict)
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
@@ -667,10 +667,10 @@ class Evidences:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class HypothesisProbabilities:
     """Probabilities of hypotheses by (names on the mean, names on the noise)."""
 
-    probabilities: Mapping[Hypothesis, float]
+    probabilities: Mapping[EffectNames, float]
 
     @property
     def marginal_over_noise(self) -> dict[Names, float]:
@@ -687,7 +687,9 @@ class Posterior:
         return max(marginal, key=lambda noise: marginal[noise])
 
 
-def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
+def hypothesis_probabilities(
+    evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int
+) -> HypothesisProbabilities:
     """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
     log_z = _log_sums(
         ((names, noise), or_impossible(evidence.log_z))
@@ -712,7 +714,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         log_p[key] = level
     log_p = dict(sorted(log_p.items(), key=lambda item: (-item[1], *map(_plainness, item[0]))))
     total = float(logsumexp(list(log_p.values())))
-    return Posterior({key: math.exp(value - total) for key, value in log_p.items()})
+    return HypothesisProbabilities({key: math.exp(value - total) for key, value in log_p.items()})
 
 
 def _plainness(names: Names) -> tuple[int, int, Names]:
@@ -747,7 +749,7 @@ class Searched:
     misfit_templates: MisfitTemplates
     refits: Refits
     evidences: Evidences
-    posterior: Posterior
+    posterior: HypothesisProbabilities
 
     @property
     def certain(self) -> Names:
@@ -760,7 +762,7 @@ class Searched:
 
     def with_evidences(self, evidences: Evidences) -> Searched:
         """Return the result with other evidences, and the probabilities that follow from them."""
-        posterior = posterior_of(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
+        posterior = hypothesis_probabilities(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
         return replace(self, evidences=evidences, posterior=posterior)
 
     def with_prior_probabilities(self) -> Searched:
@@ -772,7 +774,7 @@ class Searched:
             and not is_out_of_vocabulary(name)
             and name_of_first_copy(name) is None
         ]
-        return replace(self, posterior=Posterior(self.prior.single_effect_priors(on_mean, self.certain)))
+        return replace(self, posterior=HypothesisProbabilities(self.prior.single_effect_priors(on_mean, self.certain)))
 
     def best_refit_of(self, names: Names, noise: Names) -> WeighedFit | None:
         """Return the refit of these effects with the number of Gaussians of largest evidence under a noise, if any."""

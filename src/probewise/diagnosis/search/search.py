@@ -30,17 +30,17 @@ from probewise.diagnosis.search.hypotheses import (
     EXTENDED_WITHIN,
     FAR_BEHIND,
     WITH_MEMORY,
+    EffectNames,
     Evidences,
-    Hypothesis,
+    HypothesisProbabilities,
     MisfitTemplates,
     NoiseModels,
-    Posterior,
     Refits,
     Searched,
     WeighedFit,
     effects_out_of_vocabulary,
     expected_log_bayes_factor,
-    posterior_of,
+    hypothesis_probabilities,
 )
 from probewise.diagnosis.sensors import (
     default_sensor,
@@ -67,8 +67,8 @@ from probewise.effects.noise import lattice_step, noise_sd
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
-# Nats behind the best so far: screening errs by as much near a fit that one effect distorts. Within three, single
-# effects that screening did not favour were lost.
+# Nats behind the best so far: screening errs by as much near a fit that one effect distorts. Within three nats,
+# screening misses single effects.
 _REFITTED_WITHIN = 6.0
 # Share of the largest gain that an effect must promise to be refitted where it is 40 nats behind: refits of a pendulum
 # gain up to 1.6 times what screening sees, and what was left out is screened again beside the leader.
@@ -86,8 +86,8 @@ _ORDERS_WITHIN = 100.0
 # predictions. Below, those of the null are near enough, and are at hand.
 _FAR_FROM_NULL = 100.0
 _REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
-# Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does. Of the
-# best twelve it was found in none of 6 recordings with seven other columns; of the best sixty in all.
+# Effects that pairs are screened of, the best alone. A difference of two columns may explain what neither does, so many
+# are paired: of twelve it was in none of 6 recordings with seven other columns, of sixty in all.
 _PAIRED = 60
 _MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
 
@@ -98,11 +98,11 @@ class SearchState:
 
     `effects`: effects on the mean, by name; `tried_always`: effects that are always refitted alone, whatever their
     score by screening; `progress`: called at every refit; `share_is_spent`: function of a share: whether that share of
-    this search's budget of refits is spent; `share`: share of the budget that may be spent by now. `sensors`: nulls by
-    SSF order; `about_null`, `about_parts`: log evidence by screening about a null, and about a fit with all but one of
-    the effects; `undetected`: combinations in which a refit has shown one effect to be insignificant; `pruned`:
-    combinations out of vocabulary that are aliased with named ones; `optimism`: nats by which screening promises too
-    much at least.
+    this search's budget of refits is spent; `share`: share of the budget that may be spent by now. `nulls_by_order`:
+    nulls by SSF order; `about_null`, `about_parts`: log evidence by screening about a null, and about a fit with all
+    but one of the effects; `undetected`: combinations in which a refit has shown one effect to be insignificant;
+    `pruned`: combinations out of vocabulary that are aliased with named ones; `optimism`: nats by which screening
+    promises too much at least.
     """
 
     effects: Mapping[str, Effect]
@@ -113,9 +113,9 @@ class SearchState:
     share_is_spent: Callable[[float], bool] = lambda share: False
     share: float = 1.0
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
-    sensors: dict[int, Null] = field(default_factory=dict)
-    about_null: dict[Hypothesis, float] = field(default_factory=dict)
-    about_parts: dict[Hypothesis, float] = field(default_factory=dict)
+    nulls_by_order: dict[int, Null] = field(default_factory=dict)
+    about_null: dict[EffectNames, float] = field(default_factory=dict)
+    about_parts: dict[EffectNames, float] = field(default_factory=dict)
     undetected: set[Names] = field(default_factory=set)
     pruned: set[Names] = field(default_factory=set)
     optimism: float = 0.0
@@ -257,7 +257,7 @@ class SearchState:
         self.undetected.discard(both.names)
         return self.store_candidate(both) if both.is_significantly_better(between) else None
 
-    def screened_log_evidences(self) -> dict[Hypothesis, float]:
+    def screened_log_evidences(self) -> dict[EffectNames, float]:
         """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.
 
         Screening about a fit with part of the effects is more accurate than about the null, which is corrected for
@@ -308,8 +308,8 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 
     def fit_and_keep(sensor: Null, starts: FloatArray, law: NoiseLaw) -> WeighedFit:
-        state.progress("fitting the sensor alone", len(state.sensors), n_forms)
-        state.sensors[sensor.n_gaussians] = sensor
+        state.progress("fitting the model without effects", len(state.nulls_by_order), n_forms)
+        state.nulls_by_order[sensor.n_gaussians] = sensor
         return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), recording.plan), starts, law))
 
     law = white_noise_of_recording(recording, least=noises.least_sd)
@@ -429,7 +429,7 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     Returns `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
-    is_far = state.refits.sensor is not None and parent.log_z > null.log_z + _FAR_FROM_NULL
+    is_far = state.refits.given_null is not None and parent.log_z > null.log_z + _FAR_FROM_NULL
     against = state.penalty_of_extending(parent)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
@@ -499,7 +499,7 @@ def _proposals_under_simplest_noise(state: SearchState, null: WeighedFit) -> lis
     effect acts: beside a random walk, a tank that runs over need not be full. Otherwise there are no proposals. Their
     score is infinite, as of others that screening about the null cannot judge.
     """
-    if state.refits.sensor is None or not state.refits.likeliest_law(null).has_memory:
+    if state.refits.given_null is None or not state.refits.likeliest_law(null).has_memory:
         return []
     plain = state.refits.null_under_simplest_noise(null)
     scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
@@ -670,22 +670,24 @@ def search(
         fit_nulls(state, prepared, max_order=max_order)
         misfit_templates = _build_misfit_templates(state, prepared)
     else:
-        state.sensors |= after.nulls
+        state.nulls_by_order |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
         misfit_templates = replace(after.misfit_templates, about=state.null.found)
     unknown = UnknownEffects(state, misfit_templates.unknown_bases, misfit_templates.covariates)
 
     def found() -> Searched:
         own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
-        posterior = posterior_of(own, prior, certain=refits.noises.certain, n_forms=len(state.sensors))
-        return Searched(prepared, prior, state.sensors, misfit_templates, refits, own, posterior)
+        posterior = hypothesis_probabilities(
+            own, prior, certain=refits.noises.certain, n_forms=len(state.nulls_by_order)
+        )
+        return Searched(prepared, prior, state.nulls_by_order, misfit_templates, refits, own, posterior)
 
     select_forward(state, depth=depth)
     # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
     unknown.weigh_beside([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
     _refit_favoured_by_screening(state, lambda: found().posterior)
     state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, refits.noises)
-    progress("weighing what has no name")
+    progress("comparing unknown effects")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
     out = found()
@@ -694,7 +696,7 @@ def search(
     return out
 
 
-def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior]) -> None:
+def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], HypothesisProbabilities]) -> None:
     """Refit the combinations that are probable by screening alone, until none is or six were refitted.
 
     After six, all other screened evidences are reduced (`state.optimism`) by the least amount by which a refit fell
@@ -705,14 +707,14 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
     shortfalls: list[float] = []
     screened = set[WeighedFit]()
     while len(shortfalls) < _MOST_REFITTED_LATE:
-        state.progress("refitting what screening believes in", len(shortfalls), _MOST_REFITTED_LATE)
+        state.progress("refitting combinations favoured by screening", len(shortfalls), _MOST_REFITTED_LATE)
         by_mean = posterior().marginal_over_noise
         settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
         if by_mean.get(names, 0.0) <= _REFITTED_LATE or not names:
             return
         part = state.largest_refitted_part(names)
-        if state.refits.sensor is not None and part.names and part not in screened:
+        if state.refits.given_null is not None and part.names and part not in screened:
             screened.add(part)
             proposals_for(state, part, {})
             continue

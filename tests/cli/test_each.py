@@ -1,6 +1,8 @@
 """`probewise diagnose --each`: a folder and a row for each recording, whatever one of them holds."""
 
 import csv
+import os
+import threading
 
 import numpy as np
 import pytest
@@ -71,3 +73,20 @@ def test_no_file_of_a_person_is_lost_in_the_folder_of_a_recording(tmp_path, caps
         assert main(["diagnose", write_line(tmp_path / name), *given]) == 2
         assert said in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"out", "line.py", "a.csv", "b.csv", "..csv", "...csv"}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")
+def test_a_recording_that_is_a_pipe_is_waited_for_with_a_word(tmp_path, capsys):
+    (tmp_path / "line.py").write_text(LINE)
+    os.mkfifo(tmp_path / "a.csv")
+    threading.Thread(target=lambda: (tmp_path / "a.csv").write_text("no table"), daemon=True).start()
+    given = [
+        str(tmp_path / "a.csv"),
+        "--simulator",
+        str(tmp_path / "line.py"),
+        "--each",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(["diagnose", *given, "--quiet"]) == 0
+    assert "a.csv is a pipe: reading it waits" in capsys.readouterr().err

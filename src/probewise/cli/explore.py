@@ -6,7 +6,7 @@ import argparse
 import math
 import os
 import webbrowser
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -230,17 +230,18 @@ class Search:
         if step.number == 1 and not step.replayed:
             remove_earlier_results(self.out, self.files)
 
-        def written(name: str, content: bytes) -> bytes:
+        def write(name: str, content: bytes) -> bytes:
             (self.out / name).parent.mkdir(exist_ok=True)
             write_bytes_atomically(self.out / name, content)
             return content
 
-        frame = f"frames/{step.number:03d}.png"  # a disk without room for it ends no search
-        self.frames.append(self.drawings.draw(frame, lambda: written(frame, self._draw_frame(step, shadow))))
-        if self.arguments.live:
-            page = self.drawings.draw("live.html", lambda: written("live.html", self._live_page(step)))
-            if page and len(self.frames) == 1:
-                webbrowser.open((self.out / "live.html").absolute().as_uri())
+        def draw_and_write(name: str, drawer: Callable[[], bytes]) -> bytes:
+            drawn = self.drawings.draw(name, drawer)
+            return drawn and self.drawings.draw(name, lambda: write(name, drawn))  # a full disk ends no search
+
+        self.frames.append(draw_and_write(f"frames/{step.number:03d}.png", lambda: self._draw_frame(step, shadow)))
+        if self.arguments.live and draw_and_write("live.html", lambda: self._live_page(step)) and step.number == 1:
+            webbrowser.open((self.out / "live.html").absolute().as_uri())
 
     def _live_page(self, step: Step) -> bytes:
         trust, earlier = self.experiment.trust, self.steps[:-1]
@@ -364,15 +365,8 @@ def remove_earlier_results(out: Path, files: Sequence[Path]) -> None:
     Without a result.json there are none, but perhaps somebody's calibration or files of such names.
     """
     spared = {os.path.realpath(path) for path in files}
-    names = (
-        "report.html",
-        "run.gif",
-        "live.html",
-        "frames/[0-9][0-9][0-9].png",
-        "samples.csv",
-        "sensor.json",
-        "result.json",
-    )
+    drawn, of_machine = ("report.html", "run.gif", "live.html"), ("samples.csv", "sensor.json", "result.json")
+    names = (*drawn, "frames/[0-9][0-9][0-9].png", *of_machine)
     for pattern in names if (out / "result.json").exists() else ():
         for path in out.glob(pattern):
             if os.path.realpath(path) not in spared:

@@ -86,8 +86,7 @@ def test_a_plan_is_recorded(bricks, plan_file, tmp_path, capsys):
 
 
 def test_a_recording_that_a_dead_line_ended_goes_on(bricks, plan_file, tmp_path, capsys):
-    # Each sheet that was laid is looked at: once over its black, once over its white.
-    bricks.update({0: 1, 1: 7, 2: 5})
+    bricks.update({0: 1, 1: 5, 2: 3})
     out = tmp_path / "rec.csv"
     arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
     status, said = run(capsys, *arguments)
@@ -123,7 +122,7 @@ class Terminal(io.StringIO):
 LOWERING = [
     ("\n", ["arm", "heights", "524,260", "300,200"]),
     ("", ["arm", "scan", "300,200", "310,200"]),
-    ("\n", ["arm", "record", "PLAN", "--out", "OUT"]),
+    ("\n\n", ["arm", "record", "PLAN", "--out", "OUT"]),
     ("", ["explore", "--sensor", "SENSOR", "--out", "OUT", "--model", "naive"]),
     ("\n\n", ["investigate", "--plan", "PLAN", "--out", "OUT"]),
 ]
@@ -219,11 +218,11 @@ def stop_as_it_rises(bricks, monkeypatch):
 def test_a_stop_while_the_sensor_rises_keeps_the_reading_and_asks_for_nothing(
     n_read, stop_as_it_rises, bricks, plan_file, tmp_path, capsys, monkeypatch
 ):
-    """The motors are released before the reading is written. Two looks at the sheet come first."""
+    """The motors are released before the reading is written."""
     at_rest = []
     spy = then(write_recording, lambda: at_rest.append(bricks["opened"][-1].at_rest))
     monkeypatch.setattr("probewise.cli._record.write_recording", spy)
-    stop_as_it_rises(2 + n_read)
+    stop_as_it_rises(n_read)
     out = tmp_path / "rec.csv"
     arguments = ["arm", "record", plan_file, "--out", out, "--arm", "nxt:x", "--quiet"]
     status, said = run(capsys, *arguments)

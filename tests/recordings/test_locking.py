@@ -38,15 +38,15 @@ def test_a_folder_that_is_missing_is_named(tmp_path):
 
 
 def test_what_a_killed_writer_left_is_removed_by_the_next_and_what_a_living_one_holds_is_not(tmp_path):
-    (tmp_path / ".a.killed.part").write_text("half")
+    (tmp_path / ".a.01234567.part").write_text("half")
     (tmp_path / ".b.other.part").write_text("of another name")
-    with (tmp_path / ".a.living.part").open("w") as living:
+    with (tmp_path / ".a.89abcdef.part").open("w") as living:
         if os.name != "nt":
             import fcntl
 
             fcntl.flock(living, fcntl.LOCK_EX)
         write_bytes_atomically(tmp_path / "a", b"whole")
-        assert {p.name for p in tmp_path.iterdir()} == {"a", ".a.living.part", ".b.other.part"}
+        assert {p.name for p in tmp_path.iterdir()} == {"a", ".a.89abcdef.part", ".b.other.part"}
     write_bytes_atomically(tmp_path / "a", b"again")
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a": b"again", ".b.other.part": b"of another name"}
 

@@ -209,7 +209,7 @@ def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part
         {n: e for n, e in prepared_line.effects.items() if n not in prepared_line.noise_effect_names},
         searched.prior, searched.refits,
     )  # fmt: skip
-    state.sensors |= searched.nulls
+    state.nulls_by_order |= searched.nulls
     state.candidates |= {key: f for key, f in searched.evidences.fits.items() if key[1] in ((), ("sensitivity:room",))}
     pair = ("offset_drift", "sensitivity:room")
     state.about_null[pair, ()] = state.null.log_z + 500.0

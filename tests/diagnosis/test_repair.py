@@ -10,9 +10,11 @@ import numpy as np
 from probewise.diagnosis.diagnosis import (
     Diagnosis,
     PredictionAndResiduals,
+    _controls_before_time,
     predictions_before_and_after,
 )
 from probewise.diagnosis.light_sensor import LightSensorApparatus
+from probewise.diagnosis.locate import Place
 from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.prepared import Prepared, rows_to_diagnose
 from probewise.recordings import Plan, Recording, Uniform
@@ -105,3 +107,18 @@ def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_re
     np.testing.assert_array_equal(after.residuals[used], 0.0)
     np.testing.assert_array_equal(after.readings[~used], 5.0)
     np.testing.assert_array_equal(after.residuals[~used], 2.0)
+
+
+def place(covariate, values, start, end):
+    return Place(covariate, None, start, end, 0.001, 5.0, *[np.zeros(0)] * 2, values=values)
+
+
+def test_a_control_comes_before_time_where_both_hold_the_same_rows():
+    time = np.arange(100.0)
+    power = np.minimum(time // 10, 9.0)
+    rows = [place("level", time, 0, 9), place("time", time, 50, 89), place("power_w", power, 5.0, 8.0)]
+    ordered = [p.covariate for p in _controls_before_time(rows, ("power_w",))]
+    assert ordered == ["level", "power_w", "time"]
+    assert [p.covariate for p in _controls_before_time(rows, ())] == ["level", "time", "power_w"]
+    elsewhere = [*rows[:2], place("power_w", power, 0.0, 3.0)]
+    assert [p.covariate for p in _controls_before_time(elsewhere, ("power_w",))] == ["level", "time", "power_w"]

@@ -105,6 +105,11 @@ class Apparatus(ABC):
         return True
 
     @property
+    def controls(self) -> Sequence[str]:
+        """Covariates that a person sets and has declared as such."""
+        return ()
+
+    @property
     def takes_one_measurement_at_a_time(self) -> bool:
         """Whether a plan holds one of the candidate measurements only, since its file would not keep two apart."""
         return False

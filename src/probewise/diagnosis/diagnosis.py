@@ -22,6 +22,7 @@ from probewise._kinds import checked_texts, require_kind, require_like, require_
 from probewise.diagnosis.advice import NextMeasurement, choose_next_measurement, is_settled
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.best_repair import BestRepair, Improvement, improvement_and_correction, judged_and_best_repair
+from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.findings import (
     EffectFound,
     Formula,
@@ -43,6 +44,7 @@ from probewise.diagnosis.search.search import MAX_ORDER, search, search_with_for
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.diagnosis.sensors import SensorPrior
 from probewise.diagnosis.verdict import (
+    N_DRAWS,
     GlobalTest,
     Grounds,
     Judged,
@@ -122,6 +124,9 @@ def predictions_before_and_after(
     return shown(best.calibrated, np.zeros(len(everything))), shown(best.repaired, by_rows)
 
 
+_SAME = 0.8  # overlap from which two places hold the same rows
+
+
 def locate_effects_and_residuals(
     searched: Searched,
     test: GlobalTest,
@@ -137,7 +142,7 @@ def locate_effects_and_residuals(
 
     `searched`, `test`, `judged`, `best`: result of the search; global test of the null; the verdict; the repair.
     """
-    prepared, problem = searched.prepared, test.problem
+    prepared, problem, law = searched.prepared, test.problem, test.problem.law
     covariates, residuals = searched.misfit_templates.covariates, test.null.found.residuals
     plan, found = prepared.recording.plan.take(prepared.usable_rows), best.fit.found
     scans = next((c for c in covariates if c.name == "scan"), None)
@@ -150,10 +155,25 @@ def locate_effects_and_residuals(
             named += places_of_effect(*seen, p_value=judged.p_value, size=size)
     find = partial(significant_places, covariates=covariates, scan_names=prepared.recording.plan.scan_names)
     scanned = find(problem, residuals=residuals, draws=test.draws)
+    if judged.verdict == "unknown" and not (named or scanned) and law.share:
+        # Under heavy-tailed noise, residuals in outlying readings only are not significant.
+        white = Linearised.of(test.null.found, law.without_tail_or_rounding())
+        scanned = find(white, residuals=residuals, draws=white.draw_null_residuals(N_DRAWS, rng=rng))
     first: dict[str, Place] = {}
-    for place in [*named, *scanned]:
+    for place in [*named, *_controls_before_time(scanned, prepared.apparatus.controls)]:
         first.setdefault(place.figure_name, place)
     return tuple(_place_in_everything(place, prepared) if prepared.is_thinned else place for place in first.values())
+
+
+def _controls_before_time(places: Sequence[Place], controls: Sequence[str]) -> list[Place]:
+    """Move the place of a control before that of time if they hold the same rows: what a person moves is the cause."""
+    out = list(places)
+    for place in places:
+        at = next((k for k, other in enumerate(out) if other is place), 0)
+        before = [k for k in range(at) if out[k].covariate in ("time", "row") and place.overlap(out[k]) >= _SAME]
+        if place.covariate in controls and before:
+            out.insert(before[0], out.pop(at))
+    return out
 
 
 def _place_in_everything(place: Place, prepared: Prepared) -> Place:

@@ -106,6 +106,11 @@ class Place:
             return np.isfinite(values)
         return np.asarray((values >= self.start) & (values <= self.end))
 
+    def overlap(self, other: Place) -> float:
+        """Return the readings in both windows, as a share of those in either."""
+        either = int(np.sum(self._within | other._within))
+        return float(np.sum(self._within & other._within)) / either if either else 0.0
+
 
 def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], draws: FloatArray) -> float:
     """Test for a missing effect on the mean, by the weighted mean of the Bayes factors of all templates.

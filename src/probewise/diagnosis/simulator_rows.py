@@ -176,6 +176,10 @@ class SimulatorApparatus(Apparatus):
         return self.about.rows_are_in_order
 
     @property
+    def controls(self) -> tuple[str, ...]:
+        return self.system.simulator.controls
+
+    @property
     def takes_one_measurement_at_a_time(self) -> bool:
         # Without a column of runs a file is one run: a second one in next.csv would begin where the first ended, not
         # from `states` as it is planned, and a lag or a backlash would reach from one into the other.

@@ -516,7 +516,7 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
 def covariate_of_unknown(family: str, shows_in: Sequence[str]) -> str:
     """Return the covariate in which an unknown effect shows most: that of its most probable form, if it shows there.
 
-    If that is the time, it is the first of the covariates `shows_in`.
+    If that is the time, it is the first of the covariates `shows_in`, which a control is where both say the same.
     """
     likeliest, first = family.partition(",")[0].removesuffix(" within scans"), next(iter(shows_in), "")
     return likeliest if likeliest in shows_in and likeliest not in ("time", "row") else first

@@ -39,7 +39,7 @@ BESIDE = {
     "nested.importance",
     "inquiry.grid",
     "inquiry.forecast",
-    "experiment.journal",
+    "arm.carry_out",  # readings as a recording
     "calibration.fields",
     "calibration.priors",
 }

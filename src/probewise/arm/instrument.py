@@ -1,4 +1,4 @@
-"""Instruments: poses, readings, interface, places within reach (paper, section 2.1)."""
+"""Instruments: poses, readings, interface, places within reach (paper, section 2.1, "Robotic Arm Test Bed")."""
 
 from __future__ import annotations
 

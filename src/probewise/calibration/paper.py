@@ -1,8 +1,9 @@
 """The SSF of a recording by the paper's method: nested sampling of each number of Gaussians; the evidence chooses one.
 
-Paper, section 2.7: Pr(theta | D, I) = Pr(theta | I) Pr(D | theta, I) / Z (eq. 17), with the parameters theta of N
-Gaussians and the two levels, and the evidence Z = Pr(D | I) of the order N (eq. 18). `estimate_ssf` is its loop;
-`calibrate` searches each order by `search_prior_of_order`, which can refine the evidence.
+Paper, section 2.7, "Estimating SSF MoG Model Parameters": Pr(theta | D, I) = Pr(theta | I) Pr(D | theta, I) / Z (eq.
+17), with the parameters theta of N Gaussians and the two levels, and the evidence Z = Pr(D | I) of the order N (eq.
+18). `estimate_ssf` is its loop; `calibrate` searches each order by `search_prior_of_order`, which can refine the
+evidence.
 """
 
 from __future__ import annotations

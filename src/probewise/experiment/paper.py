@@ -1,9 +1,9 @@
 """The paper's robot: a nested sampling run after every reading, fifty samples, entropy of their predictions.
 
-`find_shape` is the paper's loop (section 2.3, eq. 5); `explore --method paper` takes the same steps through
-`method.NestedSampling`. The sensor model is given: for `explore`, the mean of the sampled SSFs merged into 32 Gaussians
-(`from_sensor`). Unlike the paper: sigma has proper bounds, and half of the live points are replaced at a time; the sds
-that end a run are those of all weighted samples (more in docs/explanation/errata.md).
+Paper, section 2.3, "The Machine Learning System", eq. 5: `find_shape` is the loop; `explore --method paper` takes the
+same steps through `method.NestedSampling`. The sensor model is given: for `explore`, the mean of the sampled SSFs
+merged into 32 Gaussians (`from_sensor`). Unlike the paper: sigma has proper bounds, and half of the live points are
+replaced at a time; the sds that end a run are those of all weighted samples (more in docs/explanation/errata.md).
 """
 
 from __future__ import annotations

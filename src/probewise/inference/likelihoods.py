@@ -1,4 +1,7 @@
-"""Likelihoods of readings (paper, eq. 6: naive; eq. 11 and 19: Student-t; eq. 20: its product over data sets).
+"""Likelihoods of readings.
+
+Paper, sections 2.4.1, "The Naive Likelihood" (eq. 6), 2.5, "The SSF Likelihood" (eq. 11: Student-t), and 2.7 (eq. 19
+and 20: its product over data sets).
 
 `Naive` is the paper's sensor of two levels. The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal
 density has (2 pi sigma^2)^(-1/2) and a negative one.

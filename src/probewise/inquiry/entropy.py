@@ -1,4 +1,4 @@
-"""The inquiry engine (paper, section 2.3, figures 2 and 8).
+"""The inquiry engine (paper, section 2.3, "The Machine Learning System", figures 2 and 8).
 
 Fifty hypotheses, drawn from the posterior, predict a noise-free reading at every place of a fine grid (the paper: "a
 sample of what measurement could be expected"). The predictions at a place fall into bins as wide as the sensor's step;

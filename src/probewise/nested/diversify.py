@@ -1,4 +1,7 @@
-"""Make repeated posterior samples distinct by Metropolis-Hastings (paper, section 2.3)."""
+"""Make repeated posterior samples distinct by Metropolis-Hastings.
+
+Paper, section 2.3, "The Machine Learning System".
+"""
 
 from __future__ import annotations
 

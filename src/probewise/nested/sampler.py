@@ -1,6 +1,7 @@
-"""Nested sampling (Skilling 2006), the inference engine (paper, sections 2.3 and 2.7: Z of eq. 18).
+"""Nested sampling (Skilling 2006), the inference engine.
 
-The worst live points are removed, which shrinks the volume, and new ones of greater likelihood are drawn.
+Paper, sections 2.3, "The Machine Learning System", and 2.7 (the evidence Z, eq. 18). The worst live points are removed,
+which shrinks the volume, and new ones of greater likelihood are drawn.
 
 `run` is the entry point, `replace_worst_live_points` the step, and `RemainingEvidence` and `EvidenceChange` say when to
 stop.

@@ -1,4 +1,4 @@
-"""Shapes that may lie on the field (paper, section 2.2, eq. 1: a circle).
+"""Shapes on the field (paper, section 2.2, "The Circle Characterization Experiment", eq. 1: a circle).
 
 Each is a prior over named parameters and the region they define; `AnyOf` is the paper's set of shapes. A new shape is
 one short class: a frozen dataclass with `prior` and `region`.

@@ -1,4 +1,4 @@
-"""The paper's naive sensor: it sees only the point under its centre (paper, eq. 6)."""
+"""The paper's naive sensor: it sees one point (paper, section 2.4.1, "The Naive Likelihood", eq. 6)."""
 
 from __future__ import annotations
 

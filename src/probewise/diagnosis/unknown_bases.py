@@ -117,6 +117,16 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
     return replace(bases, templates=tuple(templates)).take_entries(kept)
 
 
+def without_products_like(bases: TemplateBank, formulas: TemplateBank, problem: Linearised) -> TemplateBank:
+    """Return the bases without the products that a template of a formula holds, the fit's parameters projected out."""
+    products = bases.indices_by_label.get(PRODUCTS, np.zeros(0, dtype=np.int64))
+    if products.size == 0 or not formulas.templates:
+        return bases
+    own = OrthonormalBlocks.of(problem, [bases[k] for k in products]).u
+    held = np.any([_are_held(cosines) for cosines in _cosines(formulas, problem, own)], axis=0)
+    return bases.take_entries(np.delete(np.arange(len(bases.labels)), products[held]))
+
+
 def _cosines(bank: TemplateBank, problem: Linearised, columns: FloatArray) -> Iterator[FloatArray]:
     """Yield cosines of orthonormal columns, (n_rows, k), with directions of each template of a group, (n, width, k).
 

@@ -10,7 +10,7 @@ import pytest
 
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.noise import white_noise
-from probewise.diagnosis.search.search import prune_out_of_vocabulary, search
+from probewise.diagnosis.search.search import UnknownEffects, prune_out_of_vocabulary, search
 from probewise.systems import Noise, Simulator, table_for
 
 N_ROWS = 160
@@ -103,3 +103,16 @@ def test_what_predicts_the_same_as_a_name_is_left_out():
     stay, pruned = prune_out_of_vocabulary(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
     assert pruned == {PUSH}
     assert (1, PUSH) not in stay
+
+
+@pytest.mark.parametrize(
+    ("name", "beside", "speaks"),
+    [(-1.0, 0.0, True), (-1.0, 2.5, False), (-4.0, -4.0, False)],
+    ids=["as much, and nothing left", "something left", "far behind"],
+)
+def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
+    state = SimpleNamespace(refits=SimpleNamespace(noises=NOISES), effects_in_vocabulary=[NAME])
+    unknown = UnknownEffects(state, None, (), {(1, (), ()): 0.0, (1, NAME, ()): beside})
+    unknown.drop_superfluous([Held((), -50.0), Held(NAME, name)])
+    assert ((1, (), ()) not in unknown.log_z) == speaks
+    assert (1, NAME, ()) in unknown.log_z

@@ -27,6 +27,7 @@ from probewise.diagnosis.evidence import (
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, Null, fit, fit_each_start
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, SdPrior, rough_sd, rounding_that_hides_noise
+from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.templates import (
@@ -36,11 +37,13 @@ from probewise.diagnosis.templates import (
     log_mean_exp,
 )
 from probewise.effects import NUISANCES, PROPOSAL, Effect, NoiseEffect, is_out_of_vocabulary, name_of_first_copy
+from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.effects.noise import (
     ROUNDING_SEEN_ABOVE,
     correlated_noise,
     lattice_step,
     noise_sd,
+    outliers,
     quantisation,
     random_walk,
 )
@@ -55,6 +58,7 @@ from probewise.sensor import Stage
 # a refit sometimes gains 8 nats over its screening.
 ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
+SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
 # Nats behind the best refit: a fit so far behind is weighed once, and one of a law that stays there is given up. Where
 # an effect gains hundreds of nats, others gain some of them slowly, and most steps of a search were theirs.
 FAR_BEHIND = 40.0
@@ -147,6 +151,10 @@ class WeighedFit:
         """Log evidence under the best noise model."""
         return max(e.log_z for e in self.evidence.values())
 
+    def at_likelier_sd(self, noise: Names) -> NoiseEvidence:
+        """Return the evidence under a noise model, with the calibration's noise sd or another, the larger one."""
+        return max((e for names, e in self.evidence.items() if _unchanged(names) == noise), key=lambda e: e.log_z)
+
     def split_by_sd(self, changed: NoiseEffect) -> WeighedFit:
         """Return a copy with two noise models for each: with the noise sd of the calibration, and with another."""
         by_sd = {noise: evidence.by_sd(changed) for noise, evidence in self.evidence.items()}
@@ -203,6 +211,10 @@ def effects_out_of_vocabulary(mean: Names) -> Names:
 
 def _changed(noise: Names) -> Names:
     return tuple(sorted((*noise, noise_sd.name)))
+
+
+def _unchanged(noise: Names) -> Names:
+    return tuple(name for name in noise if name != noise_sd.name)
 
 
 WITH_MEMORY = frozenset({correlated_noise.name, random_walk.name})
@@ -380,6 +392,7 @@ class Refits:
         model: Model,
         starts: FloatArray,
         law: NoiseLaw,
+        max_steps: int = 30,
         *,
         beyond: WeighedFit | None = None,
     ) -> WeighedFit:
@@ -389,7 +402,7 @@ class Refits:
         significantly better than the fit `beyond` takes over its evidence, to save the computation, unless the noise
         has memory: there the fit may still gain under white noise.
         """
-        found = self._fit_from_best_start(model, starts, law)
+        found = self._fit_from_best_start(model, starts, law, max_steps)
         if beyond is not None and not law.has_memory and not _improves_fit(found, beyond.found, law):
             plain = beyond.with_log_evidence_shifted(-(beyond.log_share + beyond.log_detectable)).evidence
             detectable = beyond.log_detectable
@@ -401,13 +414,13 @@ class Refits:
                 if best.is_practically_equal(law) or max(e.log_z for e in plain.values()) < leads - FAR_BEHIND:
                     break
                 law = best
-                found = self._fit_from_best_start(model, found.z[None, :], law)
+                found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
             else:
                 plain = self.noises.evidence_by_noise(found)
             detectable = log_probability_effects_detectable(found, law, self.templates.usable)
         return WeighedFit(found, law, plain, 0.0, detectable, {}).with_log_evidence_shifted(detectable)
 
-    def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw) -> Fit:
+    def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
         """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
         recording, hopeless = self.noises.recording, math.inf
         if model.sensor.predicts_dearly and self.known:
@@ -418,7 +431,7 @@ class Refits:
             found = min(fits, key=lambda f: f.objective)
             start = found.z
         if found is None or not found.settled:
-            found = fit(model, recording, start, law, hopeless_above=hopeless)
+            found = fit(model, recording, start, law, max_steps=max_steps, hopeless_above=hopeless)
         if not np.isfinite(found.objective):
             text = "the model predicts readings that are not finite; check the model and its prior"
             raise NotConvergedError(text, found)
@@ -434,7 +447,7 @@ class Refits:
             return self.plain[-1]
         law = null.evidence[certain].likeliest_law
         starts = np.stack([null.found.z, *cast(Null, self.given_null).starts])
-        found = self._fit_from_best_start(null.found.model, starts, law)
+        found = self._fit_from_best_start(null.found.model, starts, law, 30)
         self.plain.append(WeighedFit(found, law, self.noises.evidence_by_noise(found), 0.0, 0.0, {}))
         return self.plain[-1]
 
@@ -573,6 +586,7 @@ def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[
     return [first, second] if bound and weights[second] > _VARIANTS_TRIED * weights[first] else [first]
 
 
+_BEYOND_DOUBT = math.log(1000)  # log odds of outlying readings against noise without them
 _TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gains less than half of it
 
 
@@ -627,6 +641,32 @@ class Evidences:
             and all(name.startswith(PROPOSAL) for name in {*names} - {*fit.names})
         ]
         return max(options, key=lambda more: more.evidence[noise].log_z, default=None)
+
+    def only_outlying_readings_differ(self, prior: PriorOdds, certain: Names) -> bool:
+        """Return whether effects on the mean that beat outlying readings change no other readings than those.
+
+        Outlying readings are beyond doubt then without an effect. Jumps before the last reading, or delays past the
+        first, are many ways to say the same of fewer than five rows; the others differ by less than the three nats that
+        tell aliases apart.
+        """
+        noise = tuple(sorted({outliers.name, *certain}))
+        nulls = [fit for (_, names), fit in self.fits.items() if not names and {noise, certain} <= fit.evidence.keys()]
+        if not nulls:
+            return False
+        null = max(nulls, key=lambda fit: fit.at_likelier_sd(noise).log_z)
+        evidence = null.at_likelier_sd(noise)
+        least, law = evidence.log_z, evidence.likeliest_law
+        odds = prior.log_prior_on_noise((outliers.name,)) - prior.log_prior_on_noise(())
+        rivals = [fit for (_, names), fit in self.fits.items() if names and fit.log_z > least]
+        if not rivals or not least - max(fit.at_likelier_sd(certain).log_z for fit in nulls) + odds > _BEYOND_DOUBT:
+            return False
+        narrow = 1 - outlier_probabilities(null.found.residuals, law)
+        sd = law.likeliest_sigma_of(null.found.residuals)
+        apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
+        return all(
+            0.5 * float(narrow @ change**2) < ALIASED_NATS and np.count_nonzero(np.abs(change) > 1) < ROWS_OF_A_SIDE
+            for change in apart
+        )
 
     def split_by_sd(self, changed: NoiseEffect) -> Evidences:
         """Return a copy with two noise models for each: with the noise sd of the calibration, and with another.
@@ -691,18 +731,22 @@ def hypothesis_probabilities(
     evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int
 ) -> HypothesisProbabilities:
     """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
+    outlying = evidences.only_outlying_readings_differ(prior, certain)
     log_z = _log_sums(
         ((names, noise), or_impossible(evidence.log_z))
         for (_, names), candidate in evidences.fits.items()
+        if not (names and outlying)
         for noise, evidence in candidate.evidence.items()
     )
     log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
+        if names and outlying:
+            continue
         # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
         value = or_impossible(value) + prior.log_prior_with_unknown(names)
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
-    for (names, noise), value in evidences.screened.items():
+    for (names, noise), value in evidences.screened.items() if not outlying else ():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
     for names, noise in log_p:
         log_p[names, noise] += prior.log_prior_on_noise(tuple(n for n in noise if n not in certain)) - math.log(n_forms)

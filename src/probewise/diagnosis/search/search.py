@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, cast
 
@@ -21,7 +21,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model, Null, fit_each_start
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.noise import NoiseLaw, white_noise_of_recording
+from probewise.diagnosis.noise import MAD_OF_NORMAL, NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import Names, PriorOdds
@@ -29,6 +29,7 @@ from probewise.diagnosis.search.hypotheses import (
     ALIASED_NATS,
     EXTENDED_WITHIN,
     FAR_BEHIND,
+    SAME_MODE,
     WITH_MEMORY,
     EffectNames,
     Evidences,
@@ -54,9 +55,10 @@ from probewise.diagnosis.templates import (
     log_bayes_factors_of_pairs,
     log_mean_exp,
 )
-from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named
+from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
 from probewise.effects import (
     AGAIN,
+    PROPOSAL,
     Effect,
     Extent,
     NoiseEffect,
@@ -90,6 +92,16 @@ _REPEATED_FROM = 2.0  # nats of an effect alone, from which it is tried twice
 # are paired: of twelve it was in none of 6 recordings with seven other columns, of sixty in all.
 _PAIRED = 60
 _MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with something out of vocabulary
+# Share of a template that a null leaves, below which a large effect may show in another way than to first order. The
+# width of the SSF takes up all but a tenth of a scale of positions, yet not of one a third off.
+_FAINT = 0.35
+_ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no refit shows more
+# Leading combinations, of which each effect is left out in turn: one that was found first may stand at a wrong place
+# beside another that it makes superfluous, and the right pair may be built from the part that looked worse.
+_ELIMINATED = 3
+_SWAPPED = 2  # combinations that lead beside what is left, with what was left out or another
+_MOST_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders
+_REFITTED_AT_OTHER_ORDERS = 1e-4  # probability of such a combination, among those with a formula
 
 
 @dataclass(eq=False)
@@ -296,6 +308,9 @@ def competing_candidates(names: Names, among: Iterable[WeighedFit]) -> list[Weig
     return [c for c in among if effects_out_of_vocabulary(names) or not effects_out_of_vocabulary(c.names)]
 
 
+_MOST_EXACT = 0.25  # share of the readings, those of the smallest declared sds, in which rounding shows first
+
+
 def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None:
     """Fit the given null; if there is none, each form of the SSF: one Gaussian, the free form, more Gaussians.
 
@@ -338,15 +353,28 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
 
 
 def noise_sd_about_given_null(prepared: Prepared) -> float:
-    """Estimate the noise sd, rounding included, from the best fit of the given null.
+    """Estimate the noise sd, rounding included, from residuals about the given null, by their median.
 
-    Infinite without a given null, and where the readings lie on no lattice, since it serves to judge rounding alone.
+    Of readings with declared sds, it is that of the most exact. A null with one start is taken there: it is an earlier
+    fit, or a calibration. Infinite without a given null, and where the readings lie on no lattice, since it serves to
+    judge rounding alone.
     """
-    null, recording = prepared.null, prepared.recording
-    if null is None or not lattice_step(recording.readings[prepared.usable_rows]):
+    null, recording, rows = prepared.null, prepared.recording, prepared.usable_rows
+    readings = recording.readings[rows]
+    step = lattice_step(readings)
+    if null is None or not step:
         return math.inf
-    model, law = Model(null, (), recording.plan), white_noise_of_recording(recording)
-    return min(found.sd for found in fit_each_start(model, recording, list(null.starts), law))
+    model, z = Model(null, (), recording.plan), null.starts[0]
+    if len(null.starts) > 1:
+        fits = fit_each_start(model, recording, list(null.starts), white_noise_of_recording(recording))
+        z = min(fits, key=lambda found: found.objective).z
+    with np.errstate(all="ignore"):  # of a start from which the model runs away
+        residuals = np.abs(readings - model.predict(z[None, :])[0, rows])
+    relative_sd = recording.relative_sd[rows]
+    median = float(np.median(residuals[relative_sd <= np.quantile(relative_sd, _MOST_EXACT)])) / MAD_OF_NORMAL
+    free = max(len(rows) - model.n_params, 1)
+    # Readings that are all as predicted still have the sd of rounding.
+    return max(median, step / math.sqrt(12)) * math.sqrt(len(rows) / free) if math.isfinite(median) else math.inf
 
 
 class Proposal(NamedTuple):
@@ -479,14 +507,18 @@ def _single_effects_to_refit(
 ) -> list[Proposal]:
     """Choose the effects to refit alone: the leader, those not far behind, and those that screening cannot judge.
 
-    Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor one of two copies of an
-    effect. Their score is infinite.
+    Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
+    null absorbs nearly completely to first order, nor one of two copies of an effect. Their score is infinite.
     """
     scores = {names: proposal.score for names, proposal in proposals.items()}
     ranked = sorted(scores, key=lambda names: -(scores[names] + state.prior.log_prior_on_mean(names)))
+    faint, about = set[str](), Linearised.of(null.found, null.law)
+    for bank in state.template_banks(null):
+        left = bank.unabsorbed_shares(about)
+        faint |= {name for name, of in bank.indices_by_label.items() if _ABSORBED < left[of].max() < _FAINT}
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
-    always = state.tried_always | twice
+    always = state.tried_always | faint | twice
     chosen = promising_combinations(state, scores, width=_SINGLES, behind=_REFITTED_WITHIN)
     wanted = dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)])
     return [proposals[n]._replace(score=math.inf) if n[0] in always else proposals[n] for n in wanted]
@@ -548,10 +580,73 @@ def _largest_scores_about_null(state: SearchState) -> dict[Names, float]:
     return best
 
 
+def eliminate_backward(state: SearchState) -> None:
+    """Refit the leading combinations without each of their effects in turn, and extend what remains by other effects.
+
+    An effect selected first may be superfluous. Or it stood in for two effects, and its variant (scans or parameters)
+    suits neither. Candidates are stored in the state.
+    """
+    several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.log_posterior(c))
+    named, rest = ([c for c in several if bool(effects_out_of_vocabulary(c.names)) == rare] for rare in (False, True))
+    # Of an effect that is there twice either may go; what stays is the first of its name.
+    dropped = [(c.names, n) for c in [*named[:_ELIMINATED], *rest[:1]] for n in c.names if n + AGAIN not in c.names]
+    for k, (names, left_out) in enumerate(dropped):
+        state.progress("leaving effects out in turn", k, len(dropped))
+        others = tuple(name for name in names if name != left_out)
+        if others not in state.refitted_combinations | state.undetected:
+            state.refit_stepwise(others)
+        held = state.best_candidate(others)
+        if held is None:
+            continue
+        proposals = proposals_for(state, held, {})
+        scores = {key: proposal.score for key, proposal in proposals.items()}
+        chosen = [names, *promising_combinations(state, scores, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
+        for added in [proposals[key].added for key in chosen if key in proposals]:
+            state.refit_with_effect(held, added)
+
+
+def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
+    """Refit the most probable combinations of effects on the mean at other numbers of Gaussians (SSF orders).
+
+    Refits with significant effects are stored in `state`. `by_mean` is the posterior probability of each combination,
+    whatever the noise. An unknown effect may lead at an order at which no named effect was tried; named ones must then
+    be tried there.
+    """
+    known = sum(p for names, p in by_mean.items() if names != ("unknown",))
+    leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
+    for k, names in enumerate(leaders[:_MOST_AT_OTHER_ORDERS]):
+        state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _MOST_AT_OTHER_ORDERS))
+        source = state.best_candidate(names)
+        if source is None or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
+            continue
+        own = state.candidates[source.n_gaussians, ()].log_z
+        for n, sensor in state.nulls_by_order.items():
+            # A freer SSF that the evidence rejects by itself is also rejected with an effect.
+            ahead, more = state.candidates[n, ()].log_z - own, sensor.effective_n_gaussians
+            is_freer, is_much_freer = (more >= source.ssf_degrees_of_freedom + k for k in (0, 2))
+            rejected = (is_freer and ahead <= -_REFITTED_WITHIN) or (is_much_freer and ahead <= 0)
+            if (n, names) not in state.candidates and not rejected:
+                _refit_at_order(state, source, n)
+
+
+def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
+    """Refit a candidate's effects with `n` Gaussians; store the fit if it is significantly better than that null."""
+    null, sensor, found = state.candidates[n, ()], state.nulls_by_order[n], source.found
+    start = np.concatenate([null.found.z, found.z[found.model.sensor.n_params :]])
+    candidate = state.refits.fit_and_weigh(
+        replace(found.model, sensor=sensor), start[None, :], state.refits.likeliest_law(source), max_steps=15
+    )
+    before, after = map(state.complexity_penalty, (source.ssf_degrees_of_freedom, sensor.effective_n_gaussians))
+    candidate = candidate.with_variant_factor_and_weights(source.log_share + before - after, source.weights)
+    if candidate.is_significantly_better(null):
+        state.store_candidate(candidate)
+
+
 MAX_ORDER = 3
 """Gaussians of the SSF that are tried; one more where that is not far behind."""
 
 _FEW_READINGS = 40  # usable readings below which one Gaussian is tried, and no free form
+_NULL_TRIED_AGAIN = 2  # fits of one effect from which a given null is fitted once more
 _REFITTED_LATE = 0.02  # probability by screening alone, from which on a combination is refitted
 _MOST_REFITTED_LATE = 6  # such combinations
 _WITH_UNKNOWN = 4  # refitted combinations that something unknown is weighed beside
@@ -624,6 +719,45 @@ class UnknownEffects:
                     total = logsumexp(list(by_family.values()))
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
+    def drop_superfluous(self, candidates: Collection[WeighedFit]) -> None:
+        """Drop an unknown effect, alone or with one named effect, if one or two more named effects explain as much.
+
+        An unknown effect added to the named ones must then be insignificant. A basis of many columns, such as one value
+        per scan, can imitate named effects. Two names are chosen from many more combinations than one, so they must
+        explain correspondingly more.
+        """
+        named = [c for c in candidates if not effects_out_of_vocabulary(c.names)]
+        for known in dict.fromkeys(c.names for c in named if len(c.names) <= 1):
+            rivals = [c for c in named if set(c.names) > set(known) and len(c.names) <= 2]
+            if any(key[1] == known for key in self.log_z) and self._is_superfluous(known, rivals, candidates):
+                self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
+
+    def _is_superfluous(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
+        """Return whether one of the `rivals` makes an unknown effect added to `known` superfluous.
+
+        The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
+        """
+        average, n_named = self.state.refits.noises.average_log_evidence, len(self.state.effects_in_vocabulary)
+
+        def with_unknown(candidate: WeighedFit) -> float:
+            own = candidate.n_gaussians, candidate.names
+            return average({key[2]: value for key, value in self.log_z.items() if key[:2] == own})
+
+        def believed(rival: WeighedFit) -> float:
+            n = len(rival.names)  # two names are chosen from many more combinations
+            several = math.log(math.comb(n_named, n) / n_named) if n - len(known) > 1 else 0.0
+            return average(rival.log_z_by_noise) - several
+
+        most = max((with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
+        for candidate in sorted(rivals, key=believed, reverse=True):
+            if believed(candidate) < most - ALIASED_NATS:
+                return False
+            if with_unknown(candidate) == -np.inf:
+                self.weigh_beside([candidate])
+            if with_unknown(candidate) - average(candidate.log_z_by_noise) < ALIASED_NATS:
+                return True
+        return False
+
 
 def search(
     prepared: Prepared,
@@ -673,7 +807,7 @@ def search(
         state.nulls_by_order |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
         misfit_templates = replace(after.misfit_templates, about=state.null.found)
-    unknown = UnknownEffects(state, misfit_templates.unknown_bases, misfit_templates.covariates)
+    unknown = _build_unknown_effects(state, misfit_templates)
 
     def found() -> Searched:
         own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
@@ -683,13 +817,19 @@ def search(
         return Searched(prepared, prior, state.nulls_by_order, misfit_templates, refits, own, posterior)
 
     select_forward(state, depth=depth)
+    if prepared.null is not None:
+        _refit_null_from_effects(state)
+    eliminate_backward(state)
     # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
     unknown.weigh_beside([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
     _refit_favoured_by_screening(state, lambda: found().posterior)
+    if prepared.null is None:
+        refit_at_other_orders(state, found().posterior.marginal_over_noise)
     state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, refits.noises)
     progress("comparing unknown effects")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh_beside(sorted(refitted, key=lambda c: -c.log_z)[:_WITH_UNKNOWN])
+    unknown.drop_superfluous(state.candidates.values())
     out = found()
     if refits.noises.sd_prior is not None:
         out = out.with_evidences(out.evidences.split_by_sd(on_noise[noise_sd.name]))
@@ -722,6 +862,34 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Hyp
         state.refit_stepwise(names)
         shortfalls.append(promised - state.log_evidence(names))
     state.optimism = max(min(shortfalls), 0.0)
+
+
+def _refit_null_from_effects(state: SearchState) -> None:
+    """Refit the null from the best fits with one effect, whose gain may be due to a better mode of the null.
+
+    A better fit replaces the null in the state.
+    """
+    null = state.null
+    single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
+    for candidate in sorted(single, key=lambda c: -c.log_z)[:_NULL_TRIED_AGAIN]:
+        start = candidate.found.z[: null.found.model.sensor.n_params]
+        again = state.refits.fit_and_weigh(null.found.model, start[None, :], candidate.law)
+        if again.log_z > state.null.log_z + SAME_MODE:
+            state.store_candidate(again)
+
+
+def _build_unknown_effects(state: SearchState, misfit_templates: MisfitTemplates) -> UnknownEffects:
+    """Build the evidence of unknown effects, without the products of columns that are among the state's formulas.
+
+    As a formula and as a basis a product would be the same hypothesis twice, and the less specific one, the basis,
+    might lead. The test of the residuals keeps all bases, since the formulas were chosen by these readings.
+    """
+    null, bases = state.null, misfit_templates.unknown_bases
+    formulas = [effect for name, effect in state.effects.items() if name.startswith(PROPOSAL)]
+    if formulas:
+        problem = Linearised.of(null.found, state.refits.likeliest_law(null))
+        bases = without_products_like(bases, state.refits.templates.coarse_bank(null.found, formulas), problem)
+    return UnknownEffects(state, bases, misfit_templates.covariates)
 
 
 def _build_misfit_templates(state: SearchState, prepared: Prepared) -> MisfitTemplates:

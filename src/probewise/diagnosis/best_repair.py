@@ -25,7 +25,7 @@ from probewise.diagnosis.held_out import (
     partition_into_blocks,
     predictive_log_densities,
 )
-from probewise.diagnosis.locate import bayes_factor_p_value
+from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise import NoiseLaw, walk_given_readings
 from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.prior_odds import Names
@@ -177,6 +177,7 @@ def judged_and_best_repair(
 
 
 _ABOUT_EQUAL = 5.0  # nats
+_MOST_BASES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,38 +244,49 @@ def improvement_and_correction(
 ) -> tuple[Improvement, FloatArray]:
     """Correct the residuals of the best fit by basis functions, if this improves held-out predictions.
 
-    One basis is added; where nothing can be held out, without that check.
+    Bases are added one at a time, at most six, until the global test finds nothing or the next one gains less than the
+    gain's sd. Where nothing can be held out, one basis is added without that check.
 
     Returns `improvement, change`: the improvement of `best` including the correction, and the correction of the usable
     readings, (n_usable,).
     """
     recording, problem, found, gain = searched.prepared.recording, best.problem, best.repaired, best.improvement
-    fixed, (_, part_names) = best_correction(searched, best)
+    fixed, (parts, part_names) = best_correction(searched, best)
+    change = np.zeros(len(fixed.change))
     if fixed.gains_nothing:
-        return gain, np.zeros(len(fixed.change))
+        return gain, change
     plain_z = test.null.evidence[test.null.possible_noise(best.noise)].log_z
     key = (best.fit.n_gaussians, best.fit.names, best.noise)
     log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
-    found = replace(
-        found,
-        residuals=found.residuals - fixed.change,
-        slopes=np.concatenate([found.slopes, fixed.columns], axis=1),
-        z=np.concatenate([found.z, np.zeros(fixed.columns.shape[1])]),
-    )
-    after, held = Linearised.of(found, problem.law), fixed.held_out
-    before = dict(gain.heldout_by_scan)  # of blocks, none
-    by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
-    corrected = Improvement(
-        log_evidence,
-        gain.heldout_log_density_per_reading + held.per_reading,
-        math.hypot(gain.heldout_sd, held.sd),
-        tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
-        gain.rms_before,
-        rms_beside_walk(found.residuals, after.law, recording),
-        p_value_after(searched, best.fit, after, rng=rng),
-        gain.comes_next,
-    )
-    return corrected, fixed.change
+    for step in range(_MOST_BASES):
+        if step:
+            fixed = correct_by_best_basis(found, problem, searched.misfit_templates.unknown_bases, parts)
+        held = fixed.held_out
+        if step and held.per_reading <= held.sd:
+            break
+        found = replace(
+            found,
+            residuals=found.residuals - fixed.change,
+            slopes=np.concatenate([found.slopes, fixed.columns], axis=1),
+            z=np.concatenate([found.z, np.zeros(fixed.columns.shape[1])]),
+        )
+        change = change + fixed.change
+        problem = Linearised.of(found, problem.law)
+        before = dict(gain.heldout_by_scan)  # of blocks, none
+        by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
+        gain = Improvement(
+            log_evidence,
+            gain.heldout_log_density_per_reading + held.per_reading,
+            math.hypot(gain.heldout_sd, held.sd),
+            tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
+            gain.rms_before,
+            rms_beside_walk(found.residuals, problem.law, recording),
+            p_value_after(searched, best.fit, problem, rng=rng),
+            gain.comes_next,
+        )
+        if gain.p_value_after >= ALARM or not held.by_scan:
+            break
+    return gain, change
 
 
 def _amounts_and_covariance(

@@ -277,7 +277,7 @@ def complaints(out: Path, said: str, results: Sequence[Any]) -> Iterator[str]:
     pictures |= {f"picture {k} of the report": base64.b64decode(picture) for k, picture in enumerate(embedded)}
     for name, picture in pictures.items():
         try:
-            Image.open(io.BytesIO(picture)).load() if picture[:4] == b"\x89PNG" else ElementTree.fromstring(picture)
+            ElementTree.fromstring(picture) if picture[:1] == b"<" else Image.open(io.BytesIO(picture)).load()
         except (OSError, ElementTree.ParseError) as error:
             yield f"broken picture: {name}: {error}"
     words = re.sub(r"<(style|script).*?</\1>|<[^>]*>", " ", page, flags=re.DOTALL)

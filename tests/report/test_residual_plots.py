@@ -1,5 +1,6 @@
 """Figures of a diagnosis: every axis has its unit, nothing lies over data, files stay small and are the same again."""
 
+import itertools
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from probewise.report import plots
+from probewise.report.plots import canvas
 from probewise.report.residual_means import mean_residuals
 
 X = np.linspace(0.0, 10.0, 200)
@@ -64,6 +66,19 @@ def test_no_legend_lies_over_data(figures, images):
             if legend is not None:
                 assert legend.get_window_extent().y0 >= ax.get_window_extent().y1 - 1, name
                 assert legend.get_window_extent().x1 <= ax.figure.bbox.x1, name
+
+
+def test_a_legend_beside_long_names_below_it_is_whole_and_ticks_stand_apart():
+    axes = canvas.stack_of_axes([2.7, 2.0])
+    shifted = mean_residuals(X - 5.006, np.sin(X), 0.1 * np.sin(X), sd=1.0)
+    plots.mean_residuals_along(shifted, label="dq", unit="Nm", window=(-1.0, 1.0), ax=axes[0])
+    plots.hypothesis_probabilities(["another height of the sensor above the surface in some scans"], [1.0], ax=axes[1])
+    canvas.fit_to_room(axes[0])
+    assert plots.svg(axes)
+    sheet, ax = axes[0].figure, axes[0]
+    assert ax.get_legend().get_window_extent().x1 <= sheet.bbox.x1
+    ticks = [label.get_window_extent() for label in ax.get_xticklabels() if label.get_text()]
+    assert all(first.x1 < second.x0 for first, second in itertools.pairwise(ticks))
 
 
 def test_the_same_drawing_gives_the_same_bytes():

@@ -24,7 +24,7 @@ from probewise.report.covariates import (
     views_of_place,
 )
 from probewise.report.plots import residuals as plots
-from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, stack_of_axes, svg
+from probewise.report.plots.canvas import BLUE, FILLED, AxesGrid, fit_to_room, stack_of_axes, svg
 from probewise.report.plots.probabilities import height_of_bars_in, hypothesis_probabilities
 from probewise.systems import RunTable
 from probewise.systems.forms import Form
@@ -93,6 +93,7 @@ def draw_first_figure(chance: ResidualNoise) -> AxesGrid:
     names += [""] * (len(diagnosis.hypotheses) - len(listed))
     probabilities = [h.probability for h in (*listed, *diagnosis.hypotheses[len(listed) :])]
     hypothesis_probabilities(names, probabilities, most=most, ax=below)
+    fit_to_room(above)
     return axes
 
 

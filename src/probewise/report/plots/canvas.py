@@ -24,7 +24,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.layout_engine import LayoutEngine
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageOps
 
@@ -45,6 +47,7 @@ FILLED: dict[str, Any] = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
 TITLE: dict[str, Any] = {"fontsize": "medium", "loc": "left", "y": 1.0}
 """Style of a title. Without `y`, each drawing measures the tick labels of both axes, to place the title above them."""
 
+_TICK_IN = 0.8  # width of a tick with its label, of six digits
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _MARGIN_IN = 0.1  # about a cropped picture, as matplotlib leaves it
@@ -159,6 +162,16 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
     style: dict[str, Any] = {"frameon": False, "fontsize": SMALL_PT, "title_fontsize": SMALL_PT, "alignment": "left"}
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
     ax.legend(handles, labels, ncols=max(int(room / widest), 1), title=title or None, **place, **style)
+
+
+def fit_to_room(ax: Axes) -> None:
+    """Lay the figure out, and fit legend and ticks of some axes to the width that long labels of others leave them."""
+    sheet = figure_of(ax)
+    cast(LayoutEngine, sheet.get_layout_engine()).execute(sheet)
+    legend_above(ax)
+    if isinstance(ax.xaxis.get_major_locator(), MaxNLocator):
+        width_in = ax.get_position().width * sheet.get_figwidth()
+        ax.xaxis.set_major_locator(MaxNLocator(max(int(width_in / _TICK_IN), 2), steps=[1, 2, 2.5, 5, 10]))
 
 
 def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:

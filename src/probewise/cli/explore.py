@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import os
 import webbrowser
@@ -58,7 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sensor is None:
         arguments.sensor = out / _SHIPPED
         out.mkdir(parents=True, exist_ok=True)
-        write_sensor(search.sensor, arguments.sensor)
+        if not (arguments.resume and arguments.sensor.exists()):
+            write_sensor(search.sensor, arguments.sensor)
     _bench.confirm_lowering(search.arm, instrument, search.geometry)
     if search.as_built is not None:
         _bench.warn_if_place_sd_large(search.as_built, search.experiment.stop_sd_mm)
@@ -75,6 +77,8 @@ def run(arguments: argparse.Namespace) -> int:
         **about_truth,
         "arm": arguments.arm.partition(":")[0],
     }
+    if arguments.sensor.is_file():  # the bytes as they stand: sums of samples anew may differ in the last digit
+        about["sensor_sha256"] = hashlib.sha256(arguments.sensor.read_bytes()).hexdigest()
     with (
         reporting_what_is_kept(kept_message),
         progress_of(arguments) as progress,

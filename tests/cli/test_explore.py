@@ -4,6 +4,7 @@ import csv
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -163,6 +164,19 @@ def test_the_papers_robot_leaves_what_the_other_leaves_and_its_journal_names_it(
     assert found["readings"] == 1
     assert "nested sampling anew after each reading" in (tmp_path / "found" / "report.html").read_text()
     assert "radius_mm" in capsys.readouterr().out
+
+
+def test_a_resumed_run_takes_its_shipped_sensor_for_the_same_though_reading_normalises_the_field_again(
+    sensor_file, tmp_path, monkeypatch, quick_frames
+):
+    sensor = read_sensor(sensor_file)
+    fields = (replace(sensor.field, values=sensor.field.values * k) for k in range(1, 1000))
+    made = replace(sensor, field=next(field for field in fields if field.values.sum() != 1.0))
+    given = ["explore", "--out", str(tmp_path / "out"), "--trust", "1", "--quiet", "--max-readings"]
+    monkeypatch.setattr("probewise.cli.explore.calibrate", lambda *_, **__: SimpleNamespace(sensor=made))
+    assert main([*given, "1"]) == 0
+    monkeypatch.setattr("probewise.cli.explore.calibrate", lambda *_, **__: pytest.fail("calibrated again"))
+    assert main([*given, "2", "--resume"]) == 0
 
 
 def test_without_a_sensor_a_simulated_run_takes_that_of_the_recording_that_ships(tmp_path, monkeypatch, capsys):

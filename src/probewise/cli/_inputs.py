@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import glob
-import hashlib
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -178,8 +177,7 @@ def find_journal_sensor_file(path: Path) -> Path:
     for place in places:  # where a result took its place, it has another name: see `staged_output`
         standing += sorted(place.parent.glob(f"{glob.escape(place.stem)}_kept*{place.suffix}"))
     for place in standing:
-        digest = hashlib.sha256(place.read_bytes()).hexdigest()
-        if wanted in (digest, sensor_entry(read_sensor(place))["sensor_sha256"]):
+        if sensor_entry(read_sensor(place))["sensor_sha256"] == wanted:
             return place
     found = "is another by now" if standing else "is not there any more"
     raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)

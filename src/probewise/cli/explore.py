@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 import os
 import webbrowser
@@ -11,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -59,8 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sensor is None:
         arguments.sensor = out / _SHIPPED
         out.mkdir(parents=True, exist_ok=True)
-        if not (arguments.resume and arguments.sensor.exists()):
-            write_sensor(search.sensor, arguments.sensor)
+        if search.shipped:
+            write_bytes_atomically(arguments.sensor, search.shipped)
     _bench.confirm_lowering(search.arm, instrument, search.geometry)
     if search.as_built is not None:
         _bench.warn_if_place_sd_large(search.as_built, search.experiment.stop_sd_mm)
@@ -77,8 +77,6 @@ def run(arguments: argparse.Namespace) -> int:
         **about_truth,
         "arm": arguments.arm.partition(":")[0],
     }
-    if arguments.sensor.is_file():  # the bytes as they stand: sums of samples anew may differ in the last digit
-        about["sensor_sha256"] = hashlib.sha256(arguments.sensor.read_bytes()).hexdigest()
     with (
         reporting_what_is_kept(kept_message),
         progress_of(arguments) as progress,
@@ -130,6 +128,7 @@ class Search:
         self.steps: list[Step] = []
         self.shadows: list[Step] = []
         self.frames: list[bytes] = []
+        self.shipped = b""  # content of the file of a sensor that is calibrated here
         self.truth_mm: FloatArray | None = None
         self.known: Mapping[str, float] | None = None
         with_geometry = self.arm.is_lego or (arguments.geometry is not None and self.arm.kind != "file")
@@ -183,7 +182,12 @@ class Search:
             return read_sensor(arguments.out / _SHIPPED)
         say(arguments, "no --sensor: that of the recording that ships is calibrated")
         rng = np.random.default_rng(DEFAULT_SEED)
-        return calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
+        made = calibrate(read_recording(shipped("paper")), orders=(1,), rng=rng, progress=False).sensor
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / _SHIPPED
+            write_sensor(made, path)
+            self.shipped = path.read_bytes()
+            return read_sensor(path)  # as a resumed run does: reading normalises the field once more, in its last digit
 
     def _naive_levels(self) -> Naive | None:
         """Return the paper's naive model's readings over black and white, with sds; None if it is not used."""

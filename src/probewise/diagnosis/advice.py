@@ -362,8 +362,8 @@ def measurement_at_place(
     """
     from scipy.spatial import KDTree  # a tenth of a second, which few diagnoses need
 
-    commands = apparatus.candidate_measurements(plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0])
-    if not commands or place.values is None:
+    candidates = apparatus.candidate_measurements(plan, strides=_STRIDES, level=null.model.predict(null.z[None, :])[0])
+    if not candidates or place.values is None:
         return None
     usable = np.flatnonzero(everything.usable)
     inside = place.rows_among(everything.plan, usable)
@@ -371,18 +371,18 @@ def measurement_at_place(
     known = apparatus.settings_of(everything.plan.take(usable))
     scale = np.ptp(known, axis=0)
     varies = scale > 0
-    planned = apparatus.settings_of(apparatus.plan_of_alternatives(commands, plan))[:, varies] / scale[varies]
+    planned = apparatus.settings_of(apparatus.plan_of_alternatives(candidates, plan))[:, varies] / scale[varies]
     apart, nearest = KDTree(known[:, varies] / scale[varies]).query(planned, p=np.inf)
     squares = np.where(apart <= _NEAR, shown[nearest], 0.0) ** 2
-    nats = np.array([0.5 * float(squares[rows].sum()) for rows in rows_by_candidate(commands)])
-    per_minute = np.where(nats >= ENOUGH_NATS, nats, 0.0) / [command.minutes for command in commands]
+    nats = np.array([0.5 * float(squares[rows].sum()) for rows in rows_by_candidate(candidates)])
+    per_minute = np.where(nats >= ENOUGH_NATS, nats, 0.0) / [candidate.minutes for candidate in candidates]
     best = int(np.argmax(per_minute))
     if per_minute[best] == 0.0:
         return None
     return NextMeasurement(
-        apparatus.plan_of_sequence([commands[best]], plan),
-        commands[best].description,
-        commands[best].minutes,
+        apparatus.plan_of_sequence([candidates[best]], plan),
+        candidates[best].description,
+        candidates[best].minutes,
         float(nats[best]),
         (_null_in_words(apparatus), NO_NAME),
         ((), ("unknown",)),

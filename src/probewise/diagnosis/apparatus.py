@@ -44,10 +44,10 @@ class Candidate:
     minutes: float
 
 
-def rows_by_candidate(commands: Sequence[Candidate]) -> list[IntArray]:
-    """Return the row numbers of each command in the plan that concatenates all commands, (n_rows,) each."""
-    ends = np.cumsum([len(command.plan) for command in commands])
-    return [np.arange(end - len(command.plan), end) for end, command in zip(ends.tolist(), commands, strict=True)]
+def rows_by_candidate(candidates: Sequence[Candidate]) -> list[IntArray]:
+    """Return the row numbers of each candidate in the plan that concatenates all candidates, (n_rows,) each."""
+    ends = np.cumsum([len(candidate.plan) for candidate in candidates])
+    return [np.arange(end - len(candidate.plan), end) for end, candidate in zip(ends.tolist(), candidates, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -198,9 +198,9 @@ class Apparatus(ABC):
         """
 
     @abstractmethod
-    def plan_of_alternatives(self, commands: Sequence[Candidate], after: Plan) -> Plan:
-        """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
+    def plan_of_alternatives(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
+        """Concatenate alternative candidates, each timed as if directly after a plan, to predict all at once."""
 
     @abstractmethod
-    def plan_of_sequence(self, commands: Sequence[Candidate], after: Plan) -> Plan:
-        """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""
+    def plan_of_sequence(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
+        """Concatenate candidates into one plan, timed to be carried out in sequence after a plan."""

@@ -337,15 +337,15 @@ def audit_plan(
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
     chosen = choose_cure_scans(plan, expected, ailing, progress)
     steps, current = [before], plan
-    for k, command in enumerate(chosen):
+    for k, candidate in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
-        current = join_plans([current, command.plan])
+        current = join_plans([current, candidate.plan])
         steps.append(audits_and_cosines(expected.bank(current), list(effects), unit)[0])
     cured = _curing_step_by_effect(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
-        Cure(**vars(command), cured=tuple(name for name, step in cured.items() if step == k))
-        for k, command in enumerate(chosen[:n_kept], start=1)
+        Cure(**vars(candidate), cured=tuple(name for name, step in cured.items() if step == k))
+        for k, candidate in enumerate(chosen[:n_kept], start=1)
     )
     return PlanAudit(plan, expected.assumed, before, cosines, cures, steps[n_kept])
 
@@ -444,9 +444,9 @@ def choose_cure_scans(
     current = plan
     while len(chosen) < _MOST_SCANS:
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)
-        taken = {command.plan.scan_names for command in chosen}
+        taken = {candidate.plan.scan_names for candidate in chosen}
         offered = [c for c in every if c.plan.scan_names not in taken]
-        options = [scan_started_after(command, current) for command in offered]
+        options = [scan_started_after(candidate, current) for candidate in offered]
         if not options:
             break
         together = join_plans([current, *(option.plan for option in options)])

@@ -36,7 +36,7 @@ LAY_S = 60.0  # additional seconds to lay a new sheet
 _LAY = "lay"  # the kind of a scan over another sheet
 
 
-def scan_command(kind: str, description: str, plan: Plan) -> Candidate:
+def candidate_scan(kind: str, description: str, plan: Plan) -> Candidate:
     """Return a scan that the arm could take."""
     minutes = (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 + (LAY_S if kind == _LAY else 0.0) / 60.0
     return Candidate(kind, description, plan, minutes)
@@ -130,7 +130,7 @@ def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatAr
                 raised = replace(once, covariates={**once.covariates, "height_mm": high_mm})
                 taken.append(("raise", f"{take} with the sensor at {where}{every}", raised, "raised"))
             for kind, words, own, how in taken:
-                out.append(scan_command(kind, words, replace(own, scan_names=(f"{name}{suffix}_{how}",))))
+                out.append(candidate_scan(kind, words, replace(own, scan_names=(f"{name}{suffix}_{how}",))))
     return out
 
 
@@ -181,12 +181,12 @@ def target_swaps(plan: Plan) -> list[Candidate]:
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
         flat = rows_as_next_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
         flat = _with_pattern(flat, f"plain_{colour}", Uniform(albedo))
-        out.append(scan_command(_LAY, f"scan a plain {colour} surface", flat))
+        out.append(candidate_scan(_LAY, f"scan a plain {colour} surface", flat))
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts_of_scan(first, (_STRIDE // 2, _STRIDE)):
         words = f"scan at right angles to scan {name}, through its middle{part.words}"
         across = _rotated_scan(rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
-        out.append(scan_command("across", words, across))
+        out.append(candidate_scan("across", words, across))
     edges = ((scan, plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])) for scan in scans)
     laid = (_scans_over_moved_targets(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
     return [*out, *next(filter(None, laid), [])]
@@ -222,7 +222,7 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
         laid_in_parts.append((label, words, plan, stripes, excerpts_of_scan(scan, (_STRIDE // 2, _STRIDE))))
     return [
-        scan_command(
+        candidate_scan(
             _LAY,
             f"{words}{part.words}",
             _with_pattern(rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern),
@@ -386,16 +386,16 @@ class LightSensorApparatus(Apparatus):
                 return part.reshape(-1), tuple(f"{pattern}, {turn:.0f} degrees" for pattern, turn in named)
         return scan, plan.scan_names
 
-    def plan_of_alternatives(self, commands: Sequence[Candidate], after: Plan) -> Plan:
-        plan = join_plans([command.plan for command in commands])
+    def plan_of_alternatives(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
+        plan = join_plans([candidate.plan for candidate in candidates])
         # What cannot be commanded, such as battery voltage, keeps its last known value until it is measured.
         read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
         kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
         return replace(plan, covariates={**kept, **plan.covariates})
 
-    def plan_of_sequence(self, commands: Sequence[Candidate], after: Plan) -> Plan:
+    def plan_of_sequence(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
         out: list[Candidate] = []
-        for scan in commands:
+        for scan in candidates:
             out.append(scan_started_after(scan, out[-1].plan if out else after))
         return self.plan_of_alternatives(out, after)
 

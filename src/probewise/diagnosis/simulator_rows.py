@@ -332,16 +332,16 @@ class SimulatorApparatus(Apparatus):
     ) -> list[Candidate]:
         return candidate_runs(cast(RunTable, plan), self.system.simulator)
 
-    def plan_of_alternatives(self, commands: Sequence[Candidate], after: Plan) -> Plan:
-        first, *more = (cast(RunTable, command.plan) for command in commands)
+    def plan_of_alternatives(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
+        first, *more = (cast(RunTable, candidate.plan) for candidate in candidates)
         return cast(Plan, append_tables(first, more))
 
-    def plan_of_sequence(self, commands: Sequence[Candidate], after: Plan) -> Plan:
+    def plan_of_sequence(self, candidates: Sequence[Candidate], after: Plan) -> Plan:
         recorded, out = cast(RunTable, after), list[Candidate]()
-        for command in commands:
-            table = cast(RunTable, command.plan)
+        for candidate in candidates:
+            table = cast(RunTable, candidate.plan)
             if table.time is not None and not recorded.time_begins_anew and out:
                 later = float(out[-1].plan.time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
                 table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
-            out.append(replace(command, plan=cast(Plan, table)))
+            out.append(replace(candidate, plan=cast(Plan, table)))
         return self.plan_of_alternatives(out, after)

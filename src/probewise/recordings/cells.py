@@ -220,21 +220,15 @@ def are_other_days(days: Sequence[str], clocks: Sequence[str]) -> bool:
         return False
     dates = [match for cell in days if (match := _YEAR_FIRST.fullmatch(cell) or _YEAR_LAST.fullmatch(cell))]
     hours = [match for cell in clocks if (match := _CLOCK_ALONE.fullmatch(cell)) and match["second"]]
-    if (
-        len(set(days)) == 1
-        or len(dates) < len(days)
-        or len(hours) < len(clocks)
-        or any(match["hour"] for match in dates)
-    ):
+    all_read = len(dates) == len(days) and len(hours) == len(clocks)
+    if not all_read or len(set(days)) == 1 or any(match["hour"] for match in dates):
         return False
     try:
-        seconds = [
-            _seconds_of_dates([match.groupdict() for match in dates])[0],
-            _seconds_of_clocks([match.groupdict() for match in hours])[0],
-        ]
+        by_date, _ = _seconds_of_dates([match.groupdict() for match in dates])
+        by_clock, _ = _seconds_of_clocks([match.groupdict() for match in hours])
     except UnclearCellError:  # a date that can be read in two ways
         return False
-    return bool((np.diff(seconds[0] // _DAY) != np.diff(seconds[1] // _DAY)).any())
+    return bool((np.diff(by_date // _DAY) != np.diff(by_clock // _DAY)).any())
 
 
 def times_to_numbers(name: str, values: ArrayLike, unit: str = "s") -> tuple[ArrayLike, str]:

@@ -384,11 +384,7 @@ def _alias_table(aliases: Sequence[Alias]) -> html.Markup:
             " and ".join(map(effect_in_words, a.effects)),
             number_text(a.cosine, 3),
             typeset_numbers(a.settle_by),
-            "–"
-            if not a.readings
-            else str(a.readings)
-            if a.readings < MOST_ADVISED_READINGS
-            else f"{MOST_ADVISED_READINGS} or more",
+            f"{a.readings or '–'}{' or more' * (a.readings >= MOST_ADVISED_READINGS)}",
         )
         for a in aliases
     )

@@ -194,9 +194,8 @@ def _draw_noise_panel(chance: ResidualNoise, name: str, ax: Axes) -> None:
     predicted, residuals, sd = diagnosis.after.readings, np.array(diagnosis.after.residuals), float(chance.sd.mean())
     unit = recording.plan.instrumentation.unit_after_number
     found = {p.name: p.mean for p in diagnosis.noise.parameters}
-    if (
-        name != "dropouts" and "share" in found and "value" in found
-    ):  # lost readings carry no information on the noise of the others
+    # Lost readings carry no information on the noise of the others.
+    if name != "dropouts" and "share" in found and "value" in found:
         lost = recording.usable & np.isclose(recording.readings, found["value"], atol=3 * sd)
         residuals[lost & (np.abs(residuals) > _LOST * sd)] = np.nan
     if name == "quantisation" and "step" in found:

@@ -54,10 +54,8 @@ def page_html(
     `concealed` are the effects that a simulated world concealed, None for any other arm.
     """
     hidden = ", ".join(map(spoken_name, concealed or ())) or "nothing"
-    diagnosis, said = (
-        found.last.diagnosis,
-        "Probability of each explanation after each round, given all readings so far.",
-    )
+    diagnosis = found.last.diagnosis
+    said = "Probability of each explanation after each round, given all readings so far."
     n_readings, rounds = sum(len(each.recording) for each in found.rounds), count_with_noun(len(found.rounds), "round")
     run = {"arm": source, "readings": f"{n_readings} in {rounds}", **seed_fact(seed)}
     run |= {} if concealed is None else {"the world concealed": hidden}

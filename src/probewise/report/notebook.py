@@ -66,18 +66,19 @@ _DRAWINGS: dict[type, tuple[Callable[[Any], Axes | AxesGrid], str]] = {
 
 def drawing_of(value: object) -> Axes | AxesGrid:
     """Draw a result's main picture; return its axes. ParameterError if a result of this type has none."""
-    draw = next((_DRAWINGS[kind][0] for kind in type(value).__mro__ if kind in _DRAWINGS), None)
-    if draw is None:
+    if (kind := _kind_with_picture(value)) is None:
         raise ParameterError("result", value, f"one with a picture: {', '.join(k.__name__ for k in _DRAWINGS)}")
-    return draw(value)
+    return _DRAWINGS[kind][0](value)
 
 
 def html_of(value: object) -> str:
-    """Return a result as an HTML fragment: its summary, and its main picture if it has one."""
+    """Return a result as an HTML fragment: its summary, and its main picture if its type has one."""
     said = element("pre", str(value))
-    try:
-        drawing = drawing_of(value)
-    except ParameterError:
+    if (kind := _kind_with_picture(value)) is None:
         return said
-    caption = next(_DRAWINGS[kind][1] for kind in type(value).__mro__ if kind in _DRAWINGS)
-    return element("div", said, figure(png(drawing, dpi=_DPI), caption))
+    draw, caption = _DRAWINGS[kind]
+    return element("div", said, figure(png(draw(value), dpi=_DPI), caption))
+
+
+def _kind_with_picture(value: object) -> type | None:
+    return next((kind for kind in type(value).__mro__ if kind in _DRAWINGS), None)

@@ -10,8 +10,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.diagnosis import best_repair
 from probewise.diagnosis.best_repair import correct_by_best_basis
-from probewise.diagnosis.evidence import SCALES, Linearised
-from probewise.diagnosis.held_out import partition_into_blocks
+from probewise.diagnosis.evidence import SCALES, Linearised, partition_into_blocks
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.templates import TemplateBank

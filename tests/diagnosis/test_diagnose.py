@@ -14,7 +14,7 @@ from hand_made import TRUTH, sensor_of
 
 from probewise.calibration import predict
 from probewise.diagnosis import Diagnosis, diagnose, diagnosis_json, diagnosis_schema
-from probewise.diagnosis.held_out import HeldOutGain
+from probewise.diagnosis.evidence import HeldOutGain
 from probewise.diagnosis.sensors import sensor_from_samples
 from probewise.effects import EFFECTS, VOCABULARY, Origin
 from probewise.errors import ParameterError

@@ -13,9 +13,14 @@ from scipy.special import log_ndtr, logsumexp
 from scipy.stats import multivariate_normal, norm
 
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import LEAST_VISIBLE, laplace_evidence, log_probability_effects_detectable, refined
+from probewise.diagnosis.evidence import (
+    LEAST_VISIBLE,
+    held_out_gain,
+    laplace_evidence,
+    log_probability_effects_detectable,
+    refined,
+)
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, fit
-from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.noise import SAME_SD, NoiseModel, SdPrior, white_noise, white_noise_of_recording
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.held_out import mean_gain_over_parts, predictive_log_densities
+from probewise.diagnosis.evidence import mean_gain_over_parts, predictive_log_densities
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.recordings import Recording, paper_plan

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.held_out import predictive_log_densities
+from probewise.diagnosis.evidence import predictive_log_densities
 from probewise.diagnosis.noise import (
     NoiseLaw,
     innovations_given_rest,

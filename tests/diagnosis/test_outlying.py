@@ -11,9 +11,8 @@ from scipy.stats import betabinom
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.evidence import Linearised
+from probewise.diagnosis.evidence import Linearised, held_out_gain
 from probewise.diagnosis.fit import Fit, Model, fit
-from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import Covariate, significant_places, window_columns
 from probewise.diagnosis.noise import NoiseLaw, white_noise
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities

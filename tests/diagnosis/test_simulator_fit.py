@@ -7,8 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from probewise.diagnosis import diagnose_system
-from probewise.diagnosis.diagnose_simulator import _notes_on_integration, recording_from_table
-from probewise.diagnosis.simulator_fit import fit_system, with_step_for_likely_parameters
+from probewise.diagnosis.diagnose_simulator import (
+    _notes_on_integration,
+    fit_system,
+    recording_from_table,
+    with_step_for_likely_parameters,
+)
 from probewise.systems import Law, RunTable, Simulator, System
 from probewise.systems.integrate import Integrations
 

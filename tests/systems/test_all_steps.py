@@ -7,8 +7,7 @@ import pytest
 
 from probewise.systems import Law, RunTable
 from probewise.systems.integrate import Integrations, integrate_from_known_trajectories, integrate_states
-from probewise.systems.law import LawWithEffects, Limit
-from probewise.systems.step import steps_for_table
+from probewise.systems.law import LawWithEffects, Limit, steps_for_table
 
 
 def _pendulum(s, p, u):

@@ -11,8 +11,7 @@ from probewise.errors import ParameterError
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.integrate import Integrations, integrate_states
-from probewise.systems.law import LawWithEffects, Limit
-from probewise.systems.step import steps_for_table
+from probewise.systems.law import LawWithEffects, Limit, steps_for_table
 from probewise.systems.system import with_converged_step
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from probewise.systems.integrate import Stepper
-from probewise.systems.law import LawWithEffects, StepInputs
+from probewise.systems.law import LawWithEffects, StepInputs, rosenbrock_step, runge_kutta_step
 from probewise.systems.simulator import Law
-from probewise.systems.step import rosenbrock_step, runge_kutta_step
 
 SWINGS = LawWithEffects(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))
 

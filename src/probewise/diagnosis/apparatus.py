@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.diagnosis.evidence import Parts
 from probewise.diagnosis.fit import Fit, Model, Null
-from probewise.diagnosis.held_out import Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.effects import Effect

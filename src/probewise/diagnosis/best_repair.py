@@ -15,16 +15,17 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.apparatus import SETTLED
-from probewise.diagnosis.evidence import SCALES, Linearised
-from probewise.diagnosis.fit import Fit, fit_each_start
-from probewise.diagnosis.held_out import (
+from probewise.diagnosis.evidence import (
+    SCALES,
     HeldOutGain,
+    Linearised,
     Parts,
     held_out_gain,
     mean_gain_over_parts,
     partition_into_blocks,
     predictive_log_densities,
 )
+from probewise.diagnosis.fit import Fit, fit_each_start
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise import NoiseLaw, walk_given_readings
 from probewise.diagnosis.outlying import FAR_OUT

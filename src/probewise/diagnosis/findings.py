@@ -10,9 +10,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.best_repair import BestRepair
-from probewise.diagnosis.evidence import linearised_sizes
+from probewise.diagnosis.evidence import held_out_gain, linearised_sizes
 from probewise.diagnosis.fit import fit
-from probewise.diagnosis.held_out import held_out_gain
 from probewise.diagnosis.locate import ALARM, significant_places
 from probewise.diagnosis.noise import n_rows_since_previous_usable, noise_statistics, previous_usable
 from probewise.diagnosis.prior_odds import Names

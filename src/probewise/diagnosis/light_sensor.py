@@ -18,8 +18,8 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
+from probewise.diagnosis.evidence import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.fit import Fit, Null
-from probewise.diagnosis.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.prepared import join_plans, last_known_value
 from probewise.effects import EFFECTS, NUISANCES, RARE_EFFECTS, VOCABULARY, Effect, Extent, LightEffect

@@ -11,9 +11,10 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
+from probewise.diagnosis.evidence import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.fit import Fit, Model, Null
-from probewise.diagnosis.held_out import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.outlying import MeterStop
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.words import join_names
 from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
@@ -23,7 +24,6 @@ from probewise.systems.forms import ReferenceFit, bind_forms
 from probewise.systems.forms.binding import has_value_per_run, names_in_definitions, names_of_jumps_in_sorted_rows
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.readings import time_since_start_of_run
-from probewise.systems.forms.stop import MeterStop
 from probewise.systems.table import append_tables, covariate_of_column, unused_name
 
 _LEAST_ROWS = 4

@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from probewise.effects import noise, optics, pose, reading
-from probewise.effects.effect import AGAIN, Effect, LightEffect, NoiseEffect, light_effect
-from probewise.effects.known import Estimated, Known
+from probewise.effects.effect import AGAIN, Effect, Estimated, Known, LightEffect, NoiseEffect, light_effect
 from probewise.effects.reference import Extent, Origin
 from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior
 

@@ -30,7 +30,7 @@ from probewise.effects import (
     LogHeavyTailedPrior,
     light_effect,
 )
-from probewise.effects.known import WrappedEffect
+from probewise.effects.effect import WrappedEffect
 from probewise.effects.optics import PatchPrior
 from probewise.effects.pose import play_of_axes
 from probewise.effects.reading import gain_drift

@@ -17,9 +17,8 @@ from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
-from probewise.systems.law import LawWithEffects, StepInputs, of_columns, values_at_rows
+from probewise.systems.law import LawWithEffects, Method, StepInputs, Steps, of_columns, rosenbrock_step, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
-from probewise.systems.step import Method, Steps, rosenbrock_step
 
 _MANY_COLUMNS = 64  # of the states' arrays, from which steps to be split are taken out of the others
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory

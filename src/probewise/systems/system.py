@@ -28,9 +28,8 @@ from probewise.systems.integrate import (
     integrate_from_known_trajectories,
     integrate_states,
 )
-from probewise.systems.law import LawWithEffects, readings_of_states
+from probewise.systems.law import LawWithEffects, Steps, readings_of_states, steps_for_table
 from probewise.systems.simulator import Columns, Law, Simulator, Values
-from probewise.systems.step import Steps, steps_for_table
 from probewise.systems.table import LARGEST_IN_FIT, RunTable, relative_sds_of_column
 
 _N_STARTS = 8

@@ -6,8 +6,8 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit_simulator import repaired_of
+from probewise.diagnosis.outlying import meter_stops_and_masks
 from probewise.systems import RunTable, Simulator, as_recording, predict_system, table_for
-from probewise.systems.forms.stop import meter_stops_and_masks
 
 _N, _SD = 240, 0.05
 

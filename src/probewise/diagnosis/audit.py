@@ -12,7 +12,6 @@ import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
@@ -48,7 +47,6 @@ from probewise.sensor import Stage
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
 from probewise.systems.system import STANDS_STILL, with_converged_step
-from probewise.systems.table import median_sd_of_column
 
 ALIAS = math.sqrt(1 - 2 * ENOUGH_NATS / LAMBDA**2)  # the cosine at which the evidence is ENOUGH_NATS
 _MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
@@ -364,26 +362,14 @@ def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, 
     return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
 
 
-def _levels(names: Sequence[str], theta: FloatArray) -> tuple[float, float]:
-    low, high = sorted(float(theta[list(names).index(name)]) for name in ("I_min", "I_max"))
-    return low, high if low < high else low + 1e-9 * (abs(low) or 1.0)
-
-
-def _effects_under(
-    kinds: Mapping[str, LightEffect], levels: tuple[float, float], null: Null, plan: Plan
-) -> dict[str, Effect]:
-    """Scale effects to the low and high level and to a plan, without those that cannot act or be told from the null."""
-    maybe = {name: kind.for_extent(Extent(*levels, plan)) for name, kind in kinds.items()}
-    return {name: effect for name, effect in maybe.items() if effect is not None and null.admits(effect)}
-
-
 def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[str, LightEffect]) -> Expected:
     """Return a sensor as calibrated, or a typical one, with its noise sd."""
     null: CalibratedSensor
     if sensor is not None:
         null, said = sensor_from_samples(sensor), _AS_CALIBRATED
-        low, high = _levels(sensor.names, np.asarray(sensor.samples, dtype=np.float64).mean(axis=0))
-        z = np.zeros(null.n_params)
+        mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
+        low, high = sorted(float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
+        high, z = high if low < high else low + 1e-9 * (abs(low) or 1.0), np.zeros(null.n_params)
     else:
         inst = plan.instrumentation
         bottom, top = (0.0 if inst.min is None else inst.min), (100.0 if inst.max is None else inst.max)
@@ -393,7 +379,12 @@ def _expected_sensor(plan: Plan, sensor: SensorPrior | None, effects: Mapping[st
         said = f"a typical sensor of {low:g} to {high:g}"
     sd = float(sensor.noise_sd.mean()) if isinstance(sensor, FittedSensor) else _NOISE * (high - low)
     said = f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
-    return Expected(null, z, sd, partial(_effects_under, effects, (low, high), null), said)
+
+    def effects_under(plan: Plan) -> dict[str, Effect]:
+        maybe = {name: kind.for_extent(Extent(low, high, plan)) for name, kind in effects.items()}
+        return {name: effect for name, effect in maybe.items() if effect is not None and null.admits(effect)}
+
+    return Expected(null, z, sd, effects_under, said)
 
 
 def audits_and_cosines(bank: EffectBank, names: Sequence[str], unit: str) -> tuple[tuple[EffectAudit, ...], FloatArray]:
@@ -613,13 +604,9 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
 
 
 def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:
-    declared = simulator.noise.sd
-    if isinstance(declared, str):
-        median = median_sd_of_column(table, declared)
-        if median is not None:
-            return median, f"the median of {declared}"
-    elif declared is not None:
-        return float(declared), "as declared"
+    declared, sd = simulator.noise.sd, simulator.declared_sd(table)
+    if sd is not None:
+        return float(sd), f"the median of {declared}" if isinstance(declared, str) else "as declared"
     return _NOISE * float(np.ptp(predicted)), "a hundredth of the range of the readings, since none is declared"
 
 

@@ -21,7 +21,6 @@ from probewise._words import count_with_noun
 from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared
 from probewise.diagnosis.evidence import covariance_root, log_evidence_of
 from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start, with_prior
-from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, rough_sd, white_noise_of_recording
 from probewise.diagnosis.outlying import MeterStop, find_lost_readings, meter_stops_and_masks
 from probewise.diagnosis.prepared import MOST_DIAGNOSED_READINGS, Prepared, positions_in_stretches
@@ -39,7 +38,6 @@ from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.reference import note_on_row_order, rows_are_in_order
 from probewise.systems.integrate import Integrations
 from probewise.systems.system import STANDS_STILL, with_converged_step
-from probewise.systems.table import median_sd_of_column
 
 _STEPS_TRIED = 8  # from each start
 _BEST_STARTS = 3  # of which it goes on
@@ -256,8 +254,7 @@ def is_noise_sd_known_beside_misfit(simulator: Simulator, table: RunTable) -> bo
 
 
 def _noise_sd_of(simulator: Simulator, table: RunTable, recording: Recording, found: Fit) -> float:
-    declared = simulator.noise.sd
-    known = median_sd_of_column(table, declared) if isinstance(declared, str) else declared
+    known = simulator.declared_sd(table)
     if known is not None:
         return float(known)
     rough = rough_sd(recording) if rows_are_in_order(simulator, table) else 0.0  # sorted, successive ones are too alike
@@ -527,11 +524,7 @@ def prepare_system(
     told("fitting the simulator")
     plain = system
     system, found, sd = fit_system(plain, recording)
-    first = SimulatorApparatus(ReferenceFit(system, table, found.z, sd))
-
-    def covariates(fitted: Fit) -> Sequence[Covariate]:
-        return first.covariates_and_predicted_slope(fitted, recording)[0]
-
+    covariates = SimulatorApparatus(ReferenceFit(system, table, found.z, sd)).covariates_and_predicted_slope
     lost = find_lost_readings(found.model, recording, found, list(system.starts), covariates, sd=sd)
     effect = None if lost is None else lost.effect(recording)
     if lost is not None:

@@ -483,16 +483,11 @@ class OrthonormalBlocks:
 
 def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
     """Whiten templates (n_points, k), scale to unit rms, project the fit out; concatenated, (n_rows, n_columns)."""
-    return problem.project_whitened(whiten_to_unit_rms(templates, problem.law))
-
-
-def whiten_to_unit_rms(templates: Sequence[FloatArray], law: NoiseLaw) -> FloatArray:
-    """Whiten templates (n_points, k) and scale each to unit rms; concatenated, (n_points, n_columns)."""
     widths = [template.shape[1] for template in templates]
-    whitened = law(np.concatenate(templates, axis=1))
+    whitened = problem.law(np.concatenate(templates, axis=1))
     norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
-    whitened *= np.sqrt(law.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
-    return whitened
+    whitened *= np.sqrt(problem.n_kept / np.repeat(widths, widths)) / np.where(norms > 0, norms, 1.0)
+    return problem.project_whitened(whitened)
 
 
 def orthonormalise_groups(
@@ -596,7 +591,9 @@ def held_out_gain(
         if not rest.n_kept:  # without them the noise sd, and so the density, is unknown
             return np.zeros(int(out.sum()))
         without = fit(found.model, recording.with_readings(readings), found.z, rest, max_steps=4, tolerance=0.05)
-        of_its_own = are_of_part_alone(found.slopes, out)
+        # Such as where its run starts: parameters that change only the readings of the part.
+        here, elsewhere = (np.linalg.norm(found.slopes[rows], axis=0) for rows in (out, ~out))
+        of_its_own = (here > 0.0) & (elsewhere <= _NO_SLOPE * here)
         turned = np.where(of_its_own, 0.0, rest(without.slopes))
         # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the
         # other readings may bound them on one side only, as for a ceiling.
@@ -703,12 +700,3 @@ def predictive_log_densities(
         mean += gain * left / variance
         covariance -= np.outer(gain, gain) / variance
     return densities
-
-
-def are_of_part_alone(slopes: FloatArray, part: BoolArray) -> BoolArray:
-    """Return which parameters change only the readings of a part, (n_params,), such as where its run starts.
-
-    `slopes` are those of all readings, (n_readings, n_params), `part` is the mask of its readings.
-    """
-    here, elsewhere = (np.linalg.norm(slopes[rows], axis=0) for rows in (part, ~part))
-    return np.asarray((here > 0.0) & (elsewhere <= _NO_SLOPE * here))

@@ -134,17 +134,17 @@ def find_lost_readings(
     recording: Recording,
     first: Fit,
     starts: Sequence[FloatArray],
-    covariates: Callable[[Fit], Sequence[Covariate]],
+    covariates: Callable[[Fit, Recording], tuple[Sequence[Covariate], FloatArray]],
     *,
-    sd: float = math.inf,
+    sd: float,
 ) -> LostReadings | None:
     """Find single readings so far from a fit to the others that even the widest outlying noise is improbable.
 
     The fit is one of least trimmed squares (Rousseeuw 1984), which a fifth of the readings cannot bend, however far out
     they are. A reading is lost if it also stands out from its neighbours in the run, so that neither a jump nor a bend
     explains it, or has the very value of one that is; and if such readings do not cluster in a covariate (`covariates`
-    of a fit). Nothing is fitted unless a residual of the fit `first`, to all readings, is improbable, or their rms is
-    over twice a noise sd that is known without it. None if there are none.
+    are as of an `Apparatus`). Nothing is fitted unless a residual of the fit `first`, to all readings, is improbable,
+    or their rms is over twice a noise sd that is known without it. None if there are none.
     """
     law, usable = white_noise_of_recording(recording), np.flatnonzero(recording.usable)
     n_most, size = int(MOST_OUTLYING * len(usable)), np.abs(law(first.residuals))
@@ -175,7 +175,7 @@ def find_lost_readings(
     far = aside & (size > LARGEST_SIZE * by_chance)
     readings = recording.readings[usable]
     far |= aside & (size > by_chance) & np.isin(readings, readings[far])  # lost to one value, nearer to what was there
-    if not far.any() or _cluster(far, readings, covariates(found)):
+    if not far.any() or _cluster(far, readings, covariates(found, recording)[0]):
         return None
     squares = residual**2
     return LostReadings(usable[far], size[far], float(squares[far].sum() / squares.sum()))

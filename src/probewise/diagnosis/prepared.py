@@ -12,8 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, own_arithmetic
 from probewise.diagnosis.apparatus import Apparatus
-from probewise.diagnosis.fit import Fit, Model, Null, fit_each_start
-from probewise.diagnosis.locate import Covariate
+from probewise.diagnosis.fit import Model, Null, fit_each_start
 from probewise.diagnosis.noise import rough_sd, white_noise_of_recording
 from probewise.diagnosis.outlying import LostReadings, find_lost_readings
 from probewise.diagnosis.sensors import (
@@ -65,7 +64,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
         join_plans(plans, own_sessions=True),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
-        (*notes, *_notes_on_missing_covariates(plans, labels), *_notes_on_other_instrumentation(plans, labels)),
+        (*notes, *_notes_on_differences(plans, labels)),
     )
 
 
@@ -136,17 +135,13 @@ def _joined_covariate(plans: Sequence[Plan], name: str) -> FloatArray:
     return np.concatenate(columns)
 
 
-def _notes_on_missing_covariates(plans: Sequence[Plan], labels: Sequence[str]) -> Iterator[str]:
+def _notes_on_differences(plans: Sequence[Plan], labels: Sequence[str]) -> Iterator[str]:
     first = plans[0].covariates.keys()
     for other, label in zip(plans[1:], labels[1:], strict=True):
         for name in sorted(first - {*other.covariates, *COMMANDED}):
             yield f"{label} has no column {name}: taken to be there as it was last known"
         for name in sorted(other.covariates.keys() - {*first, *COMMANDED}):
             yield f"column {name} of {label} left out: {labels[0]} has none"
-
-
-def _notes_on_other_instrumentation(plans: Sequence[Plan], labels: Sequence[str]) -> Iterator[str]:
-    for other, label in zip(plans[1:], labels[1:], strict=True):
         for name in ("min", "max", "step", "height_mm"):
             own, taken = (getattr(plan.instrumentation, name) for plan in (other, plans[0]))
             if own == taken:
@@ -352,8 +347,4 @@ def _lost_readings(recording: Recording, null: Null | None, apparatus: Apparatus
     first = min(fit_each_start(model, recording, list(starts), law), key=lambda found: found.objective)
     if not np.isfinite(first.objective):
         return None
-
-    def covariates(found: Fit) -> Sequence[Covariate]:
-        return apparatus.covariates_and_predicted_slope(found, recording)[0]
-
-    return find_lost_readings(model, recording, first, [], covariates, sd=rough)
+    return find_lost_readings(model, recording, first, [], apparatus.covariates_and_predicted_slope, sd=rough)

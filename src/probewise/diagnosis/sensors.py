@@ -29,9 +29,8 @@ from probewise.diagnosis.noise import SAME_SD, SdPrior
 from probewise.effects import Effect, Extent
 from probewise.effects.noise import noise_sd, quantisation
 from probewise.errors import ParameterError, require
-from probewise.priors import Prior
 from probewise.recordings.plan import Plan, Recording
-from probewise.scene import AnyOf, KnownScene, Region, Scene, Shape
+from probewise.scene import AnyOf, HypothesisScene, KnownScene, Region, Scene, Shape
 from probewise.sensor import (
     FAST_NODES,
     N_BENDS,
@@ -334,19 +333,10 @@ class SensorAndShape(CalibratedSensor):
 
 
 @dataclass(frozen=True, eq=False)
-class _ShapeAmongPatterns:
+class _ShapeAmongPatterns(HypothesisScene):
     """A scene of a plan's described patterns, and of one unknown shape under every other name."""
 
-    shape: Shape
     plan: Plan
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.shape.prior.names
-
-    @property
-    def prior(self) -> Prior:
-        return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return the region of each pattern by name, for theta (n_samples, n_params of the shape)."""

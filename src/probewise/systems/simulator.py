@@ -28,7 +28,7 @@ from probewise.errors import FileError, ParameterError, message_of, printable, r
 from probewise.priors import Marginal, parse_prior
 from probewise.recordings.io import raising_exceptions, read_text, run_python_text
 from probewise.sensor import Stage
-from probewise.systems.table import RunTable, read_run_table
+from probewise.systems.table import RunTable, median_sd_of_column, read_run_table
 
 _OF_SYSTEM = ("reading", "unit", "time", "time_unit", "run", "parameters", "per_run", "controls", "noise")
 _OF_LAW = ("states", "hold", "max_step_s")
@@ -237,6 +237,10 @@ class Simulator:
             require(name not in _TAKEN, "extra", name, allowed)
         for name, value in given.items():
             object.__setattr__(self, name, value)
+
+    def declared_sd(self, table: RunTable) -> float | None:
+        """Return the declared sd of a reading, or the median of a column of sds; None if there is none."""
+        return median_sd_of_column(table, self.noise.sd) if isinstance(self.noise.sd, str) else self.noise.sd
 
     def inputs(self, columns: Columns) -> dict[str, NDArray[Any]]:
         """Return columns by name without the reading and its declared sd."""

@@ -153,7 +153,9 @@ class WeighedFit:
 
     def at_likelier_sd(self, noise: Names) -> NoiseEvidence:
         """Return the evidence under a noise model, with the calibration's noise sd or another, the larger one."""
-        return max((e for names, e in self.evidence.items() if _unchanged(names) == noise), key=lambda e: e.log_z)
+        return max(
+            (self.evidence[own] for own in (noise, _changed(noise)) if own in self.evidence), key=lambda e: e.log_z
+        )
 
     def split_by_sd(self, changed: NoiseEffect) -> WeighedFit:
         """Return a copy with two noise models for each: with the noise sd of the calibration, and with another."""
@@ -211,10 +213,6 @@ def effects_out_of_vocabulary(mean: Names) -> Names:
 
 def _changed(noise: Names) -> Names:
     return tuple(sorted((*noise, noise_sd.name)))
-
-
-def _unchanged(noise: Names) -> Names:
-    return tuple(name for name in noise if name != noise_sd.name)
 
 
 WITH_MEMORY = frozenset({correlated_noise.name, random_walk.name})

@@ -92,6 +92,10 @@ def frozen_int(values: ArrayLike) -> IntArray:
     return array
 
 
+TINY = 1e-300
+"""Least divisor, whose square root is a number: what it divides is 0 with it."""
+
+
 def rounding_error(values: FloatArray, axis: int | None = None) -> FloatArray:
     """Return the difference up to which values are taken for equal, since they are the results of arithmetic.
 

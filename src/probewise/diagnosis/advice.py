@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import TINY, FloatArray, IntArray
 from probewise.diagnosis.apparatus import (
     ENOUGH_NATS,
     MOST_ADVISED_READINGS,
@@ -180,7 +180,7 @@ def pairs_with_separating_scans(
         with np.errstate(all="ignore"):  # not finite where the model diverges
             old = problem.whiten((with_effect.predict(points) - without).T[usable])
             new = (replace(with_effect, plan=everywhere).predict(points) - expected).T / problem.sd
-        length = max(float(np.linalg.norm(old)), 1e-300)
+        length = max(float(np.linalg.norm(old)), TINY)
         is_of_run = len(apparatus.coordinates_of_new_run(with_effect)) > len(of_run)
         if is_of_run:  # the new run's value is about the mean of the others
             new = np.repeat(new.mean(axis=1, keepdims=True), new.shape[1], axis=1)

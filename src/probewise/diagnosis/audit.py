@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, own_arithmetic, read_only_floats
+from probewise._arrays import TINY, FloatArray, IntArray, own_arithmetic, read_only_floats
 from probewise._display import Reported
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
@@ -116,7 +116,7 @@ class EffectBank:
         onto = np.add.reduceat(onto, _run_start_indices(self.entry[at]), axis=1)
         mine = np.unique(self.entry[at])
         best = np.maximum.reduceat(onto, _run_start_indices(self.owner), axis=0)
-        cosines = np.sqrt(np.minimum(best / np.maximum(kept[mine] ** 2, 1e-300), 1.0))
+        cosines = np.sqrt(np.minimum(best / np.maximum(kept[mine] ** 2, TINY), 1.0))
         owners = [names[k] for k in self.owner[_run_start_indices(self.owner)]]
         for name in wanted:
             typical = np.median(cosines[:, self.owner[mine] == names.index(name)], axis=1)
@@ -586,7 +586,7 @@ def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatAr
     never, is_constant = np.ones(len(table), dtype=np.bool_), False
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
-        if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-12 * max(float(np.abs(predicted).max()), 1e-300):
+        if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-12 * max(float(np.abs(predicted).max()), TINY):
             other = "another point of the prior (at its middle, readings are constant or not finite)"
             return z, predicted, other if k else "the middle of the prior"
         never &= ~np.isfinite(predicted)

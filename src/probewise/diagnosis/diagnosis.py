@@ -45,6 +45,8 @@ from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreemen
 from probewise.diagnosis.sensors import SensorPrior
 from probewise.diagnosis.verdict import (
     N_DRAWS,
+    NEGLIGIBLE,
+    OPEN,
     GlobalTest,
     Grounds,
     Judged,
@@ -304,7 +306,7 @@ class Diagnosis(Judged, Reported):
             odd = "probability of readings at least this odd if nothing is missing from the mean"
             lines.append(f"{p_in_words(self.p_value)} ({odd})")
         lines.append("probability  explanation")
-        for h in (h for h in self.hypotheses[:5] if h.probability > 1e-3):
+        for h in (h for h in self.hypotheses[:5] if h.probability > NEGLIGIBLE):
             words, code = hypothesis_in_words(h.effects), h.label
             lines.append(f"  {h.probability:9.3f}  {words if words == code else f'{words} ({code})'}")
         # The reason is not repeated.
@@ -312,7 +314,7 @@ class Diagnosis(Judged, Reported):
             f"{self.apparatus.words.as_sentence(e.sentence)} ({name_without_copy_suffix(e.name)}, probability "
             f"{e.probability:.3f} in all explanations together)"
             for e in self.effects
-            if e.probability > 0.05 and e.sentence.lower() not in self.reason.lower()
+            if e.probability > OPEN and e.sentence.lower() not in self.reason.lower()
         ]
         gain, unit = self.improvement, self.recording.plan.instrumentation.unit_after_number
         unit = f"{unit}{self.recording.weighting_in_words}"

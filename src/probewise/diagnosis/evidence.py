@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.fit import Fit, fit, log_multiplicity, residual_degrees_of_freedom, with_prior
 from probewise.diagnosis.noise import (
     LEAST_SCALE,
@@ -38,7 +38,8 @@ SCALES = np.geomspace(0.05, 25.0, 8)
 LEAST_VISIBLE = 4.0
 """Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
 
-_MOST_NUMBERS = 4_000_000  # numbers in memory, for the slopes under several noise models
+NUMBERS = 4_000_000
+"""Readings or slopes that are predicted or whitened at once, to fit in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,7 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw], sd_prior: SdPrior |
             peak[:, nodes] = _peak_of_log_sd(own, sigma, bend, curvature)
 
     normal = [node for node, law in enumerate(laws) if law.whitened_density.is_normal]
-    chunk = max(_MOST_NUMBERS // joined.size, 1)
+    chunk = max(NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
         weigh(nodes, _normal_log_evidences)
     tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
@@ -673,7 +674,7 @@ def predictive_log_densities(
     whitened, sd = innovations_given_rest(law, columns, out, each_alone=not sequential)
     turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
     noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
-    log_shares = np.log(np.maximum([1 - law.share, law.share], 1e-300))
+    log_shares = np.log(np.maximum([1 - law.share, law.share], TINY))
     widths = np.tile([1.0, law.times**2], (len(sd), 1))
     if law.wide.size:  # variances, in units of sd^2, if each is narrow and if it is wide: it may be either
         own = law.sd[out] ** 2

@@ -18,12 +18,12 @@ from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
 from probewise.diagnosis.search.hypotheses import ALIASED_NATS, Searched, WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.templates import TemplateCache, log_mean_exp
-from probewise.diagnosis.verdict import N_DRAWS, Hypothesis, Judged
+from probewise.diagnosis.verdict import N_DRAWS, NEGLIGIBLE, Hypothesis, Judged
 from probewise.diagnosis.words import p_in_words, substitute_reading_unit
 from probewise.effects import Effect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
+from probewise.effects.noise import sd_of_rounding
 
-_LEAST_PROBABILITY = 1e-3
 _IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
 _STANDS_BESIDE = 0.5  # conditional probability from which an effect counts as beside the unknown one
 
@@ -100,7 +100,7 @@ def effects_found(
         p = sum(h.probability for h in hypotheses if name in h.effects)
         if beside.get(name, 0.0) >= _STANDS_BESIDE and not is_out_of_vocabulary(name):
             p += unknown * beside[name]
-        if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)):
+        if p <= NEGLIGIBLE or not noise_effects_in_vocabulary((name,)):
             continue
         holder, noise = (best.fit, best.noise) if name in samples.effects else likeliest_with(name)
         if holder is None:
@@ -144,7 +144,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     if name in searched.certain:
         own = holder.evidence[noise]
         step = float(own.nodes.settings[0, own.noise.columns_of_effect(name)][0])
-        return step / math.sqrt(12) / found.sd * math.sqrt(law.n_kept)
+        return sd_of_rounding(step) / found.sd * math.sqrt(law.n_kept)
     if name in prepared.noise_effect_names:
         # For noise effects: the size of an effect on the mean with equal evidence.
         without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]

@@ -15,7 +15,7 @@ from probewise._display import Reported
 from probewise._kinds import require_kind, require_progress, require_rng
 from probewise.diagnosis.diagnose_simulator import modes_of, notes_on_declared_noise, prepare_system
 from probewise.diagnosis.diagnosis import Diagnosis
-from probewise.diagnosis.evidence import laplace_evidence, log_evidence_of
+from probewise.diagnosis.evidence import NUMBERS, laplace_evidence, log_evidence_of
 from probewise.diagnosis.fit import Fit, Model, fit_each_start
 from probewise.diagnosis.noise import (
     LEAST_SCALE,
@@ -25,7 +25,7 @@ from probewise.diagnosis.noise import (
     white_noise_of_recording,
 )
 from probewise.diagnosis.outlying import note_on_improbable_rows
-from probewise.diagnosis.posterior import NUMBERS, HypothesisProblem, draw_by_importance
+from probewise.diagnosis.posterior import HypothesisProblem, draw_by_importance
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, noise_sd_by_node
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
+from probewise._arrays import TINY, BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.templates import TemplateBank
 from probewise.effects import Effect
@@ -178,7 +178,7 @@ def significant_places(
     n_draws).
     """
     out: list[Place] = []
-    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_kept)
+    norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), TINY) / problem.n_kept)
     own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_kept) or 1.0
     for covariate in covariates:
         columns, windows = window_columns(covariate, problem.n_points)

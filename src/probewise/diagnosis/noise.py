@@ -16,9 +16,9 @@ import numpy as np
 from scipy.linalg.lapack import dpbtrf, dpttrf, dpttrs, dtbtrs
 from scipy.special import expit
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
 from probewise.effects import NoiseEffect
-from probewise.effects.noise import SD_FACTORS, lattice_step
+from probewise.effects.noise import FAR, SD_FACTORS, lattice_step, sd_of_rounding
 from probewise.effects.noise_distribution import FittedReadings, log_gaussian_mass_between
 from probewise.inference import sd_of_numbers
 from probewise.recordings.plan import Recording
@@ -505,13 +505,13 @@ def noise_statistics(
     reading of the scan, shape (n_points,); None where it is the one above. Returns lag-1 autocorrelation, excess
     kurtosis, and projection of the squares on the level, (3, n_draws).
     """
-    r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
+    r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), TINY))
     neighbours = np.flatnonzero(steps == 1)
     above = neighbours - 1 if before is None else before[neighbours]
     lag_1 = (r[neighbours] * r[above]).mean(axis=0) if neighbours.size else np.zeros(r.shape[1])
     kurtosis = (r**4).mean(axis=0) - 3
     tilt = level - level.mean()
-    tilt = tilt / max(float(np.linalg.norm(tilt)), 1e-300)
+    tilt = tilt / max(float(np.linalg.norm(tilt)), TINY)
     return np.stack([lag_1, kurtosis, tilt @ (r**2)])
 
 
@@ -667,7 +667,6 @@ def n_rows_since_previous_usable(recording: Recording) -> IntArray:
     return np.where(before >= 0, own - own[before], 0).astype(np.int64)
 
 
-_FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
 _APART = 0.3  # initial spacing of nodes in the log of half a step over the noise sd
 _WIDEST, _NARROWEST = -6, 9  # range of nodes: noise sds from 3 steps, or the residual rms, to a thirtieth of a step
 _UNLIKELY = 15.0  # nats behind the best from which nodes of noise with rounding are dropped
@@ -797,7 +796,7 @@ class NoiseModel:
         span, seen = float(np.ptp(predicted)) or 1.0, np.zeros((1, len(self.recording)))
         seen[0, self.recording.usable] = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
         noise = self._parameters(settings, seen)
-        far = np.abs(residuals) > _FAR * sd
+        far = np.abs(residuals) > FAR * sd
         names = "rho", "walk", "wide_share", "wide_times", "lost_share", "lost_value"
         each = (np.broadcast_to(getattr(noise, name)[:, 0], len(settings)).tolist() for name in names)
         sds = noise.sd if noise.sd.shape[1] == 1 else noise.sd[:, self.recording.usable]
@@ -820,7 +819,7 @@ class NoiseModel:
         residuals = (self._readings - predicted) / self.recording.relative_sd[self.recording.usable]
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         free = residuals[~self._censored] if self._censored.any() else residuals
-        sd = max(float(np.median(np.abs(free))) / MAD_OF_NORMAL, self._rounding_step / math.sqrt(12))
+        sd = max(float(np.median(np.abs(free))) / MAD_OF_NORMAL, sd_of_rounding(self._rounding_step))
         return residuals, sd or 1.0
 
     def _law(

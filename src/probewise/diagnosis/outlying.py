@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import betaln, ndtri, stdtr
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.fit import Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.locate import Covariate, window_columns
@@ -119,7 +119,7 @@ def improbable_rows(found: Fit, law: NoiseLaw, *, chance: float = _BY_CHANCE) ->
                 break
             unshared = 1 - np.minimum(np.sum(own**2, axis=1), 1 - 1e-9)
             others = (left @ left - left**2 / unshared) / free
-            t = np.abs(left) / np.sqrt(np.maximum(others, 1e-300) * unshared)
+            t = np.abs(left) / np.sqrt(np.maximum(others, TINY) * unshared)
             t[unshared < 1e-6] = 0.0
             worst = int(np.argmax(t))
             if 2 * kept.sum() * stdtr(free, -t[worst]) > chance:

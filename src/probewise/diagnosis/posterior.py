@@ -34,7 +34,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.evidence import NoiseEvidence, log_evidence_of
+from probewise.diagnosis.evidence import NUMBERS, NoiseEvidence, log_evidence_of
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, SdPrior
 from probewise.diagnosis.sensors import CalibratedSensor
@@ -205,9 +205,6 @@ class TangentModel:
         view = self.view + moved @ self.slopes
         return self.model.chain.readings_from_simulated_view(view, self.model.theta(z), self.model.plan)[:, rows]
 
-
-NUMBERS = 4_000_000
-"""Readings that are predicted at once."""
 
 _HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
 

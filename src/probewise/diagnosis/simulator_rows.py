@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import TINY, FloatArray, IntArray
 from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
 from probewise.diagnosis.evidence import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.fit import Fit, Model, Null
@@ -270,7 +270,7 @@ class SimulatorApparatus(Apparatus):
         out = []
         for name, values in pooled.items():
             there = np.flatnonzero(np.isfinite(values))
-            if there.size > 1 and np.ptp(values[there]) > _CONSTANT * max(1e-300, float(np.abs(values[there]).max())):
+            if there.size > 1 and np.ptp(values[there]) > _CONSTANT * max(TINY, float(np.abs(values[there]).max())):
                 out.append(Covariate(name, values[there], there))
         if len(table.scan_names) > 1:
             out.append(Covariate("run", table.scan[usable].astype(np.float64), np.arange(len(usable)), groups=True))

@@ -17,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised, scale_and_project
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise import NoiseLaw
@@ -98,7 +98,7 @@ class TemplateBank:
         (n_entries, n_draws).
         """
         own = problem.residual[:, None] if residuals is None else residuals
-        total = np.maximum(np.sum(own**2, axis=0), 1e-300)
+        total = np.maximum(np.sum(own**2, axis=0), TINY)
         out = np.empty((len(self.templates), own.shape[1]))
         for members, _, left, along in self.projected(problem, own):
             out[members] = _log_bayes_factors_of_grams(left, along, total, problem.n_kept)
@@ -116,7 +116,7 @@ class TemplateBank:
         out = np.empty(len(self.templates))
         for members, grams, left, _ in self.projected(problem, np.zeros((len(problem.basis), 0))):
             whole, kept = (np.trace(each, axis1=1, axis2=2) for each in (grams, left))
-            out[members] = np.sqrt(np.maximum(1 - (whole - kept) / np.maximum(whole, 1e-300), 0.0))
+            out[members] = np.sqrt(np.maximum(1 - (whole - kept) / np.maximum(whole, TINY), 0.0))
         return out[self.which]
 
     def projected(
@@ -439,7 +439,7 @@ def log_bayes_factors_of_pairs(
     asked = [((a, i), (b, j)) for a, b in pairs for i in best[a] for j in best[b]]
     both = [np.concatenate([own[first], own[second]]) for first, second in asked]
     together, n_columns = np.empty(len(both)), np.array([len(at) for at in both])
-    total = np.maximum(np.sum(problem.residual[:, None] ** 2, axis=0), 1e-300)
+    total = np.maximum(np.sum(problem.residual[:, None] ** 2, axis=0), TINY)
     per_column = np.sqrt(np.repeat(widths, widths))
     for width in set(n_columns.tolist()):
         members = np.flatnonzero(n_columns == width)

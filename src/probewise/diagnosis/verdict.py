@@ -38,6 +38,9 @@ from probewise.effects import PROPOSAL
 N_DRAWS = 999
 """Number of residual draws under the null."""
 
+NEGLIGIBLE = 1e-3
+"""Probability up to which a hypothesis or an effect is not listed."""
+
 _NO_ALARM = 0.05  # p-value above which no alarm is possible, so that other forms of the SSF need no test
 
 
@@ -189,7 +192,7 @@ class Judged:
     @property
     def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
         """Forms that an unknown effect could have, with probabilities, largest first; empty if there hardly is one."""
-        if self.unknown_probability < 1e-3:
+        if self.unknown_probability < NEGLIGIBLE:
             return ()
         shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
         return tuple((name, self.unknown_probability * share) for name, share in shares if share > 0.01)
@@ -400,7 +403,8 @@ NOTHING_MORE = "nothing more"
 NOTHING = "nothing missing"
 """The hypothesis of no effect at all."""
 
-_OPEN = 0.05  # least probability of a rival: what has less is no open question
+OPEN = 0.05
+"""Least probability of a rival: what has less is no open question."""
 
 
 @dataclass(frozen=True)
@@ -533,7 +537,7 @@ def _open_question(hypotheses: Sequence[Hypothesis], grounds: Grounds, nothing: 
 
 
 def _rivals_to_name(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    return [h for k, h in enumerate(hypotheses[:3]) if k == 0 or h.probability >= _OPEN]
+    return [h for k, h in enumerate(hypotheses[:3]) if k == 0 or h.probability >= OPEN]
 
 
 def _joined_effect_sentences(names: Sequence[str], grounds: Grounds, *more: str) -> str:

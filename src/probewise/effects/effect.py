@@ -20,7 +20,7 @@ from probewise._words import unit_after_number, value_with_sd
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.reference import ZERO, Extent, Origin
 from probewise.errors import require
-from probewise.priors import HeavyTailedPrior, Marginal, Prior, Product, Uniform
+from probewise.priors import HeavyTailedPrior, LogUniform, Marginal, Prior, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor import stages
 from probewise.sensor.stages import Stage
@@ -530,6 +530,11 @@ def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]
     """
     equal = np.all(samples == samples[0], axis=0)
     return np.where(equal, samples[0], samples.mean(axis=0)), np.where(equal, 0.0, samples.std(axis=0))
+
+
+def sizes_inside(prior: LogUniform, n: int, by: float = 1.5) -> FloatArray:
+    """Return trial sizes of a prior for a template bank, (n,), by a factor inside its ends."""
+    return np.geomspace(prior.low * by, prior.high / by, n)
 
 
 def single_column_bank(*parameters: ArrayLike) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import TINY, FloatArray
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     Act,
@@ -31,7 +31,6 @@ from probewise.sensor.stages import NoiseParameters, Stage
 
 _SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
 _NEWTON_STEPS = 40
-_FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
 _NEAR_END = 1e-4  # of the range of a lost reading's value: distance of the bank's values from its ends
 _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printed values
 _DIGITS = 1e-6  # of a step: below this a difference is rounding
@@ -210,6 +209,9 @@ def _most_probable_log_sd_ratios(counts: FloatArray, squares: FloatArray, spread
     return np.asarray(logs)
 
 
+FAR = 4.0
+"""Noise sds from its prediction beyond which a reading may be lost rather than noisy."""
+
 LARGEST_SIZE = 40.0
 """Largest sd of outlying readings, in noise sds; readings too far out for it are lost ones (`diagnosis.outlying`)."""
 
@@ -243,7 +245,7 @@ def readings_lost_beyond_doubt(lost: FloatArray, n_readings: int, distance: floa
     They are left out of the recording, so that the noise of the others does not change. `distance` is the norm of their
     residuals in noise sds.
     """
-    wide = 0.01 * max(float(np.ptp(lost)), float(np.abs(lost).max()), 1e-300)
+    wide = 0.01 * max(float(np.ptp(lost)), float(np.abs(lost).max()), TINY)
     values = tuple(lost.tolist())
     low, high = float(lost.min()) - wide, float(lost.max()) + wide
     return _dropouts(
@@ -285,7 +287,7 @@ def _commonest_far_value(
     There is no node, (0, 2), unless an outlying value occurs twice or is one of the `ends` of the declared range, its
     likeliest values. Log weights are equal.
     """
-    far = rows.readings[np.abs(residuals) > _FAR]
+    far = rows.readings[np.abs(residuals) > FAR]
     # Floats differ in their last digits, so the value is one of the readings, not their mean.
     n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)
     at_end = (np.abs(far[:, None] - np.array(ends)) <= 1e-6 * rows.sd).any(axis=1)
@@ -329,6 +331,11 @@ def quantisation(kind: LightEffect, of: Extent) -> Effect | None:
     return _on_noise(kind, of, {"step": (step, "reading")}, act, says, (16,), from_prior=False)  # from the readings
 
 
+def sd_of_rounding(step: float) -> float:
+    """Return the sd of the error of rounding to a step."""
+    return step / math.sqrt(12)
+
+
 def lattice_step(readings: FloatArray) -> float:
     """Find the step of a lattice that holds all readings; 0 where there is none.
 
@@ -355,7 +362,7 @@ def sd_of_estimated_lattice_step(readings: FloatArray, step: float) -> float:
     fits = (np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n) for n in range(first, first + 10))
     digit = next((10.0**-n for n, fit in enumerate(fits, first) if fit), 0.0)
     reach = float(np.linalg.norm(values - values.mean())) / step
-    return max(digit / math.sqrt(12) / reach, _DIGITS * step)
+    return max(sd_of_rounding(digit) / reach, _DIGITS * step)
 
 
 def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import TINY, FloatArray
 from probewise.effects.effect import (
     Act,
     Declared,
@@ -24,6 +24,7 @@ from probewise.effects.effect import (
     one_of,
     scans_in_words,
     single_column_bank,
+    sizes_inside,
 )
 from probewise.effects.reference import Extent, Origin, candidate_scan_groups, distinct_positions_mm, scan_indicator
 from probewise.priors import HeavyTailedPrior, LogUniform, Normal, Product, Uniform
@@ -49,7 +50,7 @@ def edge_misplacement(kind: LightEffect, of: Extent) -> Effect:
     """Every pattern is shifted by offset_mm: along its normal (half-plane, stripes, ramp), or along X (all others)."""
     act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * np.ones(len(plan)), plan))
     says = in_words("the printed edges lie {0} mm from their described place, in all scans")
-    return kind.linear(of, {"offset_mm": "mm"}, 0.003 * of.length_mm, act, says)
+    return kind.linear(of, {"offset_mm": "mm"}, of.small_shift_mm, act, says)
 
 
 @light_effect("scan_misplacement", Stage.SCENE, "a misplaced pattern in one scan", ("scan", "slope"))
@@ -59,7 +60,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
     def in_scan(name: str) -> Effect:
         act = acting(lambda value, plan, mm: _with_shifted_patterns(value, mm * scan_indicator(plan, (name,)), plan))
         says = in_words(f"in {scans_in_words((name,))} the pattern lies {{0}} mm from where it lies in the others")
-        return kind.linear(of, {"offset_mm": "mm"}, 0.003 * of.length_mm, act, says, scans=(name,))
+        return kind.linear(of, {"offset_mm": "mm"}, of.small_shift_mm, act, says, scans=(name,))
 
     names = tuple(dict.fromkeys(of.plan.scan_names))
     return one_of([in_scan(name) for name in names]) if len(names) > 1 else None
@@ -296,7 +297,7 @@ def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian
     """
     a, b = region.theta[:, :1], region.theta[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
-    rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
+    rise = np.sqrt(np.maximum(a * x + b * y, TINY))  # sd of the field under the footprint, t.C t
     x, y = x / rise * _STEP, y / rise * _STEP
 
     def mean_albedo_at_shift(sign: float) -> FloatArray:
@@ -427,7 +428,6 @@ class _BlurEffect(Effect):
 @light_effect("halo", Stage.FOOTPRINT, "scattered light around the spot", ("edge_distance",))
 def halo(kind: LightEffect, of: Extent) -> Effect:
     """Light scattered in the lens: `share` of the footprint becomes one more Gaussian, of sd r_mm about its centre."""
-    narrowest_mm, widest_mm = 0.1 * of.length_mm, of.length_mm
 
     def act(value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
@@ -436,8 +436,9 @@ def halo(kind: LightEffect, of: Extent) -> Effect:
         return _with_more_gaussians(value, (1 - share) * value.weight, more)
 
     says = "a wide halo around the sensor's spot, of sd {1} mm, contributes {0} % of the light: the lens scatters it"
-    parameters = {"share": (LogUniform(1e-3, 0.7), "1"), "r_mm": (LogUniform(narrowest_mm, widest_mm), "mm")}
-    bank = single_column_bank(0.02, np.geomspace(narrowest_mm * 1.2, widest_mm / 1.2, 5))
+    radii = LogUniform(0.1 * of.length_mm, of.length_mm)
+    parameters = {"share": (LogUniform(1e-3, 0.7), "1"), "r_mm": (radii, "mm")}
+    bank = single_column_bank(0.02, sizes_inside(radii, 5, 1.2))
     return kind.bind(of, parameters, act, bank, in_words(says, factors=(100,)))
 
 
@@ -472,7 +473,7 @@ def edge_shadow(kind: LightEffect, of: Extent) -> Effect:
 
 def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, ...]) -> Effect:
     """Return the shadow along the edges of these patterns, () for all."""
-    typical, narrowest_mm, widest_mm = 0.01, 0.01 * of.length_mm, of.length_mm / 3
+    typical, widths = 0.01, LogUniform(0.01 * of.length_mm, of.length_mm / 3)
 
     def act(value: View, theta: FloatArray, plan: Plan) -> View:
         x_mm, y_mm = (np.broadcast_to(a, (len(a), len(plan))) for a in (value.poses.x_mm, value.poses.y_mm))
@@ -489,8 +490,8 @@ def edge_shadow_of_patterns(kind: LightEffect, of: Extent, patterns: tuple[str, 
     where = f"of an edge of pattern {', '.join(patterns)}" if patterns else "of an edge"
     looks = f"within {{1}} mm {where} the surface looks {{|0|}} % {{darker/brighter}} than the pattern explains"
     says = in_words(f"{looks}: the edge {{casts a shadow/reflects light}}", factors=(100,))
-    parameters: Declared = {"amp": (HeavyTailedPrior(typical), "1"), "w": (LogUniform(narrowest_mm, widest_mm), "mm")}
-    bank = single_column_bank(typical, np.geomspace(narrowest_mm * 1.5, widest_mm / 1.5, 6))
+    parameters: Declared = {"amp": (HeavyTailedPrior(typical), "1"), "w": (widths, "mm")}
+    bank = single_column_bank(typical, sizes_inside(widths, 6))
     source = partial(edge_shadow_of_patterns, kind, of, patterns)
     return kind.bind(of, parameters, act, bank, says, patterns=patterns, source=source)
 

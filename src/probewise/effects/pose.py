@@ -62,7 +62,7 @@ def backlash(kind: LightEffect, of: Extent) -> Effect:
         return f"the arm comes to rest {side}: gear play of {whole} mm"
 
     act = acting(lambda value, plan, width: _moved(value, *(-(width / 2) * d for d in plan.direction_of_motion.T)))
-    return kind.linear(of, {"width_mm": "mm"}, 0.005 * of.length_mm, act, says, positive=True)
+    return kind.linear(of, {"width_mm": "mm"}, of.small_play_mm, act, says, positive=True)
 
 
 @light_effect("backlash", Stage.POSE, "backlash (play) of each axis", ("slope", "direction"))
@@ -137,7 +137,7 @@ def sensor_tilt(kind: LightEffect, of: Extent) -> Effect:
 
     off = "the sensor's spot is off by {0} mm along X and {1} mm along Y"
     says = in_words(f"{off}, whatever the orientation: the sensor is tilted")
-    return kind.linear(of, {"dx_mm": "mm", "dy_mm": "mm"}, 0.003 * of.length_mm, act, says)
+    return kind.linear(of, {"dx_mm": "mm", "dy_mm": "mm"}, of.small_shift_mm, act, says)
 
 
 @light_effect("bent_rails", Stage.POSE, "bent rails", ("place", "slope"), counts="place")
@@ -156,7 +156,7 @@ def bent_rails(kind: LightEffect, of: Extent) -> Effect:
         of_x, of_y = (value_with_sd(mean[k] + mean[k + 1], float(np.hypot(sd[k], sd[k + 1]))) for k in (0, 2))
         return f"the rails are bent: 10 mm from the origin the arm is off by {of_x} mm along X and {of_y} mm along Y"
 
-    typical_mm = 0.005 * of.length_mm / max(0.5 * of.length_mm / _UNIT_MM, 1.0) ** 2
+    typical_mm = of.small_play_mm / max(0.5 * of.length_mm / _UNIT_MM, 1.0) ** 2
     return kind.linear(of, dict.fromkeys(("x2_mm", "x3_mm", "y2_mm", "y3_mm"), "mm"), typical_mm, act, says)
 
 
@@ -166,7 +166,7 @@ def missing_tooth(kind: LightEffect, of: Extent) -> Effect | None:
 
     Between which two of the recorded positions of an axis it lies is a discrete choice; `axis` is 0 for X, 1 for Y.
     """
-    typical_mm = 0.005 * of.length_mm
+    typical_mm = of.small_play_mm
 
     def act(value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         along_y = theta[:, 2:3] > 0.5
@@ -200,7 +200,7 @@ def arm_knock(kind: LightEffect, of: Extent) -> Effect | None:
 
     off = "from {3} s on, all positions are off by {0} mm along X and {1} mm along Y, and the sensor is turned by {2}"
     says = in_words(f"{off} degrees: the arm or the paper was pushed")
-    typical = 0.005 * of.length_mm, "mm"
+    typical = of.small_play_mm, "mm"
     return kind.step(of, {"dx_mm": typical, "dy_mm": typical, "turn_deg": (2.0, "deg")}, act, says)
 
 
@@ -221,7 +221,7 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
     shortest_mm, reach_mm = _shortest_period_and_range_mm(of.plan)
     if not reach_mm > 0:
         return None
-    typical_mm, longest_mm = 0.003 * of.length_mm, 2 * reach_mm
+    typical_mm, longest_mm = of.small_shift_mm, 2 * reach_mm
 
     @acting
     def act(value: Poses, plan: Plan, amp: FloatArray, period: FloatArray, phase: FloatArray) -> Poses:
@@ -242,7 +242,7 @@ def periodic_position_error(kind: LightEffect, of: Extent) -> Effect | None:
 def stick_slip(kind: LightEffect, of: Extent) -> Effect | None:
     """Stick-slip: X + amp_mm saw((X - X0) / period_mm + phase), saw a sawtooth of 1 to -1, X0 of the origin."""
     shortest_mm, reach_mm = _shortest_period_and_range_mm(of.plan)
-    typical_mm, longest_mm = 0.003 * of.length_mm, 0.25 * reach_mm
+    typical_mm, longest_mm = of.small_shift_mm, 0.25 * reach_mm
     if longest_mm <= shortest_mm:
         return None
 

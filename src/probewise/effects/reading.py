@@ -17,6 +17,7 @@ from probewise.effects.effect import (
     light_effect,
     sine_and_cosine_entries,
     single_column_bank,
+    sizes_inside,
 )
 from probewise.effects.reference import Extent, sign_of_motion
 from probewise.priors import HeavyTailedPrior, LogHeavyTailedPrior, LogUniform, Uniform
@@ -75,7 +76,9 @@ def dark_level(kind: LightEffect, of: Extent) -> Effect:
         way = "higher" if mean[0] > 0 else "lower"
         return f"since the calibration every reading is {value_with_sd(abs(mean[0]), sd[0])} {way}: other light"
 
-    return kind.linear(of, {"offset": "reading"}, 0.01 * of.span, lambda value, theta, plan: value + theta[:, :1], says)
+    return kind.linear(
+        of, {"offset": "reading"}, of.small_change, lambda value, theta, plan: value + theta[:, :1], says
+    )
 
 
 @light_effect("gain", Stage.GAIN, _GAIN, ("level",), is_absorbed_by_ssf=lambda plan: True)
@@ -93,15 +96,15 @@ def gain(kind: LightEffect, of: Extent) -> Effect:
 @light_effect("gain_drift", Stage.GAIN, "a gain that drifts", ("time",), counts="time")
 def gain_drift(kind: LightEffect, of: Extent) -> Effect:
     """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's time since the origin, 0 before it."""
-    shortest_s, longest_s = 0.01 * of.duration_s, 2 * of.duration_s
+    taus = LogUniform(0.01 * of.duration_s, 2 * of.duration_s)
 
     def since(plan: Plan) -> FloatArray:
         return np.maximum(of.origin.seconds(plan), 0.0)  # a negative time would let the exponential overflow
 
     says = "the signal starts {|0|} % {too strong/too weak} at time 0 and settles with a time constant of {1} s: "
     act = acting(lambda value, plan, frac, tau_s: value * (1 + frac * np.exp(-since(plan) / tau_s)))
-    parameters: Declared = {"frac": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")}
-    bank = single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 7))
+    parameters: Declared = {"frac": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (taus, "s")}
+    bank = single_column_bank(_SHARE, sizes_inside(taus, 7))
     return kind.bind(of, parameters, act, bank, in_words(f"{says}the lamp warms up", factors=(100,)))
 
 
@@ -176,14 +179,14 @@ def ambient_gradient(kind: LightEffect, of: Extent) -> Effect | None:
     says = f"the reading changes by {{0}} per 100 mm along X and by {{1}} per 100 mm along Y, {_ALIKE}: stray light "
     words = in_words(f"{says}from one side", unit, unit, factors=(100, 100))
     act = acting(lambda value, plan, x, y: value + x * (plan.x_mm - at.x_mm) + y * (plan.y_mm - at.y_mm))
-    return kind.linear(of, units, 0.01 * of.span / of.length_mm, act, words)
+    return kind.linear(of, units, of.small_change / of.length_mm, act, words)
 
 
 @light_effect("offset_drift", Stage.OFFSET, "a slow drift of all readings", ("time",), counts="time")
 def offset_drift(kind: LightEffect, of: Extent) -> Effect:
     """A slow drift: reading + per_hour t, t the plan's time since the origin in hours."""
     says = f"the reading {{rises/falls}} by {{|0|}} per hour, {_ALIKE}: the electronics or the room light drift"
-    typical, words = 0.01 * of.span / (of.duration_s / 3600), in_words(says, of.reading_unit)
+    typical, words = of.small_change / (of.duration_s / 3600), in_words(says, of.reading_unit)
     act = acting(lambda value, plan, per_hour: value + per_hour * of.origin.hours(plan))
     return kind.linear(of, {"per_hour": "reading/h"}, typical, act, words)
 
@@ -192,7 +195,7 @@ def offset_drift(kind: LightEffect, of: Extent) -> Effect:
 def ambient_step(kind: LightEffect, of: Extent) -> Effect | None:
     """Light switched on or off in the room: reading + amp 1(t > at_s)."""
     says = f"the reading {{jumps up/drops}} by {{|0|}} at {{1}} s and stays there, {_ALIKE}: the room light changed"
-    words, sizes = in_words(says, of.reading_unit), {"amp": (0.01 * of.span, "reading")}
+    words, sizes = in_words(says, of.reading_unit), {"amp": (of.small_change, "reading")}
     return kind.step(of, sizes, lambda value, theta, after: value + theta[:, :1] * after, words, is_thinned=False)
 
 
@@ -202,7 +205,7 @@ def flicker(kind: LightEffect, of: Extent) -> Effect | None:
 
     The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
     """
-    typical, highest = 0.01 * of.span, 0.5 / of.gap_s
+    typical, highest = of.small_change, 0.5 / of.gap_s
     if highest <= _LOWEST_HZ:
         return None
     n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, _MOST_FREQUENCIES))
@@ -234,7 +237,7 @@ def hysteresis(kind: LightEffect, of: Extent) -> Effect | None:
     says = f"readings {way} are {{|0|}} {{higher/lower}} than those {other}, {_ALIKE}: hysteresis"
     words = in_words(says, of.reading_unit, factors=(more[-1] - least,))
     act = acting(lambda value, plan, amp: value + amp * sign_of_motion(plan))
-    return kind.linear(of, {"amp": "reading"}, 0.01 * of.span, act, words)
+    return kind.linear(of, {"amp": "reading"}, of.small_change, act, words)
 
 
 @light_effect("lag", Stage.LAG, "a sensor that follows slowly", ("slope", "direction"))
@@ -266,7 +269,7 @@ def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
     """
     if not np.any(np.diff(of.plan.time_s) > 0):
         return None
-    shortest_s, longest_s = of.gap_s, 30 * of.gap_s
+    taus = LogUniform(of.gap_s, 30 * of.gap_s)
 
     def act(value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         waited_s = np.maximum(np.diff(plan.time_s, prepend=plan.time_s[:1]), 0.0)
@@ -278,8 +281,8 @@ def overshoot(kind: LightEffect, of: Extent) -> Effect | None:
         how = above if mean[0] > 0 else "{|0|} % of each rise of the signal comes late,"
         return in_words(f"{how} with a time constant of {{1}} s", factors=(100,))(mean, sd)
 
-    parameters: Declared = {"share": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (LogUniform(shortest_s, longest_s), "s")}
-    bank = single_column_bank(_SHARE, np.geomspace(shortest_s * 1.5, longest_s / 1.5, 6))
+    parameters: Declared = {"share": (HeavyTailedPrior(_SHARE), "1"), "tau_s": (taus, "s")}
+    bank = single_column_bank(_SHARE, sizes_inside(taus, 6))
     return kind.bind(of, parameters, act, bank, says)
 
 

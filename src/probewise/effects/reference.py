@@ -117,6 +117,21 @@ class Extent:
         """Largest minus least usable reading."""
         return self.high - self.low
 
+    @property
+    def small_change(self) -> float:
+        """Typical size of what is added to readings: a hundredth of their span."""
+        return 0.01 * self.span
+
+    @property
+    def small_shift_mm(self) -> float:
+        """Typical displacement, mm: 0.003 of the longest scan."""
+        return 0.003 * self.length_mm
+
+    @property
+    def small_play_mm(self) -> float:
+        """Typical error of the arm where it turns, jumps or is pushed, mm: 0.005 of the longest scan."""
+        return 0.005 * self.length_mm
+
     @cached_property
     def origin(self) -> Origin:
         """Time and place from which effects on this recording count."""

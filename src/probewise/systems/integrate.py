@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import TINY, FloatArray, IntArray
 from probewise.systems.calls import number_of_samples
 from probewise.systems.law import LawWithEffects, Method, StepInputs, Steps, of_columns, rosenbrock_step, values_at_rows
 from probewise.systems.simulator import Columns, Law, Values
@@ -231,7 +231,7 @@ def integrate_from_known_trajectories(
         known, width = every, n_own
     if known:
         there = np.stack([each.theta[:width] for each in known])
-        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
+        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), TINY)
         nearest = np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
         try:
             with np.errstate(all="ignore"):
@@ -350,7 +350,7 @@ class _NewtonState:
         ordered by run, then by step, then by state.
         """
         n_states, n, _, n_runs = states.shape
-        nudge = _NUDGE * np.maximum(np.abs(states).max(axis=(2, 3), keepdims=True), 1e-300)
+        nudge = _NUDGE * np.maximum(np.abs(states).max(axis=(2, 3), keepdims=True), TINY)
         # As given, and with each state nudged in turn: one evaluation of all takes a third of the time.
         every = np.repeat(states[:, None], n_states + 1, axis=1)
         for j in range(n_states):
@@ -378,7 +378,7 @@ class _NewtonState:
 
 def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:
     """Return each sample's largest change of a state, relative to that state's largest absolute value, (n_samples,)."""
-    size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
+    size = np.maximum(np.abs(states).max(axis=(2, 3)), TINY)
     return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
 
 

@@ -46,6 +46,7 @@ from probewise.effects.noise import (
     outliers,
     quantisation,
     random_walk,
+    sd_of_rounding,
 )
 from probewise.errors import NotConvergedError
 from probewise.inference import sd_floor
@@ -252,7 +253,7 @@ class NoiseModels:
         if is_rounding_seen and quantisation.name in self.effects:
             known.setdefault(quantisation.name, np.array([self._step]))
         if is_rounding_seen and self.sd_prior is not None:
-            self.sd_prior = replace(self.sd_prior, rounding=self._step / math.sqrt(12))
+            self.sd_prior = replace(self.sd_prior, rounding=sd_of_rounding(self._step))
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in known.items()}
         self._rounding = rounding_that_hides_noise(self.recording, self._step, sd)
         self.certain = tuple(sorted(known))

@@ -65,7 +65,7 @@ from probewise.effects import (
     is_out_of_vocabulary,
     name_of_first_copy,
 )
-from probewise.effects.noise import lattice_step, noise_sd
+from probewise.effects.noise import lattice_step, noise_sd, sd_of_rounding
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
@@ -374,7 +374,7 @@ def noise_sd_about_given_null(prepared: Prepared) -> float:
     median = float(np.median(residuals[relative_sd <= np.quantile(relative_sd, _MOST_EXACT)])) / MAD_OF_NORMAL
     free = max(len(rows) - model.n_params, 1)
     # Readings that are all as predicted still have the sd of rounding.
-    return max(median, step / math.sqrt(12)) * math.sqrt(len(rows) / free) if math.isfinite(median) else math.inf
+    return max(median, sd_of_rounding(step)) * math.sqrt(len(rows) / free) if math.isfinite(median) else math.inf
 
 
 class Proposal(NamedTuple):

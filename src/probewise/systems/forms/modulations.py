@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, distinct_values
+from probewise._arrays import TINY, FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import (
     PHASE,
@@ -27,6 +27,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.reference import (
     AMPLITUDE,
     POSITIVE,
+    UNSEEN,
     BlockForm,
     Form,
     ReferenceFit,
@@ -35,7 +36,6 @@ from probewise.systems.forms.reference import (
 from probewise.systems.table import RunTable, covariate_of_column
 
 _N_VALUES = 9
-_UNSEEN = 1e-7  # of the noise
 _ALL = 17  # digits of a number in double precision
 _MOST_FREQUENCIES = 1024
 _ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial frequencies of one form: a fifth of a second
@@ -43,7 +43,7 @@ _N_BANDS = 64  # of equal prior probability
 _PEAKS_OF_A_BAND = 8  # so many, for the days and years between readings give each wave some of its height
 _BINS_PER_WAVE = 8  # of the fastest wave: a bin is within a sixteenth of a turn of its rows
 _MOST_BINS = 2**21
-_OUTLYING = 5.0  # medians of the residual's size
+OUTLYING = 5.0  # medians of the residual's size
 _MOST_OF_ONE_SCALE = 24  # values per run: with 36 a vector of typical length has 6 sds, a coordinate's bound, in one
 
 
@@ -144,7 +144,7 @@ def _times_of_readings(about: ReferenceFit) -> tuple[FloatArray, list[Any]]:
 def _frequency_of_median_gap(values: FloatArray, groups: list[Any], rows_each: int) -> float:
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
-    gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
+    gaps = gaps[gaps > 1e-9 * max(reach, TINY)]
     return 1 / (rows_each * float(np.median(gaps))) if gaps.size else 1.0 / reach
 
 
@@ -154,7 +154,7 @@ def _weighted_residuals(about: ReferenceFit) -> FloatArray:
     sd = np.where(np.isfinite(sd) & (sd > 0), sd, about.sd)
     in_sds = (table.columns[own.reading] - about.predicted)[read] / sd
     in_sds = in_sds - np.average(in_sds / sd) / np.average(1 / sd)
-    most = _OUTLYING * float(np.median(np.abs(in_sds)))
+    most = OUTLYING * float(np.median(np.abs(in_sds)))
     return np.asarray(np.clip(in_sds, -most, most) / sd)
 
 
@@ -347,7 +347,7 @@ def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
             return {**value, name: theta[:, :1]}
 
         rms = about.rms_change_in_sds(Stage.PARAMETER, act, values[:, None])
-        seen = np.isfinite(rms) & (rms > _UNSEEN)
+        seen = np.isfinite(rms) & (rms > UNSEEN)
         if seen.any():
             says, along = in_words(extra.says.replace("{value}", "{0}")), ("level", "time", "row")
             own = (name, Stage.PARAMETER, {"value": (extra.prior, "")}, along, act, says, values[seen][:, None, None])

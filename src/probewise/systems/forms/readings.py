@@ -11,11 +11,21 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 
 from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
-from probewise.effects.effect import ROWS_OF_A_SIDE, Act, Declared, Fixed, acting, in_words, single_column_bank
+from probewise.effects.effect import (
+    ROWS_OF_A_SIDE,
+    Act,
+    Declared,
+    Fixed,
+    acting,
+    in_words,
+    single_column_bank,
+    sizes_inside,
+)
 from probewise.effects.reading import decaying_sum
 from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.modulations import (
+    OUTLYING,
     Modulation,
     column_proportional_modulation,
     modulated_form,
@@ -29,7 +39,6 @@ from probewise.systems.forms.reference import (
     Form,
     ReferenceFit,
     flag,
-    prior_sizes,
     switch_points,
 )
 from probewise.systems.table import RunTable, covariate_of_column
@@ -41,7 +50,6 @@ _BEND_DEGREE = 4
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
 _VISIBLE = 4.0  # lambda of an effect that a test at level .01 sees more often than not
 _NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
-_OUTLYING = 5.0  # medians of the residual's size
 
 
 def _cubics(time: FloatArray, values: FloatArray) -> FloatArray:
@@ -76,7 +84,15 @@ def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says
         value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
         own: Declared = {"tau_s": (prior, about.time_unit), _SMOOTH: (of_flag, "1")}
         words = in_words(f"{about.system.simulator.reading} {says}", about.time_unit)
-        given = (name, Stage.LAG, own, ("previous",), act, words, single_column_bank(prior_sizes(prior), value))
+        given = (
+            name,
+            Stage.LAG,
+            own,
+            ("previous",),
+            act,
+            words,
+            single_column_bank(sizes_inside(prior, N_SIZES, 1.2), value),
+        )
         variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
     first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
     apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd
@@ -343,7 +359,7 @@ def _expected_readings_and_inliers(about: ReferenceFit) -> tuple[FloatArray, Boo
     for _ in range(3):  # the last two without outlying residuals
         bend = chebfit(level[there], residual[there], degree)
         off = np.abs(residual - chebval(level, bend))
-        there = np.isfinite(readings) & (off <= _OUTLYING * max(np.nanmedian(off), about.sd))
+        there = np.isfinite(readings) & (off <= OUTLYING * max(np.nanmedian(off), about.sd))
     return predicted + chebval(level, bend), there
 
 

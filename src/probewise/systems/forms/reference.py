@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from probewise._arrays import BoolArray, FloatArray, distinct_values, varies
+from probewise._arrays import TINY, BoolArray, FloatArray, distinct_values, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
     ROWS_OF_A_SIDE,
@@ -24,6 +24,7 @@ from probewise.effects.effect import (
     StepEffect,
     in_words,
     priors_and_units,
+    sizes_inside,
     thinned,
 )
 from probewise.priors import HeavyTailedPrior, LogUniform, Uniform
@@ -40,7 +41,7 @@ _LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
 _LEAST_CUT = 0.003  # of a range, that is cut off at least by what is looked for
 _N_LEVELS = 10  # of either
 _ROWS_OF_A_RUN = 3  # least rows per run on average
-_UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
+UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _GROWTH = (1.0, 1e9, 1e18, 1e27, 1e36)  # of an amplitude, until the readings change
 _NUDGE = 1e-3  # of a state's range
 _N_COMPARED = 64  # states and parameters at which a rate is compared with another state
@@ -139,7 +140,7 @@ def note_on_row_order(simulator: Simulator, table: RunTable) -> tuple[str, ...]:
         return ()
     sorted_ = f"wherever the other columns are equal, {simulator.reading} is sorted, by chance once in "
     unasked = "nothing is asked that needs their order, such as a jump at a row, hysteresis or correlated noise"
-    return (f"rows are in no order of recording: {sorted_}{1 / max(chance, 1e-300):.0e} tables; {unasked}",)
+    return (f"rows are in no order of recording: {sorted_}{1 / max(chance, TINY):.0e} tables; {unasked}",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,8 +372,8 @@ class ReferenceFit:
             larger[:, amplitudes] *= times
             rms = self.rms_change_in_sds(form.stage, form.apply, larger)
             rms = rms[np.isfinite(rms)]
-            if rms.size and rms.max() > _UNSEEN:
-                return times * guess / float(np.median(rms[rms > _UNSEEN]))
+            if rms.size and rms.max() > UNSEEN:
+                return times * guess / float(np.median(rms[rms > UNSEEN]))
         return 0.0
 
     def form(
@@ -420,7 +421,7 @@ class ReferenceFit:
         """
         prior = self.log_uniform_size_prior(stage, act, tried)
         if prior is not None:
-            entries, (parameter, unit) = prior_sizes(prior)[:, None, None], size
+            entries, (parameter, unit) = sizes_inside(prior, N_SIZES, 1.2)[:, None, None], size
             own = (name, stage, {parameter: (prior, unit)}, covariates, act, says, entries)
             yield from self.form(*own, absent={0: 0.0}, **more)
 
@@ -438,8 +439,3 @@ class ReferenceFit:
         first, last = int(there[0]), int(there[-1])
         low, high = float(tried[first]), float(tried[last if last > first else min(last + 1, len(tried) - 1)])
         return LogUniform(low, high) if low < high else None
-
-
-def prior_sizes(prior: LogUniform) -> FloatArray:
-    """Return the trial sizes of a prior for the template bank, (9,)."""
-    return np.geomspace(prior.low * 1.2, prior.high / 1.2, N_SIZES)

@@ -10,8 +10,8 @@ import pytest
 
 from probewise.diagnosis.diagnose_simulator import diagnose_system, prepare_system
 from probewise.diagnosis.diagnosis import diagnose_prepared
+from probewise.diagnosis.search import needs_more_than_memoryless_noise, search
 from probewise.diagnosis.search.hypotheses import HypothesisProbabilities
-from probewise.diagnosis.search.search import needs_more_than_memoryless_noise, search
 from probewise.diagnosis.verdict import run_global_test
 from probewise.systems import RunTable, Simulator, table_for
 

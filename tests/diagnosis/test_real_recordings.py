@@ -10,7 +10,7 @@ from refitted import state_with_nulls
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
-from probewise.diagnosis.search.search import select_forward
+from probewise.diagnosis.search import select_forward
 from probewise.recordings import read_recording
 from probewise.systems import read_simulator, read_table_for
 

@@ -14,8 +14,8 @@ from probewise.diagnosis import diagnose
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.noise import NoiseLaw, NoiseModel, RoundedNormal, SdPrior, rough_sd
 from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.search import noise_sd_about_given_null
 from probewise.diagnosis.search.hypotheses import NoiseModels
-from probewise.diagnosis.search.search import noise_sd_about_given_null
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 from probewise.sensor import Stage

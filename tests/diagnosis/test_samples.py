@@ -14,7 +14,7 @@ from probewise.diagnosis.evidence import laplace_evidence
 from probewise.diagnosis.fit import FARTHEST, Model, fit
 from probewise.diagnosis.noise import NoiseModel, white_noise
 from probewise.diagnosis.samples import ModelSamples, sample_model, weights_beside_other_effects
-from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search import search
 from probewise.diagnosis.sensors import CalibratedSensor, default_sensor, with_free_form
 from probewise.effects import EFFECTS, Extent
 from probewise.effects.noise import drifting_noise

@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 
 from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import extract_stored_fit
+from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit
 
 FILE = """\
 import numpy as np

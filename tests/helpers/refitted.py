@@ -1,7 +1,7 @@
 """The state of a search after its nulls, and one effect refitted in it, as a diagnosis does."""
 
+from probewise.diagnosis.search import SearchState, fit_nulls
 from probewise.diagnosis.search.hypotheses import NoiseModels, Refits
-from probewise.diagnosis.search.search import SearchState, fit_nulls
 from probewise.diagnosis.templates import TemplateCache
 
 

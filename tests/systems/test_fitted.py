@@ -11,8 +11,7 @@ from scipy.special import ndtri
 
 from probewise.errors import FileError, ParameterError
 from probewise.systems import FittedSystem, RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import extract_stored_fit, rebind_forms
+from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit, rebind_forms
 from probewise.systems.forms.reference import StoredFit
 
 

@@ -18,8 +18,7 @@ from probewise.systems import (
     predict_system,
     write_system_prediction,
 )
-from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import StoredFit, extract_stored_fit
+from probewise.systems.forms import ReferenceFit, StoredFit, bind_forms, extract_stored_fit
 from probewise.systems.prediction import as_recording
 
 RNG = 7

@@ -124,13 +124,13 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
     The most collinear come first: their projected templates have a cosine of 0.9 or more. A template is the best
     entry of an effect's bank (its changes of readings, at a grid of its parameters).
     """
-    prepared, misfit_templates = searched.prepared, searched.misfit_templates
+    prepared, about, cache = searched.prepared, searched.misfit_templates.about, searched.refits.templates
     chosen, bases, pairs = dict[str, EffectEntry](), dict[str, FloatArray](), list[Alias]()
     for name, effect in sorted(prepared.effects.items()):
         is_copy = name_of_first_copy(name) is not None
         if name in prepared.noise_effect_names or effects_out_of_vocabulary((name,)) or is_copy:
             continue
-        templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
+        templates = cache.templates_of(about, effect.with_fewer_variants())
         blocks = OrthonormalBlocks.of(problem, templates.columns)
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))

@@ -108,7 +108,7 @@ class EffectBank:
         basis, widths = np.zeros_like(left), np.bincount(self.entry)
         for width in np.unique(widths):  # all entries of one width at a time; without directions below a thousandth
             mine = np.flatnonzero(widths[self.entry] == width)
-            basis[:, mine], _ = orthonormalise_groups(left[:, mine], int(width), least=1e-18, share=1e-6)
+            basis[:, mine] = orthonormalise_groups(left[:, mine], int(width), least=1e-18, share=1e-6)
         mine = np.concatenate([present[name] for name in wanted])
         at = np.flatnonzero(np.isin(self.entry, mine))
         onto = (basis.T @ left[:, at]) ** 2  # of each column, on every direction of the others

@@ -24,7 +24,7 @@ from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, rough_sd, white_noise_of_recording
 from probewise.diagnosis.outlying import MeterStop, find_lost_readings, meter_stops_and_masks
 from probewise.diagnosis.prepared import MOST_DIAGNOSED_READINGS, Prepared, positions_in_stretches
-from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search import search
 from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
 from probewise.effects import Effect
 from probewise.errors import ParameterError
@@ -32,8 +32,7 @@ from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, masks_of_readings_at_ends
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.binding import sorting_column
+from probewise.systems.forms import ReferenceFit, sorting_column
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.reference import note_on_row_order, rows_are_in_order
 from probewise.systems.integrate import Integrations

@@ -39,8 +39,8 @@ from probewise.diagnosis.locate import ALARM, Place, places_of_effect, significa
 from probewise.diagnosis.noise import walk_given_readings
 from probewise.diagnosis.prepared import Prepared, prepare, rows_to_diagnose
 from probewise.diagnosis.samples import ModelSamples, draw_models, sample_model
+from probewise.diagnosis.search import MAX_ORDER, search, search_with_formulas
 from probewise.diagnosis.search.hypotheses import Searched, effects_out_of_vocabulary
-from probewise.diagnosis.search.search import MAX_ORDER, search, search_with_formulas
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.diagnosis.sensors import SensorPrior
 from probewise.diagnosis.verdict import (

@@ -462,24 +462,21 @@ class Linearised:
 class OrthonormalBlocks:
     """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, one for each template.
 
-    Rows are those of `Linearised`. `gain` (n_columns,): squared lengths before normalisation, of templates scaled to
-    unit rms; their sum in a block is n_kept if the fit absorbs nothing. `starts` (n_blocks,): first columns.
+    Rows are those of `Linearised`. `starts` (n_blocks,): first columns.
     """
 
     u: FloatArray
-    gain: FloatArray
     starts: IntArray
 
     @classmethod
     def of(cls, problem: Linearised, templates: Sequence[FloatArray]) -> OrthonormalBlocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
         projected, widths = scale_and_project(problem, templates), np.array([t.shape[1] for t in templates])
-        starts = np.cumsum(widths) - widths
-        u, gain = np.empty_like(projected), np.empty(projected.shape[1])
+        starts, u = np.cumsum(widths) - widths, np.empty_like(projected)
         for width in set(widths.tolist()):  # all templates of one width at a time
             columns = (starts[widths == width, None] + np.arange(width)).ravel()
-            u[:, columns], gain[columns] = orthonormalise_groups(projected[:, columns], width)
-        return cls(u, gain, starts)
+            u[:, columns] = orthonormalise_groups(projected[:, columns], width)
+        return cls(u, starts)
 
 
 def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
@@ -491,10 +488,8 @@ def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> F
     return problem.project_whitened(whitened)
 
 
-def orthonormalise_groups(
-    columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0
-) -> tuple[FloatArray, FloatArray]:
-    """Orthonormalise groups of `width` adjacent columns, (n_rows, n_columns); return also squared lengths (n_columns,).
+def orthonormalise_groups(columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0) -> FloatArray:
+    """Orthonormalise groups of `width` adjacent columns, (n_rows, n_columns).
 
     It uses the eigenvectors of the Gram matrices. Directions with squared length up to `least`, or up to `share` times
     the greatest in the group, become zero columns.
@@ -504,7 +499,7 @@ def orthonormalise_groups(
     there = squares > np.maximum(share * squares[:, -1:], least)
     per_length = np.where(there, 1 / np.sqrt(np.maximum(squares, least)), 0.0)
     u = np.einsum("ibj,bjk->ibk", blocks, axes * per_length[:, None, :], optimize=True)
-    return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
+    return np.asarray(u.reshape(columns.shape))
 
 
 def log_probability_effects_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:

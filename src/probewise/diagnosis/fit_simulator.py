@@ -34,8 +34,7 @@ from probewise.nested.repartition import repartitioned
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for
-from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.binding import extract_stored_fit
+from probewise.systems.forms import ReferenceFit, extract_stored_fit
 from probewise.systems.table import table_digest
 
 

@@ -20,8 +20,13 @@ from probewise.diagnosis.words import join_names
 from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, Simulator, System
-from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import has_value_per_run, names_in_definitions, names_of_jumps_in_sorted_rows
+from probewise.systems.forms import (
+    ReferenceFit,
+    bind_forms,
+    has_value_per_run,
+    names_in_definitions,
+    names_of_jumps_in_sorted_rows,
+)
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.table import append_tables, covariate_of_column, unused_name

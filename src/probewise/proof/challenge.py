@@ -44,8 +44,7 @@ from probewise.proof.tables import HONEST_NATS, NOISE, names_in_label
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
 from probewise.systems import RunTable, read_simulator, read_table_for
-from probewise.systems.forms import ReferenceFit
-from probewise.systems.forms.binding import extract_stored_fit, has_value_per_run, rebind_forms
+from probewise.systems.forms import ReferenceFit, extract_stored_fit, has_value_per_run, rebind_forms
 from probewise.systems.prediction import draw_value_for_new_run
 from probewise.systems.system import SystemChain
 from probewise.world.world import World

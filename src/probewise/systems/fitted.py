@@ -23,7 +23,7 @@ from probewise.recordings import parse_json_file_text, write_text_atomically
 from probewise.recordings.io import read_text
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import Stage
-from probewise.systems.forms.binding import counts_from_far_origin
+from probewise.systems.forms import counts_from_far_origin
 from probewise.systems.forms.reference import StoredFit
 from probewise.systems.simulator import Simulator, fingerprint_of_text, run_simulator_text
 from probewise.systems.table import RunTable

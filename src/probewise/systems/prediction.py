@@ -26,7 +26,7 @@ from probewise.recordings.plan import Plan
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
-from probewise.systems.forms.binding import has_value_per_run, jumps_at_row, rebind_forms
+from probewise.systems.forms import has_value_per_run, jumps_at_row, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import STANDS_STILL, System, SystemChain, with_converged_step
 from probewise.systems.table import (

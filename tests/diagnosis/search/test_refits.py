@@ -15,13 +15,13 @@ from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise import white_noise
 from probewise.diagnosis.search import search as searching
+from probewise.diagnosis.search import search_with_formulas
 from probewise.diagnosis.search.hypotheses import (
     Evidences,
     Refits,
     _amplitudes_in_residual,
     hypothesis_probabilities,
 )
-from probewise.diagnosis.search.search import search_with_formulas
 from probewise.effects import Extent
 from probewise.effects.noise import correlated_noise, random_walk
 from probewise.priors import LogUniform, Uniform

@@ -10,7 +10,7 @@ import pytest
 
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.noise import white_noise
-from probewise.diagnosis.search.search import UnknownEffects, prune_out_of_vocabulary, search
+from probewise.diagnosis.search import UnknownEffects, prune_out_of_vocabulary, search
 from probewise.systems import Noise, Simulator, table_for
 
 N_ROWS = 160

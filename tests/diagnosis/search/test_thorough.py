@@ -13,8 +13,7 @@ from probewise import nested
 from probewise.diagnosis import diagnose, diagnosis_json, weigh_thoroughly
 from probewise.diagnosis.light_sensor import LightSensorApparatus
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.search import thorough
-from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search import search, thorough
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior
 from probewise.effects.effect import PHASE, sine_and_cosine_entries

@@ -11,8 +11,7 @@ from probewise.effects import name_without_copy_suffix
 from probewise.effects.effect import sentence_from_samples
 from probewise.errors import FileError
 from probewise.systems import FittedSystem, Law, RunTable, Simulator, System, predict_system
-from probewise.systems.forms import ReferenceFit, bind_forms
-from probewise.systems.forms.binding import extract_stored_fit
+from probewise.systems.forms import ReferenceFit, bind_forms, extract_stored_fit
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.modulations import origin_of_column
 

@@ -9,7 +9,7 @@ import pytest
 from probewise.diagnosis import PriorOdds
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.systems import Law, Simulator, table_for
-from probewise.systems.forms.binding import names_in_definitions
+from probewise.systems.forms import names_in_definitions
 
 _T = 0.2 * np.arange(60)
 

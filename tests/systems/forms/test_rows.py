@@ -8,7 +8,7 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.systems import Simulator, table_for
-from probewise.systems.forms.binding import sorting_column
+from probewise.systems.forms import sorting_column
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.reference import chance_of_sorted_readings, note_on_row_order
 

@@ -772,7 +772,6 @@ class MisfitTemplates:
     templates. `covariates` are those of the basis functions.
     """
 
-    templates: TemplateCache
     about: Fit
     unknown_bases: TemplateBank
     covariates: tuple[Covariate, ...]
@@ -882,7 +881,7 @@ class Searched:
             if effect.stage is not Stage.NOISE and not name.startswith(PROPOSAL) and name not in found.model.names
         ]
         own = self.misfit_templates
-        return [own.templates.coarse_bank(own.about, missing), own.unknown_bases]
+        return [self.refits.templates.coarse_bank(own.about, missing), own.unknown_bases]
 
     @property
     def likeliest_order(self) -> int:

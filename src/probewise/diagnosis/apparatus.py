@@ -178,10 +178,7 @@ class Apparatus(ABC):
         return None
 
     def coordinates_of_new_run(self, model: Model) -> IntArray:
-        """Return the indices of a model's coordinates of which each run has a value of its own; none by default.
-
-        In a run that is yet to be recorded such a value is known by its prior alone.
-        """
+        """Return the indices of a model's coordinates of which each run has a value of its own; none by default."""
         return np.zeros(0, dtype=np.int64)
 
     @abstractmethod

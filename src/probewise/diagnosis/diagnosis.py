@@ -249,10 +249,7 @@ class Diagnosis(Judged, Reported):
 
     @property
     def combination_shares(self) -> dict[tuple[str, ...], float]:
-        """Share of the repaired model's samples with each combination of the effects that not all samples contain.
-
-        Largest share first; {} if all samples contain the same effects.
-        """
+        """Shares of the repaired model's samples, largest first, by effects that not all of them contain; or {}."""
         absent = self.repaired.absent
         if not absent:
             return {}
@@ -285,10 +282,7 @@ class Diagnosis(Judged, Reported):
         return tuple(out)
 
     def with_shape_in_next_plan(self, shape: Shape) -> Diagnosis:
-        """Return the diagnosis with undescribed patterns of its next plan described, so that the plan can be written.
-
-        They become the unknown shape, of which the null has the parameters, at its posterior mean, as a polygon.
-        """
+        """Return the diagnosis with undescribed patterns of its next plan as the unknown shape, at its mean."""
         asked, names = self.next_measurement, list(self.repaired.chain.names)
         if asked is None:
             return self

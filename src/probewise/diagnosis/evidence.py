@@ -160,10 +160,7 @@ def log_evidence_under(found: Fit, laws: Sequence[NoiseLaw], sd_prior: SdPrior |
 def _peak_of_log_sd(
     laws: Sequence[NoiseLaw], sigma: FloatArray, bend: FloatArray, curvature: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the likeliest log of a reading's sd, and its variance, (n_laws,), the fit's parameters integrated out.
-
-    `sigma`, `bend`, `curvature`: as in `_normal_log_evidences`. The sd of a node of rounded noise is known.
-    """
+    """Return the likeliest log of a reading's sd, and its variance, (n_laws,), the fit's parameters integrated out."""
     n_points = np.array([law.n_kept for law in laws])
     n_fitted = curvature.shape[1] - np.trace(np.linalg.inv(curvature), axis1=1, axis2=2)
     more = n_points / np.maximum(n_points - n_fitted, 1.0)  # by which parameters that were fitted reduce the variance
@@ -309,10 +306,7 @@ def _coarse_parameters(evidence: NoiseEvidence) -> tuple[IntArray, FloatArray, F
 
 
 def _rise_between(marginal: FloatArray) -> float:
-    """Return how many nats the peak of a parabola through the best node and its neighbours is above that node.
-
-    `marginal`: the nodes' probabilities in order, (n_nodes,). Infinity for a single node.
-    """
+    """Return how many nats a parabola through the best node and its neighbours rises above it; inf for one node."""
     if len(marginal) < 2:
         return math.inf
     with np.errstate(divide="ignore"):
@@ -368,10 +362,7 @@ def _nodes_about(effect: NoiseEffect, about: Mapping[int, tuple[float, float]]) 
 
 
 def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
-    """Return a square root of the Laplace covariance of a fit's coordinates, (n_params, n_params).
-
-    Arguments: whitened slopes (n_points, n_params), and the variance of a whitened reading.
-    """
+    """Return a root of the Laplace covariance, (n_params, n_params), from whitened slopes and a reading's variance."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(with_prior(slopes.T @ slopes / variance))).T)
 
 

@@ -103,10 +103,7 @@ class Null(Protocol):
 
     @property
     def nuisance_names(self) -> tuple[str, ...]:
-        """Names of parameters that apply to this recording only, such as those of a shape; by default none.
-
-        They are not part of a written sensor model.
-        """
+        """Names of parameters of this recording alone, such as a shape's, not of a written model; by default none."""
         return ()
 
     @property
@@ -117,10 +114,7 @@ class Null(Protocol):
         """Return whether this model has the stage at which an effect acts."""
 
     def part_that_predicts(self, rows: IntArray, plan: Plan, effects: Sequence[Effect]) -> tuple[Plan, IntArray]:
-        """Return a part of a plan that suffices to predict some of its rows, and their numbers there; by default all.
-
-        `rows`: their numbers in the plan, (n_rows,); the numbers in the part have the same order.
-        """
+        """Return a part of a plan that suffices to predict `rows` (n_rows,), and their numbers there; or all."""
         return plan, rows
 
     def theta(self, z: FloatArray) -> FloatArray:
@@ -233,10 +227,7 @@ class Model:
         return self.sensor.part_that_predicts(rows, self.plan, self.effects)
 
     def predict_and_differentiate(self, z: FloatArray, *, by: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return predictions, (n_points,), and slopes, (n_points, n_params), at one point z (n_params,).
-
-        The slopes are by all coordinates or, (n_points, n_coordinates), by those with the indices `by`.
-        """
+        """Return predictions, (n_points,), and slopes, (n_points, n_coordinates), at z (n_params,), by all or some."""
         points, steps = difference_points_and_steps(z)
         if by is not None:
             points, steps = points[[0, *(1 + by)]], steps[by]
@@ -451,10 +442,7 @@ def with_prior(information: FloatArray) -> FloatArray:
 
 
 def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Return the Levenberg-Marquardt step for each damping, (n_solved, n_params).
-
-    Weakly damped systems that are singular are left out, and all where a prediction ran away.
-    """
+    """Return the Levenberg-Marquardt step for each damping, (n_solved, n_params), but for singular systems."""
     scale, solved = np.diag(curvature), []
     for damping in _DAMPINGS if np.isfinite(curvature).all() else ():
         with contextlib.suppress(np.linalg.LinAlgError):
@@ -463,10 +451,7 @@ def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
 
 
 def _steps_along_valley(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
-    """Return steps damped equally in all directions (Levenberg), (n_dampings, n_params).
-
-    The dampings are in terms of the curvature along the principal axis that promises most.
-    """
+    """Return steps damped alike in all directions (Levenberg), by the curvature of the axis that promises most."""
     along, axes = np.linalg.eigh(curvature)
     along = np.maximum(along, 1.0)  # the prior's, which may be lost in rounding
     slope = axes.T @ downhill

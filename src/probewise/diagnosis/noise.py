@@ -250,10 +250,7 @@ class NoiseLaw:
         return tuple(values.tobytes() for values in arrays)
 
     def is_practically_equal(self, other: NoiseLaw) -> bool:
-        """Return whether another distribution is equal, to 3 % of sd, 0.03 of correlation, and 20 % of the walk.
-
-        That of the walk is a variance, which few readings determine to better than 20 %.
-        """
+        """Return whether another one is equal, to 3 % of sd, .03 of correlation, 20 % of the walk's variance."""
         return (
             (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
             and np.array_equal(self.lost, other.lost)
@@ -483,10 +480,7 @@ def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
 
 
 def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
-    """Return independent noise of a recording's usable readings, with its declared relative sds.
-
-    Its sd is at least `least`, and `sd_of_numbers`.
-    """
+    """Return independent noise of the usable readings, of their declared relative sds; an sd is at least `least`."""
     usable, censored = recording.usable, recording.censored
     return replace(
         white_noise(int(usable.sum()), least=max(least, sd_of_numbers(recording))),

@@ -98,10 +98,7 @@ class PriorOdds:
         return math.log(self.unknown * (1 - self.out_of_vocabulary if self.n_unnamed else 1.0))
 
     def single_effect_priors(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
-        """Return the probabilities of clean, unknown and single effects alone, by names on the mean and on the noise.
-
-        `names` are those of the effects on the mean in the vocabulary, `noise` those of the certain noise effects.
-        """
+        """Return the probabilities of clean, of unknown and of each effect of `names` alone, beside certain noise."""
         each = math.exp(self._log_prior_per_combination(1)) if self.n_named else self.by_size[0]
         believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
         believed |= {(name,): each * (self.unlikely_weight if name in self.unlikely else 1.0) for name in names}

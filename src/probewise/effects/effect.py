@@ -67,10 +67,7 @@ readings, (n_columns, n_params), and masks of the readings that each variant act
 
 @dataclass(frozen=True)
 class Fixed(Uniform):
-    """Prior of a parameter that a variant of an effect fixes, to within rounding; reports leave it out.
-
-    `odds` are the prior odds of that variant against the first.
-    """
+    """Prior of a parameter that a variant fixes, to within rounding; `odds` are the variant's against the first."""
 
     odds: float = 1.0
 
@@ -217,11 +214,7 @@ class Effect:
         return self
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the parameter that the variants divide among them: draw a variant for each sample, then its value.
-
-        Returns theta, (n_samples, n_params) as given, with that parameter replaced; by default unchanged. `weights`
-        (n_variants,) are the probabilities of the variants.
-        """
+        """Redraw the parameter that variants of these `weights`, (n_variants,), divide among them; by default none."""
         return theta
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
@@ -524,10 +517,7 @@ def in_words(text: str, *units: str, factors: Sequence[float] = ()) -> Say:
 
 
 def mean_and_sd_of_samples(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean and sd of samples (n_samples, n_params), (n_params,) each: exact for a value that all samples have.
-
-    The mean of equal numbers may differ from them in the last digit, and their sd from 0.
-    """
+    """Return mean and sd of samples (n_samples, n_params); exact, without rounding, where all samples are equal."""
     equal = np.all(samples == samples[0], axis=0)
     return np.where(equal, samples[0], samples.mean(axis=0)), np.where(equal, 0.0, samples.std(axis=0))
 
@@ -588,10 +578,7 @@ class ChangePoints:
 
 
 def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
-    """Return bank entries of waves, a sine and a cosine each, (n_bank, 2, n_params).
-
-    `parameters` are those before the phase, which is the last: numbers or (n_bank,); the first is the amplitude.
-    """
+    """Return bank entries of waves, sine and cosine, (n_bank, 2, n_params), from the parameters before the phase."""
     return np.concatenate([single_column_bank(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
 
 

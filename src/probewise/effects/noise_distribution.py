@@ -189,10 +189,7 @@ def log_probability_at_end(
 
 
 def limited_mean(noise: NoiseParameters, predicted: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the mean of a reading that is not lost, limited to a range, (n_samples, n_points).
-
-    `predicted` are noise-free readings of an unlimited instrument, of that shape.
-    """
+    """Return the mean of a reading that is not lost, limited to a range, about `predicted`, (n_samples, n_points)."""
     beside = np.hypot(noise.offset_sd, noise.step / np.sqrt(12))
     sds = (np.hypot(sd, beside) for sd in (noise.sd, noise.sd * noise.wide_times))
     own, wide = (_mean_of_limited_normal(predicted, sd, low, high) for sd in sds)

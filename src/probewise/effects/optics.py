@@ -67,10 +67,7 @@ def scan_misplacement(kind: LightEffect, of: Extent) -> Effect | None:
 
 
 def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
-    """Return the view with each reading's pattern shifted by `by_mm`, (n_samples, n_points).
-
-    The shift is along the normal of a half-plane, stripes or a ramp, and along X otherwise.
-    """
+    """Return the view with each reading's pattern shifted by `by_mm`, (n_samples, n_points): along its normal, or X."""
     angle = np.zeros(len(plan))
     for name, rows in plan.rows_by_pattern():
         pattern = plan.patterns.get(name)

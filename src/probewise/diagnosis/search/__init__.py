@@ -173,10 +173,7 @@ class SearchState:
     def log_bayes_factors_by_effect(
         self, parent: WeighedFit, law: NoiseLaw, about: WeighedFit
     ) -> dict[str, FloatArray]:
-        """Return, by effect, the log Bayes factors of adding its templates to a candidate, (n_templates,) each.
-
-        The templates are those about `about`: the candidate, or its null.
-        """
+        """Return, by effect, the log Bayes factors of its templates about a candidate or its null, (n_templates,)."""
         out: dict[str, FloatArray] = {}
         for bank in self.template_banks(about):
             out |= bank.log_bayes_factors_by_label(parent.found, law)
@@ -293,10 +290,7 @@ class SearchState:
         }
 
     def log_evidence(self, names: Names) -> float:
-        """Return a combination's largest log evidence over noise models and numbers of Gaussians.
-
-        It is that of refits or, if there are none, that by screening; minus infinity if there is neither.
-        """
+        """Return a combination's largest log evidence, of refits or else by screening; minus infinity of none."""
         if (refitted := self.best_candidate(names)) is not None:
             return refitted.log_z
         screened = (value for (own, _), value in self.screened_log_evidences().items() if own == names)
@@ -560,10 +554,7 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
 
 
 def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
-    """Refit the pairs that lead by screening about the null and extend no refitted effect; return their candidates.
-
-    Of a difference of two columns, neither column alone need explain anything.
-    """
+    """Refit the pairs that lead about the null though neither effect alone does, as of a difference of two columns."""
     settled = state.refitted_combinations | state.undetected
     best = _largest_scores_about_null(state).items()
     scores: dict[Names, float] = {names: value for names, value in best if len(names) == 2 and names not in settled}

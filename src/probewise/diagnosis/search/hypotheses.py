@@ -165,10 +165,7 @@ class WeighedFit:
         return replace(self, evidence=same | {_changed(noise): second for noise, (_, second) in by_sd.items()})
 
     def possible_noise(self, noise: Names) -> Names:
-        """Return a noise model or, where it is impossible about this fit, the best of those with part of its effects.
-
-        Lost readings, for instance, are not seen about a fit that is far off.
-        """
+        """Return a noise model or, where it is impossible about this fit, the best with part of its effects."""
         if np.isfinite(self.evidence[noise].log_z):
             return noise
         parts = [names for names in self.evidence if {*names} < {*noise}]
@@ -194,10 +191,7 @@ def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
 
 
 def expected_log_bayes_factor(first: WeighedFit, second: WeighedFit) -> float:
-    """Return the log Bayes factor expected between two candidates if the first is true, in nats.
-
-    This is half the squared distance between their predictions, whitened, in noise sds of the first.
-    """
+    """Return the expected log Bayes factor over the second if the first is true: half the squared distance in sds."""
     apart = first.law((first.found.residuals - second.found.residuals)[:, None])
     return 0.5 * float(np.sum(apart**2)) / first.whitened_sd**2
 
@@ -281,10 +275,7 @@ class NoiseModels:
         return float(logsumexp(values)) if values else -math.inf
 
     def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        """Compute the evidence of a fit under every noise model, by the names of its effects.
-
-        Those that may come near the best have nodes about their peak, where those of the prior lie too far apart.
-        """
+        """Compute the evidence of a fit by noise model; of those that may lead, with nodes about their peak."""
         evidence = {names: laplace_evidence(found, model) for names, model in self.models.items()}
         best = max((e.log_z + self.log_prior(names) for names, e in evidence.items()), default=-math.inf)
         return {
@@ -437,10 +428,7 @@ class Refits:
         return found
 
     def null_under_simplest_noise(self, null: WeighedFit) -> WeighedFit:
-        """Refit the given null under the simplest noise: with no noise effects but those beyond doubt.
-
-        The refit of an earlier null is returned if it is better under that noise than this one.
-        """
+        """Refit the given null without noise effects but those beyond doubt, or return a better one made before."""
         certain = self.noises.certain
         if self.plain and self.plain[-1].evidence[certain].log_z > null.evidence[certain].log_z:
             return self.plain[-1]
@@ -572,10 +560,7 @@ def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
-    """List the numbers of an effect's variants (discrete choices, such as of scans) to refit, best first.
-
-    All of one or two; of more, the best, and the next too if bound to scans and of a twentieth of the best's weight.
-    """
+    """List the variants to refit, by number: all of two; else the best and, if bound to scans and likely, the next."""
     ranked: list[int] = np.argsort(-weights).tolist()
     if len(weights) <= _FEW_VARIANTS:
         return ranked
@@ -696,10 +681,7 @@ class Evidences:
         return Evidences(fits, screened, unknown, self.unknown_shares)
 
     def with_log_evidence_shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
-        """Return a copy with the log evidence of fits, with and without an unknown effect, shifted by `gaps` in nats.
-
-        `gaps` is by (SSF order, mean), the same under every noise model.
-        """
+        """Return a copy with fits, with and without an unknown effect, shifted by `gaps`, nats by (order, mean)."""
         fits = {key: fit.with_log_evidence_shifted(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
         unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in self.unknown.items()}
         return replace(self, fits=fits, unknown=unknown)
@@ -824,10 +806,7 @@ class Searched:
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 
     def combinations_aliased_with(self, names: Names) -> frozenset[Names]:
-        """Return the combinations aliased with this one: their expected log Bayes factor is below three nats.
-
-        One number of Gaussians at which this is so suffices. The combination () has none.
-        """
+        """Return the combinations aliased with one at some SSF order: expected to be below three nats apart."""
         fits = self.evidences.fits
         return frozenset(
             key

@@ -259,10 +259,7 @@ def modulations_over_rows(about: ReferenceFit) -> dict[str, Callable[..., Modula
 
 
 def declared_wave(about: ReferenceFit, frequencies: FloatArray, unit: str, highest: float = 0.0) -> dict[str, Any]:
-    """Return what `ReferenceFit.form` takes of a wave a sin(2 pi hz t + phase), t from its origin.
-
-    `frequencies` are those of its bank, (n_trial,), rising; its own may be as high as `highest`.
-    """
+    """Return what `ReferenceFit.form` takes of a wave of these trial frequencies, (n_trial,), or up to `highest`."""
     table, time_unit = about.table, about.time_unit
     prior = frequency_prior(np.append(frequencies, max(highest, float(frequencies[-1]))))
     return {

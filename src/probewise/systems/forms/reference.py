@@ -343,10 +343,7 @@ class ReferenceFit:
         return bool(np.any(change[rows] != 0) and not np.any(change[there > 0]))
 
     def rms_change_in_sds(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
-        """Return the rms change of the readings in noise sds, (n_settings,); not finite where predictions diverge.
-
-        The change is that of a trial form, which applies `act` with the parameters `settings` (n_settings, n_params).
-        """
+        """Return the rms change of the readings by `act` in noise sds, (n_settings,); not finite if they diverge."""
         if self.known is not None:
             return np.ones(len(settings))
         with np.errstate(over="ignore", invalid="ignore"):  # a setting may carry a law away: it is not finite

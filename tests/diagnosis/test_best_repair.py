@@ -9,10 +9,10 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis import best_repair
+from probewise.diagnosis.apparatus import PriorOdds
 from probewise.diagnosis.best_repair import correct_by_best_basis
 from probewise.diagnosis.evidence import SCALES, Linearised, partition_into_blocks
 from probewise.diagnosis.noise import NoiseLaw
-from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.templates import TemplateBank
 from probewise.diagnosis.verdict import Hypothesis, Judged
 from probewise.recordings import Recording, two_way_plan

@@ -12,6 +12,7 @@ import pytest
 from scipy.special import log_ndtr, logsumexp
 from scipy.stats import multivariate_normal, norm
 
+from probewise.diagnosis.apparatus import PriorOdds
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.evidence import (
     LEAST_VISIBLE,
@@ -22,7 +23,6 @@ from probewise.diagnosis.evidence import (
 )
 from probewise.diagnosis.fit import Fit, Model, effect_coordinates, fit
 from probewise.diagnosis.noise import SAME_SD, NoiseModel, SdPrior, white_noise, white_noise_of_recording
-from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.diagnosis.sensors import default_sensor
 from probewise.effects import VOCABULARY, Extent, NoiseEffect

@@ -11,9 +11,9 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
+from probewise.diagnosis.apparatus import PriorOdds
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.noise import NoiseLaw, NoiseModel, RoundedNormal, SdPrior, rough_sd
-from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search import noise_sd_about_given_null
 from probewise.diagnosis.search.hypotheses import NoiseModels
 from probewise.effects import VOCABULARY, Extent

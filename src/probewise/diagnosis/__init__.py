@@ -12,7 +12,7 @@ they ask of a light sensor (`light_sensor`) or of a simulator (`simulator_rows`)
 from __future__ import annotations
 
 from probewise.diagnosis.advice import Alias, NextMeasurement
-from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, SETTLED
+from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, SETTLED, PriorOdds
 from probewise.diagnosis.audit import (
     CURE_PLAN,
     Cure,
@@ -41,7 +41,6 @@ from probewise.diagnosis.fit import Null
 from probewise.diagnosis.fit_simulator import Evidence, SystemFit, calibrated_of, fit_json, fit_simulator, repaired_of
 from probewise.diagnosis.locate import ALARM, Place
 from probewise.diagnosis.prepared import join
-from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.samples import ModelSamples
 from probewise.diagnosis.search.thorough import Weighing, weigh_thoroughly
 from probewise.diagnosis.sensors import SensorAndShape, SensorPrior

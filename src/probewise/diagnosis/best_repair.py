@@ -29,10 +29,10 @@ from probewise.diagnosis.fit import Fit, fit_each_start
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.noise import NoiseLaw, walk_given_readings
 from probewise.diagnosis.outlying import FAR_OUT
-from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit
 from probewise.diagnosis.templates import TemplateBank
 from probewise.diagnosis.verdict import GlobalTest, Judged, judge
+from probewise.diagnosis.words import Names
 from probewise.recordings.plan import Recording
 
 
@@ -275,15 +275,14 @@ def improvement_and_correction(
         problem = Linearised.of(found, problem.law)
         before = dict(gain.heldout_by_scan)  # of blocks, none
         by_scan = ((part_names[int(k)], gained) for k, gained in held.by_scan)
-        gain = Improvement(
-            log_evidence,
-            gain.heldout_log_density_per_reading + held.per_reading,
-            math.hypot(gain.heldout_sd, held.sd),
-            tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
-            gain.rms_before,
-            rms_beside_walk(found.residuals, problem.law, recording),
-            p_value_after(searched, best.fit, problem, rng=rng),
-            gain.comes_next,
+        gain = replace(
+            gain,
+            log_evidence=log_evidence,
+            heldout_log_density_per_reading=gain.heldout_log_density_per_reading + held.per_reading,
+            heldout_sd=math.hypot(gain.heldout_sd, held.sd),
+            heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
+            rms_after=rms_beside_walk(found.residuals, problem.law, recording),
+            p_value_after=p_value_after(searched, best.fit, problem, rng=rng),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
             break

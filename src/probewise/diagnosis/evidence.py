@@ -659,7 +659,7 @@ def predictive_log_densities(
     columns = np.concatenate([slopes, miss[:, None]], axis=1)
     whitened, sd = innovations_given_rest(law, columns, out, each_alone=not sequential)
     turned, innovations, kept, censored = whitened[:, :-1], whitened[:, -1], law.kept[out], law.is_censored[out]
-    noise_2 = sigma_2 * (law.sd_with_rounding[out] / law.sd[out]) ** 2
+    noise_2 = sigma_2 * (np.sqrt(law.sd[out] ** 2 + law.flat**2 / 3) / law.sd[out]) ** 2
     log_shares = np.log(np.maximum([1 - law.share, law.share], TINY))
     widths = np.tile([1.0, law.times**2], (len(sd), 1))
     if law.wide.size:  # variances, in units of sd^2, if each is narrow and if it is wide: it may be either

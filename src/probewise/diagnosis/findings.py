@@ -9,17 +9,17 @@ from typing import cast
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.diagnosis.apparatus import ENOUGH_NATS
 from probewise.diagnosis.best_repair import BestRepair
 from probewise.diagnosis.evidence import held_out_gain, linearised_sizes
 from probewise.diagnosis.fit import fit
 from probewise.diagnosis.locate import ALARM, significant_places
 from probewise.diagnosis.noise import n_rows_since_previous_usable, noise_statistics, previous_usable
-from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_samples, sample_model
-from probewise.diagnosis.search.hypotheses import ALIASED_NATS, Searched, WeighedFit, noise_effects_in_vocabulary
+from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.templates import TemplateCache, log_mean_exp
 from probewise.diagnosis.verdict import N_DRAWS, NEGLIGIBLE, Hypothesis, Judged
-from probewise.diagnosis.words import p_in_words, substitute_reading_unit
+from probewise.diagnosis.words import Names, p_in_words, substitute_reading_unit
 from probewise.effects import Effect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
 from probewise.effects.noise import sd_of_rounding
@@ -257,7 +257,7 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
     shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate_in_words(where)}"
     share = more / (named + more) if named + more > 0 else 0.0
     formula, said = None, ""
-    if fit is not None and with_formula > max(value, log_z + ALIASED_NATS):
+    if fit is not None and with_formula > max(value, log_z + ENOUGH_NATS):
         formula, said = _formula_beside(searched, best, fit, rng=rng)
     smaller = "A smaller misfit" if share < 0.5 else "A misfit"
     gain = f"what has no name would add {share:.0%} of the whole gain in log evidence"

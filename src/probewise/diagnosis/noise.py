@@ -376,11 +376,6 @@ class NoiseLaw:
         """Sd of a reading of relative sd 1 in units of sigma, including rounding but not a tail."""
         return math.sqrt(1 + self.flat**2 / 3)
 
-    @property
-    def sd_with_rounding(self) -> FloatArray:
-        """Sd of each reading in units of sigma, including rounding but not a tail, (n_points,)."""
-        return np.asarray(np.sqrt(self.sd**2 + self.flat**2 / 3))
-
     def without_tail_or_rounding(self) -> NoiseLaw:
         """Return normal noise with the same whitening, its sd free, without tail or rounding; no reading is wide."""
         plain = replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)

@@ -24,7 +24,7 @@ from probewise.diagnosis.sensors import (
     sensor_from_samples,
     starts_of_one_gaussian,
 )
-from probewise.effects import Effect, Extent, NoiseEffect
+from probewise.effects import Effect, Extent
 from probewise.effects.noise import LARGEST_SIZE
 from probewise.errors import ParameterError, require
 from probewise.recordings.patterns import Pattern, have_same_albedo
@@ -258,12 +258,6 @@ class Prepared:
     def noise_effect_names(self) -> frozenset[str]:
         """Names of the effects on the noise."""
         return frozenset(name for name, effect in self.effects.items() if effect.stage is Stage.NOISE)
-
-    @cached_property
-    def pure_noise_effect_names(self) -> frozenset[str]:
-        """Names of the effects that change the noise alone."""
-        on_noise = [effect for effect in self.effects.values() if isinstance(effect, NoiseEffect)]
-        return frozenset(effect.name for effect in on_noise if effect.change_of_readings is None)
 
     @property
     def least_readings(self) -> int:

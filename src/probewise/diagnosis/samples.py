@@ -24,10 +24,10 @@ from probewise.diagnosis.evidence import Linearised, NoiseEvidence
 from probewise.diagnosis.fit import FARTHEST, Fit, Null, Predictor, effect_values
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.posterior import n_tried, posterior_draws
-from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, effects_out_of_vocabulary
 from probewise.diagnosis.templates import TemplateBank, templates_of_effect
 from probewise.diagnosis.verdict import GlobalTest, Judged
+from probewise.diagnosis.words import Names
 from probewise.effects import NUISANCES, Effect, Extent, NoiseEffect
 from probewise.effects.noise import quantisation, sd_of_estimated_lattice_step
 from probewise.effects.reference import origins_of

@@ -10,12 +10,11 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import TINY, FloatArray, IntArray
-from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, Words
+from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Candidate, PriorOdds, Words
 from probewise.diagnosis.evidence import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.outlying import MeterStop
-from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.words import join_names
 from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
 from probewise.recordings.plan import Plan, Recording

@@ -21,7 +21,7 @@ from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised, scale_and_project
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise import NoiseLaw
-from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.words import Names
 from probewise.effects import Effect, name_of_first_copy
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
@@ -262,11 +262,6 @@ class EffectTemplates:
     settings: tuple[FloatArray, ...]  # each (n_columns, n_params)
     variants: tuple[Effect, ...]
     choice: IntArray  # number of each entry's variant, (n_entries,)
-
-    def variant_of_entry(self, at: int) -> Effect:
-        """Return the variant (discrete choice, such as of scans) of entry number `at`."""
-        variant: Effect = self.variants[self.choice[at]]
-        return variant
 
     @cached_property
     def n_numbers(self) -> int:

@@ -15,7 +15,6 @@ from probewise.diagnosis.apparatus import SETTLED, Words
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.outlying import FAR_OUT
-from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import (
     Searched,
     WeighedFit,
@@ -26,6 +25,7 @@ from probewise.diagnosis.search.hypotheses import (
 from probewise.diagnosis.sensors import fine_structure_slopes
 from probewise.diagnosis.unknown_bases import PRODUCTS
 from probewise.diagnosis.words import (
+    Names,
     combination_label,
     effects_in_words,
     hypothesis_in_words,
@@ -33,7 +33,7 @@ from probewise.diagnosis.words import (
     join_names,
     p_in_words,
 )
-from probewise.effects import PROPOSAL
+from probewise.effects import PROPOSAL, NoiseEffect
 
 N_DRAWS = 999
 """Number of residual draws under the null."""
@@ -209,7 +209,8 @@ def judge(searched: Searched, test: GlobalTest, *, unknown_weight: float = 1.0) 
     """
     prepared, half = searched.prepared, searched.prior.named_needs_half
     pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
-    on_noise, certain = prepared.pure_noise_effect_names, frozenset(searched.certain)
+    effects, certain = prepared.effects.values(), frozenset(searched.certain)
+    on_noise = frozenset(e.name for e in effects if isinstance(e, NoiseEffect) and e.change_of_readings is None)
 
     def aliased_combinations(combination: Names) -> frozenset[Names]:
         noise = prepared.noise_effect_names & {*combination}

@@ -6,10 +6,14 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import TypeAlias
 
 from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, name_without_copy_suffix, spoken_name
 from probewise.effects.noise import noise_per_run, random_walk
 from probewise.systems.forms import WORDS
+
+Names: TypeAlias = tuple[str, ...]
+"""The effects of a combination, by name."""
 
 _LEAST_P = 1e-300  # smallest p-value that floating point represents reliably
 

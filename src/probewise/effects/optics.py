@@ -266,14 +266,6 @@ class ChangedRegion:
         """Number of regions, one for each sample; 1 where all samples share one."""
         return max(self.region.n_regions, len(self.theta))
 
-    def changed(self, albedo: FloatArray, points_mm: FloatArray) -> FloatArray:
-        """Return albedo at points (n_points, 2), (n_regions, n_points), as the effect changes it there."""
-        raise NotImplementedError
-
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.changed(self.region.albedo(points_mm), points_mm)
-
 
 @dataclass(frozen=True, eq=False)
 class RegionWithGradient(ChangedRegion):
@@ -281,8 +273,9 @@ class RegionWithGradient(ChangedRegion):
 
     origin: Origin = field(default=Origin())
 
-    def changed(self, albedo: FloatArray, points_mm: FloatArray) -> FloatArray:
-        return albedo * np.asarray(1 + self.theta @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        factor = np.asarray(1 + self.theta @ (points_mm - [self.origin.x_mm, self.origin.y_mm]).T)
+        return self.region.albedo(points_mm) * factor
 
 
 @mean_albedo_under_one_gaussian.register
@@ -312,9 +305,10 @@ def _mean_albedo_with_gradient(region: RegionWithGradient, gaussian: LabGaussian
 class RegionWithPatch(ChangedRegion):
     """A region and a bell-shaped patch on it; theta holds its albedo, x, y, r, (n_samples, 4)."""
 
-    def changed(self, albedo: FloatArray, points_mm: FloatArray) -> FloatArray:
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
         added, x, y, r = (self.theta[:, k : k + 1] for k in range(4))
-        return albedo + added * gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
+        bump = gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
+        return self.region.albedo(points_mm) + added * bump
 
 
 @mean_albedo_under_one_gaussian.register

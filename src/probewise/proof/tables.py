@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.prior_odds import Names
+from probewise.diagnosis.words import Names
 from probewise.effects import VOCABULARY
 from probewise.proof.campaign import Result
 from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic, grouped

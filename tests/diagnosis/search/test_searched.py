@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.apparatus import PriorOdds
 from probewise.diagnosis.search.hypotheses import Evidences, Searched, hypothesis_probabilities
 
 PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)

@@ -18,15 +18,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
+from probewise.diagnosis.apparatus import ENOUGH_NATS, PriorOdds
 from probewise.diagnosis.evidence import Linearised
 from probewise.diagnosis.fit import Model, Null, fit_each_start
 from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import MAD_OF_NORMAL, NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.search.hypotheses import (
-    ALIASED_NATS,
     EXTENDED_WITHIN,
     FAR_BEHIND,
     SAME_MODE,
@@ -56,6 +55,7 @@ from probewise.diagnosis.templates import (
     log_mean_exp,
 )
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
+from probewise.diagnosis.words import Names
 from probewise.effects import (
     AGAIN,
     PROPOSAL,
@@ -334,7 +334,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
             best = max(fit_and_keep(free, start, refits.likeliest_law(last)).log_z, last.log_z)
             for n in range(2, max_order + 2):
                 # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
-                if n > 2 and last.log_z < best - ALIASED_NATS:
+                if n > 2 and last.log_z < best - ENOUGH_NATS:
                     break
                 wanted = default_sensor(extent, n)
                 starts = starts_with_more_gaussians(last.found.model.sensor, last.found.z, wanted)
@@ -389,7 +389,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
     if depth > 1:
         _screen_pairs(state, null)
     freedom = null.ssf_degrees_of_freedom
-    within = {c: _ORDERS_WITHIN if c.ssf_degrees_of_freedom <= freedom else ALIASED_NATS for c in state.nulls}
+    within = {c: _ORDERS_WITHIN if c.ssf_degrees_of_freedom <= freedom else ENOUGH_NATS for c in state.nulls}
     parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
         asked = _proposals_to_refit(state, null, parents, size)
@@ -423,7 +423,7 @@ def _proposals_to_refit(
         return [*alone, *_proposals_under_simplest_noise(state, null)]
     best = _largest_scores_about_null(state) if size == 2 else {}
     scores = {names: max(own.score, best.get(names, own.score)) for names, own in proposals.items()}
-    chosen = promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS)
+    chosen = promising_combinations(state, scores, width=_BEAM, behind=ENOUGH_NATS)
     more = _pairs_of_repeatable_effects(state, null)
     return [proposals[names] for names in dict.fromkeys([*chosen, *more]) if names in proposals]
 
@@ -559,7 +559,7 @@ def _refit_leading_pairs(state: SearchState) -> list[WeighedFit]:
     best = _largest_scores_about_null(state).items()
     scores: dict[Names, float] = {names: value for names, value in best if len(names) == 2 and names not in settled}
     # All against what was best before: equal pairs are refitted, or none.
-    for names in promising_combinations(state, scores, width=_BEAM, behind=ALIASED_NATS):
+    for names in promising_combinations(state, scores, width=_BEAM, behind=ENOUGH_NATS):
         state.refit_stepwise(names)
     return [c for names in scores for c in state.candidates_of_combination(names)]
 
@@ -591,7 +591,7 @@ def eliminate_backward(state: SearchState) -> None:
             continue
         proposals = proposals_for(state, held, {})
         scores = {key: proposal.score for key, proposal in proposals.items()}
-        chosen = [names, *promising_combinations(state, scores, width=_SWAPPED, behind=ALIASED_NATS)[:_SWAPPED]]
+        chosen = [names, *promising_combinations(state, scores, width=_SWAPPED, behind=ENOUGH_NATS)[:_SWAPPED]]
         for added in [proposals[key].added for key in chosen if key in proposals]:
             state.refit_with_effect(held, added)
 
@@ -663,10 +663,10 @@ def prune_out_of_vocabulary(
         if not effects_out_of_vocabulary(names):
             continue
         rivals = [c for c in leading.values() if not effects_out_of_vocabulary(c.names) and len(c.names) <= len(names)]
-        if any(expected_log_bayes_factor(candidate, c) < ALIASED_NATS for c in rivals):
+        if any(expected_log_bayes_factor(candidate, c) < ENOUGH_NATS for c in rivals):
             pruned.add(names)
         ahead = average_log_evidence(candidate) - max((average_log_evidence(c) for c in rivals), default=-np.inf)
-        if 0 < ahead < ALIASED_NATS:
+        if 0 < ahead < ENOUGH_NATS:
             for key in [key for key in stay if key[1] == names]:
                 stay[key] = stay[key].with_variant_factor_and_weights(stay[key].log_share - ahead, stay[key].weights)
     return {key: c for key, c in stay.items() if key[1] not in pruned}, pruned
@@ -741,11 +741,11 @@ class UnknownEffects:
 
         most = max((with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
         for candidate in sorted(rivals, key=believed, reverse=True):
-            if believed(candidate) < most - ALIASED_NATS:
+            if believed(candidate) < most - ENOUGH_NATS:
                 return False
             if with_unknown(candidate) == -np.inf:
                 self.weigh_beside([candidate])
-            if with_unknown(candidate) - average(candidate.log_z_by_noise) < ALIASED_NATS:
+            if with_unknown(candidate) - average(candidate.log_z_by_noise) < ENOUGH_NATS:
                 return True
         return False
 

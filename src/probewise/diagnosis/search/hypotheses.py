@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
+from probewise.diagnosis.apparatus import ENOUGH_NATS, PriorOdds
 from probewise.diagnosis.evidence import (
     SCALES,
     Linearised,
@@ -29,13 +30,13 @@ from probewise.diagnosis.locate import Covariate
 from probewise.diagnosis.noise import HIDDEN, NoiseLaw, NoiseModel, SdPrior, rough_sd, rounding_that_hides_noise
 from probewise.diagnosis.outlying import outlier_probabilities
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.prior_odds import Names, PriorOdds
 from probewise.diagnosis.templates import (
     EffectTemplates,
     TemplateBank,
     TemplateCache,
     log_mean_exp,
 )
+from probewise.diagnosis.words import Names
 from probewise.effects import NUISANCES, PROPOSAL, Effect, NoiseEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.effects.noise import (
@@ -54,10 +55,6 @@ from probewise.priors import SharedScalePrior
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-# Nats that are expected between two hypotheses, below which readings do not tell them apart: odds of 20 to 1. A noise
-# model, SSF order or proposal that is as far behind the best does not say what to refit next. This may miss hypotheses:
-# a refit sometimes gains 8 nats over its screening.
-ALIASED_NATS = 3.0
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
 # Nats behind the best refit: a fit so far behind is weighed once, and one of a law that stays there is given up. Where
@@ -177,7 +174,7 @@ class WeighedFit:
         A missing effect on the mean can look like any noise effect, and be detectable under white noise only.
         """
         best, plain = self.log_z, min(self.evidence, key=len)
-        return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - ALIASED_NATS)
+        return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - ENOUGH_NATS)
 
     def is_significantly_better(self, than: WeighedFit) -> bool:
         """Return whether its log likelihood exceeds that of another by more than 1.5 nats."""
@@ -297,7 +294,7 @@ class NoiseModels:
             of_size = {names: e for names, e in known.items() if len(self._uncertain_names(names)) == size}
             first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
             parts = [n for n in known if set(n) < set(first)]
-            if not parts or known[first].log_z < max(known[n].log_z for n in parts) + ALIASED_NATS:
+            if not parts or known[first].log_z < max(known[n].log_z for n in parts) + ENOUGH_NATS:
                 return size > 1
             # Beside another effect the likeliest values may be others: nodes about them alone would lie too close.
             likely = self._likeliest_nodes(laplace_evidence(found, self.models[first]))
@@ -312,7 +309,7 @@ class NoiseModels:
                     if len(nodes) > _MANY and nodes.shape[1] == 1:
                         coarse[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
                 nearby = laplace_evidence(found, self._build_model(both, likely | coarse))
-                least = best - ALIASED_NATS - self.log_prior(both)
+                least = best - ENOUGH_NATS - self.log_prior(both)
                 own = refined(found, nearby, least=least)
                 if own.log_z <= least:
                     continue
@@ -454,7 +451,7 @@ class Refits:
     def earlier_refit(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended | None:
         """Return a refit made before, as of `refit_with_effect`; None if there is none."""
         before = self.known.get((parent.n_gaussians, parent.names, effect, against))
-        return None if before is None or parent.log_z > before[0].log_z + ALIASED_NATS else before[1]
+        return None if before is None or parent.log_z > before[0].log_z + ENOUGH_NATS else before[1]
 
     def _refit_with_likely_variants(self, parent: WeighedFit, effect: Effect, against: float) -> Extended:
         templates = self.templates.templates_of(parent.found, effect)
@@ -530,7 +527,7 @@ class Refits:
             plain = self.noises.certain
             for about, scores in seen[1:]:
                 promised = parent.evidence[plain].log_z + log_mean_exp(scores)
-                if fitted[0].evidence[plain].log_z < promised - ALIASED_NATS:
+                if fitted[0].evidence[plain].log_z < promised - ENOUGH_NATS:
                     fitted.append(self.fit_and_weigh(model, np.stack(starts), about.law, beyond=parent))
         return max(fitted, key=lambda candidate: self.noises.average_log_evidence(candidate.log_z_by_noise))
 
@@ -556,7 +553,7 @@ def _variant_to_show(log_z: FloatArray, variants: Sequence[Effect]) -> int:
     """
     best = int(np.argmax(log_z))
     shared = (k for k, variant in enumerate(variants) if isinstance(variant.prior, SharedScalePrior))
-    return next((k for k in shared if log_z[k] > log_z[best] - ALIASED_NATS), best)
+    return next((k for k in shared if log_z[k] > log_z[best] - ENOUGH_NATS), best)
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
@@ -648,7 +645,7 @@ class Evidences:
         sd = law.likeliest_sigma_of(null.found.residuals)
         apart = (law(fit.found.predicted - null.found.predicted) / sd for fit in rivals)
         return all(
-            0.5 * float(narrow @ change**2) < ALIASED_NATS and np.count_nonzero(np.abs(change) > 1) < ROWS_OF_A_SIDE
+            0.5 * float(narrow @ change**2) < ENOUGH_NATS and np.count_nonzero(np.abs(change) > 1) < ROWS_OF_A_SIDE
             for change in apart
         )
 
@@ -812,7 +809,7 @@ class Searched:
             key
             for (n, key), other in fits.items()
             if names and key and key != names and (n, names) in fits
-            if expected_log_bayes_factor(fits[n, names], other) < ALIASED_NATS
+            if expected_log_bayes_factor(fits[n, names], other) < ENOUGH_NATS
         )
 
     def likeliest_fit_beside_unknown(self, noise: Names) -> WeighedFit | None:
@@ -890,11 +887,9 @@ class Searched:
         `besides`: effects out of vocabulary that do not count as unknown.
         """
         by_mean = self.posterior.marginal_over_noise
-        unknown, unnamed = (
-            by_mean.get(("unknown",), 0.0),
-            [(effects_out_of_vocabulary(n), p) for n, p in by_mean.items()],
-        )
+        unknown = by_mean.get(("unknown",), 0.0)
         terms = [(family, unknown * p) for family, p in self.evidences.unknown_shares.items()]
-        shares = _sums([*terms, *((name, p) for names, p in unnamed if names != besides for name in names)])
+        rare = [(effects_out_of_vocabulary(names), p) for names, p in by_mean.items()]
+        shares = _sums([*terms, *((name, p) for names, p in rare if names != besides for name in names)])
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}

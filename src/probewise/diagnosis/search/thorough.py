@@ -20,9 +20,8 @@ from probewise._kinds import require_rng
 from probewise.diagnosis.evidence import covariance_root
 from probewise.diagnosis.fit import FARTHEST
 from probewise.diagnosis.posterior import HypothesisProblem
-from probewise.diagnosis.prior_odds import Names
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, noise_effects_in_vocabulary
-from probewise.diagnosis.words import combination_label
+from probewise.diagnosis.words import Names, combination_label
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested.repartition import repartitioned
 from probewise.progress import Progress, silent

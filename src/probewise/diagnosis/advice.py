@@ -133,7 +133,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         blocks = OrthonormalBlocks.of(problem, templates.columns)
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
-        chosen[name] = templates.variants[int(templates.choice[best])], templates.settings[best]
+        chosen[name] = templates.variant_of_entry(best), templates.settings[best]
         bases[name] = _projected_basis(problem, problem.whiten(templates.columns[best]))[0]
     for pair in itertools.combinations((name for name, basis in bases.items() if basis.size), 2):
         cosines = np.linalg.svd(bases[pair[0]].T @ bases[pair[1]], compute_uv=False)

@@ -263,6 +263,10 @@ class EffectTemplates:
     variants: tuple[Effect, ...]
     choice: IntArray  # number of each entry's variant, (n_entries,)
 
+    def variant_of_entry(self, at: int) -> Effect:
+        """Return the variant (discrete choice, such as of scans) of entry number `at`."""
+        return self.variants[int(self.choice[at])]
+
     @cached_property
     def n_numbers(self) -> int:
         """Numbers in all columns."""

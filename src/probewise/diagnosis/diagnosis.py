@@ -522,7 +522,7 @@ def _reason(diagnosis: Diagnosis, searched: Searched, test: GlobalTest, best: Be
         words=prepared.apparatus.words,
         n_readings=len(prepared.usable_rows),
         least_readings=prepared.least_readings,
-        form=searched.nulls[searched.likeliest_order].ssf_in_words,
+        form=searched.null.found.model.sensor.ssf_in_words,
         sentences={effect.name: effect.sentence for effect in diagnosis.effects},
         like=tuple(sentence_from_samples(each, samples.effect_samples(each.name)) for each in formulas),
         family=max(shares, key=lambda family: shares[family], default=""),

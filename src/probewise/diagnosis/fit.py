@@ -226,11 +226,9 @@ class Model:
         """Return a part of its plan that suffices to predict some rows, and their numbers there, as a null does."""
         return self.sensor.part_that_predicts(rows, self.plan, self.effects)
 
-    def predict_and_differentiate(self, z: FloatArray, *, by: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return predictions, (n_points,), and slopes, (n_points, n_coordinates), at z (n_params,), by all or some."""
+    def predict_and_differentiate(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return predictions, (n_points,), and their slopes, (n_points, n_params), at one point z (n_params,)."""
         points, steps = difference_points_and_steps(z)
-        if by is not None:
-            points, steps = points[[0, *(1 + by)]], steps[by]
         return _prediction_and_slopes(self.predict(points), steps)
 
     def with_effect(self, effect: Effect) -> Model:

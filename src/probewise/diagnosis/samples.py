@@ -330,7 +330,8 @@ class HypothesisSamples:
         parts = [(self._samples_of(c), p * share) for own, p in kept for c, share in self._orders(own)]
         if len(parts) == 1:
             return parts[0][0]
-        null = self.searched.nulls[max(part.n_gaussians for part, _ in parts)]
+        order = max(part.n_gaussians for part, _ in parts)
+        null = self.searched.evidences.fits[order, ()].found.model.sensor
         plan = self.searched.prepared.recording.plan
         return mix([part for part, _ in parts], np.array([share for _, share in parts]), null, plan, rng=self.rng)
 

@@ -11,10 +11,10 @@ import pytest
 from refitted import state_with_nulls
 
 from probewise.diagnosis import posterior
+from probewise.diagnosis import search as searching
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit import Model, fit
 from probewise.diagnosis.noise import white_noise
-from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search import search_with_formulas
 from probewise.diagnosis.search.hypotheses import (
     Evidences,
@@ -197,7 +197,7 @@ def test_a_formula_is_searched_for_where_a_name_explains_a_part(monkeypatch):
 def _refit_favoured(state):
     def posterior():
         own = Evidences(state.candidates, state.screened_log_evidences())
-        return hypothesis_probabilities(own, state.prior, certain=(), n_forms=1)
+        return hypothesis_probabilities(own, state.prior, certain=())
 
     searching._refit_favoured_by_screening(state, posterior)
 
@@ -209,7 +209,6 @@ def test_a_pair_that_screening_about_the_null_favours_is_screened_about_its_part
         {n: e for n, e in prepared_line.effects.items() if n not in prepared_line.noise_effect_names},
         searched.prior, searched.refits,
     )  # fmt: skip
-    state.nulls_by_order |= searched.nulls
     state.candidates |= {key: f for key, f in searched.evidences.fits.items() if key[1] in ((), ("sensitivity:room",))}
     pair = ("offset_drift", "sensitivity:room")
     state.about_null[pair, ()] = state.null.log_z + 500.0

@@ -35,7 +35,7 @@ EVIDENCES = Evidences(
 
 
 def posterior(evidences=EVIDENCES):
-    return hypothesis_probabilities(evidences, PRIOR, certain=(), n_forms=2)
+    return hypothesis_probabilities(evidences, PRIOR, certain=())
 
 
 def test_probabilities_are_prior_times_evidence_summed_over_orders():
@@ -71,7 +71,7 @@ def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_sta
 
 def test_too_few_readings_leave_no_second_copy_of_an_effect_alone():
     prepared = SimpleNamespace(effects=dict.fromkeys(("lag", "wave", "wave~again")), noise_effect_names=frozenset())
-    searched = Searched(prepared, PRIOR, {}, None, REFITS, EVIDENCES, posterior()).with_prior_probabilities()
+    searched = Searched(prepared, PRIOR, None, REFITS, EVIDENCES, posterior()).with_prior_probabilities()
     by_mean = searched.posterior.marginal_over_noise
     assert set(by_mean) == {(), ("unknown",), ("lag",), ("wave",)}
     assert sum(by_mean.values()) == pytest.approx(1.0)

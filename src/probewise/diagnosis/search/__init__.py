@@ -110,11 +110,10 @@ class SearchState:
 
     `effects`: effects on the mean, by name; `tried_always`: effects that are always refitted alone, whatever their
     score by screening; `progress`: called at every refit; `share_is_spent`: function of a share: whether that share of
-    this search's budget of refits is spent; `share`: share of the budget that may be spent by now. `nulls_by_order`:
-    nulls by SSF order; `about_null`, `about_parts`: log evidence by screening about a null, and about a fit with all
-    but one of the effects; `undetected`: combinations in which a refit has shown one effect to be insignificant;
-    `pruned`: combinations out of vocabulary that are aliased with named ones; `optimism`: nats by which screening
-    promises too much at least.
+    this search's budget of refits is spent; `share`: share of the budget that may be spent by now. `about_null`,
+    `about_parts`: log evidence by screening about a null, and about a fit with all but one of the effects;
+    `undetected`: combinations in which a refit has shown one effect to be insignificant; `pruned`: combinations out of
+    vocabulary that are aliased with named ones; `optimism`: nats by which screening promises too much at least.
     """
 
     effects: Mapping[str, Effect]
@@ -125,7 +124,6 @@ class SearchState:
     share_is_spent: Callable[[float], bool] = lambda share: False
     share: float = 1.0
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
-    nulls_by_order: dict[int, Null] = field(default_factory=dict)
     about_null: dict[EffectNames, float] = field(default_factory=dict)
     about_parts: dict[EffectNames, float] = field(default_factory=dict)
     undetected: set[Names] = field(default_factory=set)
@@ -317,8 +315,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 
     def fit_and_keep(sensor: Null, starts: FloatArray, law: NoiseLaw) -> WeighedFit:
-        state.progress("fitting the model without effects", len(state.nulls_by_order), n_forms)
-        state.nulls_by_order[sensor.n_gaussians] = sensor
+        state.progress("fitting the model without effects", len(state.nulls), n_forms)
         return state.store_candidate(refits.fit_and_weigh(Model(sensor, (), recording.plan), starts, law))
 
     law = white_noise_of_recording(recording, least=noises.least_sd)
@@ -611,23 +608,23 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
         if source is None or by_mean[names] < _REFITTED_AT_OTHER_ORDERS * known:
             continue
         own = state.candidates[source.n_gaussians, ()].log_z
-        for n, sensor in state.nulls_by_order.items():
+        for null in state.nulls:
             # A freer SSF that the evidence rejects by itself is also rejected with an effect.
-            ahead, more = state.candidates[n, ()].log_z - own, sensor.effective_n_gaussians
+            ahead, more = null.log_z - own, null.ssf_degrees_of_freedom
             is_freer, is_much_freer = (more >= source.ssf_degrees_of_freedom + k for k in (0, 2))
             rejected = (is_freer and ahead <= -_REFITTED_WITHIN) or (is_much_freer and ahead <= 0)
-            if (n, names) not in state.candidates and not rejected:
-                _refit_at_order(state, source, n)
+            if (null.n_gaussians, names) not in state.candidates and not rejected:
+                _refit_with_form_of(state, source, null)
 
 
-def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
-    """Refit a candidate's effects with `n` Gaussians; store the fit if it is significantly better than that null."""
-    null, sensor, found = state.candidates[n, ()], state.nulls_by_order[n], source.found
+def _refit_with_form_of(state: SearchState, source: WeighedFit, null: WeighedFit) -> None:
+    """Refit a candidate's effects with the SSF's form of a null; store the fit if significantly better than that."""
+    sensor, found = null.found.model.sensor, source.found
     start = np.concatenate([null.found.z, found.z[found.model.sensor.n_params :]])
     candidate = state.refits.fit_and_weigh(
         replace(found.model, sensor=sensor), start[None, :], state.refits.likeliest_law(source), max_steps=15
     )
-    before, after = map(state.complexity_penalty, (source.ssf_degrees_of_freedom, sensor.effective_n_gaussians))
+    before, after = (state.complexity_penalty(fit.ssf_degrees_of_freedom) for fit in (source, null))
     candidate = candidate.with_variant_factor_and_weights(source.log_share + before - after, source.weights)
     if candidate.is_significantly_better(null):
         state.store_candidate(candidate)
@@ -795,17 +792,14 @@ def search(
         fit_nulls(state, prepared, max_order=max_order)
         misfit_templates = _build_misfit_templates(state, prepared)
     else:
-        state.nulls_by_order |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
         misfit_templates = replace(after.misfit_templates, about=state.null.found)
     unknown = _build_unknown_effects(state, misfit_templates)
 
     def found() -> Searched:
         own = Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
-        posterior = hypothesis_probabilities(
-            own, prior, certain=refits.noises.certain, n_forms=len(state.nulls_by_order)
-        )
-        return Searched(prepared, prior, state.nulls_by_order, misfit_templates, refits, own, posterior)
+        posterior = hypothesis_probabilities(own, prior, certain=refits.noises.certain)
+        return Searched(prepared, prior, misfit_templates, refits, own, posterior)
 
     select_forward(state, depth=depth)
     if prepared.null is not None:

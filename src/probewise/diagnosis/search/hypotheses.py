@@ -705,9 +705,7 @@ class HypothesisProbabilities:
         return max(marginal, key=lambda noise: marginal[noise])
 
 
-def hypothesis_probabilities(
-    evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int
-) -> HypothesisProbabilities:
+def hypothesis_probabilities(evidences: Evidences, prior: PriorOdds, *, certain: Names) -> HypothesisProbabilities:
     """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
     outlying = evidences.only_outlying_readings_differ(prior, certain)
     log_z = _log_sums(
@@ -726,6 +724,7 @@ def hypothesis_probabilities(
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
     for (names, noise), value in evidences.screened.items() if not outlying else ():
         log_p[names, noise] = or_impossible(value) + prior.log_prior_on_mean(names)
+    n_forms = sum(not names for _, names in evidences.fits)
     for names, noise in log_p:
         log_p[names, noise] += prior.log_prior_on_noise(tuple(n for n in noise if n not in certain)) - math.log(n_forms)
     # Exact aliases differ by how far their fits went: within a hundredth of a nat they tie. Of those that tie the one
@@ -758,15 +757,10 @@ class MisfitTemplates:
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """Result of a search.
-
-    `nulls`: the null by SSF order (number of Gaussians), without fits; `refits`: all refits, for another search of the
-    same recording.
-    """
+    """Result of a search; `refits` are all refits, for another search of the same recording."""
 
     prepared: Prepared
     prior: PriorOdds
-    nulls: Mapping[int, Null]
     misfit_templates: MisfitTemplates
     refits: Refits
     evidences: Evidences
@@ -783,7 +777,7 @@ class Searched:
 
     def with_evidences(self, evidences: Evidences) -> Searched:
         """Return the result with other evidences, and the probabilities that follow from them."""
-        posterior = hypothesis_probabilities(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
+        posterior = hypothesis_probabilities(evidences, self.prior, certain=self.certain)
         return replace(self, evidences=evidences, posterior=posterior)
 
     def with_prior_probabilities(self) -> Searched:

@@ -100,18 +100,10 @@ class BestRepair:
     improvement: Improvement
     calibrated: Fit  # the null, refitted under the noise of the verdict; figures show it
     repaired: Fit  # `fit` likewise
-    out_of_vocabulary: Names = ()  # of the verdict `unknown`, its effects with a formula but no name in the vocabulary
 
     @classmethod
     def of(
-        cls,
-        searched: Searched,
-        test: GlobalTest,
-        fit: WeighedFit,
-        noise: Names,
-        *,
-        out_of_vocabulary: Names = (),
-        rng: np.random.Generator,
+        cls, searched: Searched, test: GlobalTest, fit: WeighedFit, noise: Names, *, rng: np.random.Generator
     ) -> BestRepair:
         """Measure the gain of a fit over the null: in evidence and, under one noise, on held-out parts, in rms."""
         noise, null, apparatus = fit.possible_noise(noise), test.null, searched.prepared.apparatus
@@ -131,7 +123,7 @@ class BestRepair:
             p_after = p_value_after(searched, fit, after, rng=rng)
         log_evidence = fit.evidence[noise].log_z - null.evidence[searched.certain].log_z
         gain = Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms, rms_after, p_after, comes_next)
-        return cls(fit, noise, after, gain, calibrated, repaired, out_of_vocabulary)
+        return cls(fit, noise, after, gain, calibrated, repaired)
 
 
 def predicts_far_worse(gain: Improvement) -> bool:
@@ -153,7 +145,7 @@ def judged_and_best_repair(
         leading = searched.leading_combination_out_of_vocabulary()
         fit = searched.best_refit_of(leading, noise) if leading else None
         if fit is not None:
-            best = BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
+            best = BestRepair.of(searched, test, fit, noise, rng=rng)
             if best.improvement.heldout_log_density_per_reading > 0:
                 return judged, best
         best = BestRepair.of(searched, test, searched.likeliest_fit_beside_unknown(noise) or null, noise, rng=rng)

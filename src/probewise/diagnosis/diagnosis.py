@@ -480,7 +480,7 @@ def diagnose_prepared(
     progress("locating the residuals")
     where = locate_effects_and_residuals(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
     change, is_unknown = np.zeros(len(prepared.usable_rows)), judged.verdict == "unknown"
-    if is_unknown and not best.out_of_vocabulary:
+    if is_unknown and not effects_out_of_vocabulary(best.fit.names):
         improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")

@@ -381,8 +381,8 @@ def draw_models(
     model = samples = cached.averaged(fit)
     if judged.verdict == "unknown":
         doubt = _DOUBT_BESIDE
-        if best.out_of_vocabulary:
-            doubt = max(1 - searched.posterior.marginal_over_noise[best.out_of_vocabulary], _LEAST_DOUBT)
+        if effects_out_of_vocabulary(fit.names):
+            doubt = max(1 - searched.posterior.marginal_over_noise[fit.names], _LEAST_DOUBT)
         model = cached.averaged(fit, {fit.names: 1 - doubt, (): doubt})
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
         model = cached.averaged(fit, cached.compatible_probabilities(fit))

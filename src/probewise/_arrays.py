@@ -96,6 +96,10 @@ TINY = 1e-300
 """Least divisor, whose square root is a number: what it divides is 0 with it."""
 
 
+MOST_NUMBERS = 2_000_000
+"""Numbers of an array that are held in memory at once."""
+
+
 def rounding_error(values: FloatArray, axis: int | None = None) -> FloatArray:
     """Return the difference up to which values are taken for equal, since they are the results of arithmetic.
 

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
-from probewise._arrays import TINY, FloatArray, IntArray, own_arithmetic, read_only_floats
+from probewise._arrays import MOST_NUMBERS, TINY, FloatArray, IntArray, own_arithmetic, read_only_floats
 from probewise._display import Reported
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
@@ -49,7 +49,6 @@ from probewise.systems.forms import ReferenceFit, bind_forms, driving_columns
 from probewise.systems.system import STANDS_STILL, with_converged_step
 
 ALIAS = math.sqrt(1 - 2 * ENOUGH_NATS / LAMBDA**2)  # the cosine at which the evidence is ENOUGH_NATS
-_MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
 
 
 class Seen(NamedTuple):
@@ -157,7 +156,7 @@ class Expected:
 
         Each has at most `most` settings, evenly spread; by default as many as hold two million numbers, but 64 or more.
         """
-        most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
+        most = max(MOST_NUMBERS // len(plan), 64) if most is None else most
         model, built, rows = Model(self.null, (), plan), self.effects_under(plan), np.arange(len(plan))
         predicted, slopes = model.predict_and_differentiate(self.z)
         found = Fit(model, self.z, predicted, np.zeros(len(plan)), slopes, sd=self.sd, objective=0.0)

@@ -29,14 +29,12 @@ from probewise.diagnosis.noise import (
     whiten_under_each,
 )
 from probewise.effects import NoiseEffect
+from probewise.effects.effect import LEAST_VISIBLE
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import effects_with_columns
 
 SCALES = np.geomspace(0.05, 25.0, 8)
 """Prior scales of an effect's rms, in noise sds: a mixture with a heavy tail."""
-
-LEAST_VISIBLE = 4.0
-"""Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
 
 NUMBERS = 4_000_000
 """Readings or slopes that are predicted or whitened at once, to fit in memory."""

@@ -43,7 +43,9 @@ class Covariate:
 ALARM = 0.01
 """p-value of the global test, at or below which the model counts as incomplete."""
 
-_LARGEST_P = 0.05
+LARGEST_P = 0.05
+"""p-value above which nothing is significant, neither a place nor, whatever the form of the SSF, the whole."""
+
 _LEAST_ROWS = 3
 _RUNS = ("scan", "run")  # covariates that number parts of the recording
 _ABSORBED = 1e-8  # of a window's length: below it, what the fit leaves is rounding
@@ -195,7 +197,7 @@ def significant_places(
         null = np.max(np.abs(units.T @ draws) / norms, axis=0)
         best = int(np.argmax(scores))
         p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
-        if p_value > _LARGEST_P:
+        if p_value > LARGEST_P:
             continue
         inside = covariate.values[windows[there[best]]]
         window: tuple[str | None, float | None, float | None] = (

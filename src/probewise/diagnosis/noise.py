@@ -30,6 +30,9 @@ MAD_OF_NORMAL = 0.6745
 SAME_SD = 0.03
 """Share by which two noise sds may differ and count as equal: weights that differ so little hardly move a fit."""
 
+RUNS_AWAY = 1e100
+"""Prediction or residual whose square overflows: it counts as impossible."""
+
 LEAST_SCALE = 1e-150
 """Least sd, for readings that are exactly as predicted."""
 
@@ -548,7 +551,6 @@ def _precision_bands_of_walk(law: NoiseLaw) -> FloatArray:
 _ROUNDS = 20
 _SAME = 0.01  # change of a reading's relative precision, and of sigma, at which the rounds end
 _SMALLEST = 1e-9  # sigma, of the largest residual: most readings may be exactly as predicted
-_FARTHEST = 1e100  # residual whose square is a number
 
 
 def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) -> list[NoiseLaw]:
@@ -558,7 +560,7 @@ def with_known_wide_readings(laws: Sequence[NoiseLaw], residuals: FloatArray) ->
     Gaussian noises with the probability of each reading to be wide (`wide`), and sds that include it. `log_extra` is
     what the log density of these residuals, averaged over the sets of wide readings, exceeds that of this noise by.
     """
-    if not np.abs(residuals).max() < _FARTHEST:  # of predictions that ran away: impossible in any case
+    if not np.abs(residuals).max() < RUNS_AWAY:  # of predictions that ran away: impossible in any case
         return [replace(law, wide=np.zeros(len(residuals))) for law in laws]
     out, going = list(laws), np.arange(len(laws))
     bands = np.stack([_precision_bands_of_walk(law) for law in laws])

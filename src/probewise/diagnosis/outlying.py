@@ -38,7 +38,9 @@ _NO_CHANCE = 1e-6  # the same, of a reading of which a note is worth while
 _BENT = 2.0  # noise sds: rms of the residuals from which single readings may have bent a fit
 _N_BLOCKS = 5
 _C_STEPS = 4
-_RARELY = 0.1  # share of successive readings that are equal, above which equal ones are no sign of a lost value
+# Share of successive readings that are equal, up to which equal ones are a sign of lost values or of a stop. Eight
+# equal readings in turn, or five and three, are then by chance in one of 1e5 places, at the end of the range in fewer.
+_RARELY = 0.1
 
 _A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffreys)
 
@@ -269,9 +271,6 @@ _LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
 # Of the median change from one reading to the next: on a coarser lattice readings are equal without a stop.
 _FINE = 0.1
-# Share of the other readings that equal the one before. Eight equal readings in turn, or five and three, are then by
-# chance in one of 1e5 places, and at the end of the range in fewer.
-_OFTEN = 0.1
 
 
 @dataclass(frozen=True)
@@ -327,5 +326,5 @@ def meter_stops_and_masks(recording: Recording, reading: str = "the reading") ->
         elsewhere = steps[~stands[1:][in_turn]]
         follows = np.append(False, stands[:-1] & stands[1:] & in_turn)
         streaks = np.diff(np.flatnonzero(np.append(~follows, True)))  # of rows at the stop, or one elsewhere
-        if np.mean(elsewhere == 0) <= _OFTEN and streaks.max() >= _LEAST_IN_TURN:
+        if np.mean(elsewhere == 0) <= _RARELY and streaks.max() >= _LEAST_IN_TURN:
             yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), there

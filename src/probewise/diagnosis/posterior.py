@@ -36,7 +36,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence import NUMBERS, NoiseEvidence, log_evidence_of
 from probewise.diagnosis.fit import FARTHEST, Fit, Model, difference_points_and_steps, fit, fit_each_start, with_prior
-from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, SdPrior
+from probewise.diagnosis.noise import LEAST_SCALE, RUNS_AWAY, NoiseLaw, SdPrior
 from probewise.diagnosis.sensors import CalibratedSensor
 from probewise.effects import Effect, HeavyTailedPrior
 from probewise.errors import NotConvergedError
@@ -695,7 +695,6 @@ def _ensemble_step(
 
 
 _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
-_RUNS_AWAY = 1e100  # of a prediction, whose square overflows: it counts as impossible
 
 
 def quadratic_predictions(
@@ -713,7 +712,7 @@ def quadratic_predictions(
     first, second = np.triu_indices(n_params)
     apart, one = first != second, np.eye(n_params)
     y = predict(np.concatenate([np.zeros((1, n_params)), one, -one, one[first[apart]] + one[second[apart]]]))
-    y = np.where(np.abs(y) < _RUNS_AWAY, y, np.nan)
+    y = np.where(np.abs(y) < RUNS_AWAY, y, np.nan)
     up, down, both = y[1 : n_params + 1] - y[0], y[n_params + 1 : 2 * n_params + 1] - y[0], y[2 * n_params + 1 :]
     # Readings impossible on one side are as on the other; on both, they say nothing.
     up, down = (np.nan_to_num(np.where(np.isnan(a), -b, a)) for a, b in ((up, down), (down, up)))

@@ -28,6 +28,7 @@ from probewise.systems.forms import (
 )
 from probewise.systems.forms.formulas import formula_forms
 from probewise.systems.forms.readings import time_since_start_of_run
+from probewise.systems.forms.reference import TWICE
 from probewise.systems.table import append_tables, covariate_of_column, unused_name
 
 _LEAST_ROWS = 4
@@ -154,7 +155,6 @@ _LEAST_EVALUATIONS = 1_500_000
 _CONSTANT = 1e-12  # of a covariate's largest value: a range up to this is rounding
 _MOST_MULTIPLIED = 10  # factors of products, time included: 45 products; more would dilute the prior of each
 
-_TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
 # Of a term in a rate that is another state by definition, such as that of a position; of a jump at a row of a table
 # that an input sorts; and of a curve of a column that drives the simulator, what is wrong with which has names of its
 # physics (a bend, a dead zone). A slip may look like the first, a ramp may be recorded in order: so all stay possible,
@@ -257,7 +257,7 @@ class SimulatorApparatus(Apparatus):
         curves = {f"curve:{name.removeprefix('input_gain:')}" for name in effects if name.startswith("input_gain:")}
         return replace(
             PriorOdds.for_effects(effects),
-            twice=_TWICE,
+            twice=TWICE,
             named_needs_half=True,
             unlikely=names_in_definitions(self.about, effects) | names_of_jumps_in_sorted_rows(effects) | curves,
             unlikely_weight=_UNLIKELY,

@@ -18,11 +18,12 @@ from typing import cast
 import numpy as np
 
 from probewise._arrays import TINY, BoolArray, FloatArray, IntArray
-from probewise.diagnosis.evidence import LEAST_VISIBLE, SCALES, Linearised, scale_and_project
+from probewise.diagnosis.evidence import SCALES, Linearised, scale_and_project
 from probewise.diagnosis.fit import AT_ONCE, Fit, effect_values
 from probewise.diagnosis.noise import NoiseLaw
 from probewise.diagnosis.words import Names
 from probewise.effects import Effect, name_of_first_copy
+from probewise.effects.effect import LEAST_VISIBLE
 from probewise.effects.reference import scan_indicator
 from probewise.sensor import Stage
 

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.advice import Alias, NextMeasurement, aliases_with_separating_plans
 from probewise.diagnosis.apparatus import SETTLED, Words
 from probewise.diagnosis.evidence import Linearised
-from probewise.diagnosis.locate import ALARM, bayes_factor_p_value
+from probewise.diagnosis.locate import ALARM, LARGEST_P, bayes_factor_p_value
 from probewise.diagnosis.outlying import FAR_OUT
 from probewise.diagnosis.search.hypotheses import (
     Searched,
@@ -40,8 +40,6 @@ N_DRAWS = 999
 
 NEGLIGIBLE = 1e-3
 """Probability up to which a hypothesis or an effect is not listed."""
-
-_NO_ALARM = 0.05  # p-value above which no alarm is possible, so that other forms of the SSF need no test
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
         draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
         tested.append((problem, draws))
         p_value = max(p_value, bayes_factor_p_value(problem, searched.template_banks_for_global_test(found), draws))
-        if p_value > _NO_ALARM:
+        if p_value > LARGEST_P:
             break
     # Constant readings have no noise to compare a residual with.
     return GlobalTest(null, noise, *tested[0], 1.0 if prepared.has_only_equal_readings else p_value)

@@ -38,6 +38,12 @@ PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 ROWS_OF_A_SIDE = 5
 """Least number of rows on which an effect rests, on either side where it is switched."""
 
+LEAST_VISIBLE = 4.0
+"""Least size (lambda) of a detectable effect: there the test at level .01 has a power above one half."""
+
+MOST_FREQUENCIES = 1024
+"""Largest number of trial frequencies of a wave."""
+
 Act: TypeAlias = Callable[[Any, FloatArray, Any], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the plan or table; returns the value with the
 effect."""

@@ -330,7 +330,9 @@ def _with_changed_regions(view: SceneView, plan: Plan, changed: Callable[[Region
 
 
 @edge_distance.register
-def _distance_to_unchanged_edge(region: ChangedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _distance_to_unchanged_edge(
+    region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
+) -> FloatArray:
     """Return the distance of points from the nearest edge of the region, which the effect leaves in place, mm."""
     return edge_distance(region.region, x_mm, y_mm)
 

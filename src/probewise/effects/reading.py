@@ -7,6 +7,7 @@ import numpy as np
 from probewise._arrays import FloatArray, varies
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    MOST_FREQUENCIES,
     PHASE,
     Declared,
     Effect,
@@ -27,7 +28,7 @@ from probewise.sensor.stages import Stage
 _BATTERY = "battery_mv"
 _REFERENCE_MV = 8000.0
 _MOST_EQUAL = 0.01
-_LOWEST_HZ, _MOST_FREQUENCIES = 0.01, 1024
+_LOWEST_HZ = 0.01
 _SHARE = 0.02  # typical change of the signal
 _IN_DIRECTION = {-1.0: "of backward motion", 0.0: "at rest", 1.0: "of forward motion"}
 _ALIKE = "over black and white alike"
@@ -208,7 +209,7 @@ def flicker(kind: LightEffect, of: Extent) -> Effect | None:
     typical, highest = of.small_change, 0.5 / of.gap_s
     if highest <= _LOWEST_HZ:
         return None
-    n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, _MOST_FREQUENCIES))
+    n = int(np.clip(np.ceil(2 * (highest - _LOWEST_HZ) * of.duration_s), 8, MOST_FREQUENCIES))
 
     amp, alias_hz = HeavyTailedPrior(typical, positive=True), Uniform(_LOWEST_HZ, highest)
     return kind.bind(

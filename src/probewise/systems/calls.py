@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray, floats, nearly_equal
+from probewise._arrays import MOST_NUMBERS, FloatArray, IntArray, floats, nearly_equal
 from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
 from probewise.progress import Progress
 from probewise.recordings.cells import first_cell_without_number
@@ -26,7 +26,6 @@ from probewise.systems.simulator import Columns, Simulate, Simulator, Values, re
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
 _NODES = 0.5 * (1 - np.cos(np.pi * np.arange(_N_NODES) / (_N_NODES - 1)))  # in its range
-_MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
 _WAY_OUT_BY_WORDS = {  # of Python's and NumPy's messages
     "output operand": "k = k * x in place of k *= x: an array changed in place keeps its shape",
     "converted to Python scalar": "np.sin(x) in place of math.sin(x), and so on: states and columns are arrays",
@@ -167,7 +166,7 @@ class Caller:
                 ({n: float(v[0, 0]) if v.shape == (1, 1) and n not in by_row else v[0] for n, v in own.items()}, table)
                 for own, table in each
             ]
-            for first in range(0, n_samples, step := max(_MOST_REMEMBERED // (2 * _N_NODES * n_points), 1)):
+            for first in range(0, n_samples, step := max(MOST_NUMBERS // (2 * _N_NODES * n_points), 1)):
                 self._call_ahead(samples[first : first + step], n_points)
                 for k, (own, table) in enumerate(samples[first : first + step], start=first):
                     try:
@@ -234,7 +233,7 @@ class Caller:
             self._count_call()
             known = _readings_broadcast_to_shape(self._simulated(own, columns), (n_points,)).copy()
         self._known[key] = known
-        while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
+        while len(self._known) * n_points > MOST_NUMBERS and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
         return known
 

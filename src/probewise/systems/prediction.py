@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, own_arithmetic
+from probewise._arrays import MOST_NUMBERS, BoolArray, FloatArray, IntArray, own_arithmetic
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
 from probewise._words import count_with_noun
@@ -41,7 +41,6 @@ from probewise.systems.table import (
 )
 
 _FEW = 20  # samples used to find rows that cannot be predicted
-_BLOCK = 2_000_000  # numbers in memory for one block of samples
 _LEAST_RUNS = 3  # recorded runs whose spread tells what a new one may have
 _EDGE = 1e-12
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
@@ -157,7 +156,7 @@ def predict_system(
     )
     chain = system.chain(own, _bound_effects(fitted, own))
     theta, is_drawn = _chain_samples_and_whether_drawn(fitted, chain, rng=rng)
-    n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(whole)))
+    n_samples, per_block = len(theta), max(1, MOST_NUMBERS // max(1, len(whole)))
     given, lost = _filled_table_and_unpredictable_mask(chain, theta, whole)
     known, earlier = _recorded_before(fitted, own, recorded, ~lost[:before])
     ignored, lost = np.append(~known.usable, lost[before:]), lost[before:]

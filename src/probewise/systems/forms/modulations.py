@@ -12,6 +12,7 @@ import numpy as np
 from probewise._arrays import TINY, FloatArray, distinct_values
 from probewise._words import unit_of_name, value_with_sd
 from probewise.effects.effect import (
+    MOST_FREQUENCIES,
     PHASE,
     Act,
     ChangePoints,
@@ -37,7 +38,6 @@ from probewise.systems.table import RunTable, covariate_of_column
 
 _N_VALUES = 9
 _ALL = 17  # digits of a number in double precision
-_MOST_FREQUENCIES = 1024
 _ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial frequencies of one form: a fifth of a second
 _N_BANDS = 64  # of equal prior probability
 _PEAKS_OF_A_BAND = 8  # so many, for the days and years between readings give each wave some of its height
@@ -71,7 +71,7 @@ def text_rounded_to_spread(value: float, spread: float, least: int = 4) -> str:
 def trial_frequencies(
     values: FloatArray,
     groups: list[Any],
-    most: int = _MOST_FREQUENCIES,
+    most: int = MOST_FREQUENCIES,
     rows_each: int = 2,
     least_waves: float = 1.0,
     most_waves: float = np.inf,
@@ -88,7 +88,7 @@ def trial_frequencies(
 
 
 def trial_frequencies_in_time(
-    about: ReferenceFit, most: int = _MOST_FREQUENCIES, rows_each: int = 2, *, most_waves: float = np.inf
+    about: ReferenceFit, most: int = MOST_FREQUENCIES, rows_each: int = 2, *, most_waves: float = np.inf
 ) -> FloatArray:
     """Return `trial_frequencies` along the times of the readings, (n_trial,); other rows resolve nothing."""
     times, groups = _times_of_readings(about)
@@ -97,7 +97,7 @@ def trial_frequencies_in_time(
 
 def max_n_trial_frequencies(n_points: int) -> int:
     """Return the affordable number of trial frequencies of a form of a law: 64 to 1,024, fewer for more rows."""
-    return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_FREQUENCIES))
+    return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, MOST_FREQUENCIES))
 
 
 def frequency_prior(frequencies: FloatArray) -> LogUniform:

@@ -12,6 +12,7 @@ from numpy.polynomial.chebyshev import chebfit, chebval
 from probewise._arrays import BoolArray, FloatArray, distinct_values, rounding_error
 from probewise._words import value_with_sd
 from probewise.effects.effect import (
+    LEAST_VISIBLE,
     ROWS_OF_A_SIDE,
     Act,
     Declared,
@@ -48,7 +49,6 @@ _ODDS_OF_SMOOTH = 0.05  # prior: the rows of most tables are dense beside what m
 _APART = 1.0  # lambda between the two at some trial size, below which they are the same
 _BEND_DEGREE = 4
 _COEFFICIENTS = "a1", "a2", "a3", "a4", "a5"  # of a curve
-_VISIBLE = 4.0  # lambda of an effect that a test at level .01 sees more often than not
 _NONE, _HARDLY = 1e-9, 1e-6  # of a size: none, and more than rounding of none
 
 
@@ -254,7 +254,7 @@ def _up_to_order(curve: Form, order: int, n_read: int) -> Form:
     """
     none = Fixed(-_NONE * curve.entries.max(), _NONE * curve.entries.max())
     highest = cast(HeavyTailedPrior, curve.marginals[_COEFFICIENTS[order - 1]])
-    seen = replace(highest, smallest=max(highest.smallest, min(_VISIBLE / np.sqrt(n_read), 1.0)))
+    seen = replace(highest, smallest=max(highest.smallest, min(LEAST_VISIBLE / np.sqrt(n_read), 1.0)))
     priors = {**curve.marginals, _COEFFICIENTS[order - 1]: seen, **dict.fromkeys(_COEFFICIENTS[order:], none)}
     return replace(curve, parameters=priors, entries=curve.entries[:, :order])
 

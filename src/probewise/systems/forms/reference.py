@@ -52,7 +52,9 @@ AMPLITUDE, POSITIVE = HeavyTailedPrior(1.0), HeavyTailedPrior(1.0, positive=True
 """Priors of amplitudes of a form before `ReferenceFit.scaled` finds their typical size: of either sign, or positive."""
 
 _BLOCK_ENDS, _FEW_BLOCK_ENDS = 64, 12  # intervals of an end: all, and as many as detection needs
-_BLOCKS = 0.1  # odds of a step that goes back: as those of a second wave
+TWICE = 0.1
+"""Odds of a second wave, given one, and of a step that goes back: machines and climates that have a cycle often have
+another one."""
 
 Form: TypeAlias = Effect
 """An effect that is bound to a target of a simulator: its act takes the table of the runs."""
@@ -73,7 +75,7 @@ class BlockForm(StepEffect):
         """The priors of end and begin in each variant."""
         begins, thinner = self.change_points.intervals, thinned(np.array(self.change_points.at), self.most)
         blocks = list(combinations(replace(self.change_points, at=thinner).intervals, 2))
-        never = replace(self.never, odds=max(len(blocks), 1) / (_BLOCKS * len(begins)))
+        never = replace(self.never, odds=max(len(blocks), 1) / (TWICE * len(begins)))
         steps = [(never, Uniform(*begin)) for begin in begins]
         return [*steps, *((Uniform(*end), Uniform(*begin)) for begin, end in blocks)]
 

@@ -22,11 +22,11 @@ from probewise.diagnosis.diagnosis import Diagnosis, Thorough, diagnose_prepared
 from probewise.diagnosis.evidence import covariance_root, log_evidence_of
 from probewise.diagnosis.fit import AT_ONCE, FARTHEST, Fit, Model, fit, fit_each_start, with_prior
 from probewise.diagnosis.noise import LEAST_SCALE, NoiseLaw, rough_sd, white_noise_of_recording
-from probewise.diagnosis.outlying import MeterStop, find_lost_readings, meter_stops_and_masks
+from probewise.diagnosis.outlying import find_lost_readings, find_meter_stop
 from probewise.diagnosis.prepared import MOST_DIAGNOSED_READINGS, Prepared, positions_in_stretches
 from probewise.diagnosis.search import search
 from probewise.diagnosis.simulator_rows import CALLS_OF_A_SEARCH, SimulatorApparatus
-from probewise.effects import Effect
+from probewise.effects import Effect, NoiseEffect
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Normal, Uniform
 from probewise.progress import Progress, silent
@@ -354,12 +354,6 @@ def without_unpredictable_readings(system: System, recording: RunRecording, *, e
     return _without_readings(recording, lost, note)
 
 
-def _without_rows_at_stop(recording: RunRecording, stop: MeterStop, rows: BoolArray) -> RunRecording:
-    level = f"{stop.level:.6g} {stop.unit}".rstrip()
-    note = f"{count_with_noun(int(rows.sum()), 'reading')} left out, at {level}, where the meter stops"
-    return _without_readings(recording, rows, note)
-
-
 def without_readings_near_ends(system: System, found: Fit, sd: float, recording: RunRecording) -> RunRecording:
     """Leave out, with a note, readings whose noise an end of the declared range cuts off, and note those at an end.
 
@@ -509,9 +503,9 @@ def prepare_system(
     plan, recording = recording.plan, without_unpredictable_readings(system, recording, every_row=with_effects)
     if recording.plan is not plan:
         table = replace(table, columns=cast(RunTable, recording.plan).columns)
-    stopped = next(meter_stops_and_masks(as_recording(simulator, table), simulator.reading), None)
-    stop = None if stopped is None else stopped[0]
-    recording = recording if stopped is None else _without_rows_at_stop(recording, *stopped)
+    left_out = list[NoiseEffect]()
+    if (stop := find_meter_stop(as_recording(simulator, table), simulator.reading)) is not None:
+        recording, left_out = cast(RunRecording, stop.left_out_of(recording)), [stop.effect]
     least = system.least_readings if with_effects else system.n_params + 1
     n_usable, n_within = int(recording.usable.sum()), int((recording.usable & ~recording.censored).sum())
     if n_usable < (1 if with_effects else least):
@@ -525,9 +519,9 @@ def prepare_system(
     system, found, sd = fit_system(plain, recording)
     covariates = SimulatorApparatus(ReferenceFit(system, table, found.z, sd)).covariates_and_predicted_slope
     lost = find_lost_readings(found.model, recording, found, list(system.starts), covariates, sd=sd)
-    effect = None if lost is None else lost.effect(recording)
     if lost is not None:
         told("fitting the simulator without lost readings")
+        left_out.append(lost.effect(recording))
         recording = cast(RunRecording, lost.left_out_of(recording))
         system, found, sd = fit_system(plain, recording)
     beside_ends = without_readings_near_ends(system, found, sd, recording)
@@ -537,7 +531,7 @@ def prepare_system(
         system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     conflicts = tuple(notes_on_prior_conflict(system, found, white_noise_of_recording(recording)))
-    apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop, lost=effect)
+    apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), tuple(left_out))
     sorting = sorting_column(apparatus.about)
     if sorting is not None:
         told_of = f"what jumps or wanders from row to row may change with {sorting} instead"

@@ -9,9 +9,8 @@ undeclared end of a meter's range, where it stops: they are exactly equal, which
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.special import betaln, ndtri, stdtr
@@ -273,20 +272,27 @@ _LEAST_IN_ALL = 8
 _FINE = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeterStop:
-    """Saturation of a meter at `level`, after the noise: its readings there are exactly equal.
+    """Saturation of a meter at `level`, after the noise: its readings there, of the mask `rows`, are exactly equal.
 
-    Readings at the stop are left out of the fit, so that the noise model does not change. In the stored model, the stop
-    is the form `saturation` of the reading.
+    They are left out of the fit, so that the noise model does not change. In the stored model, the stop is the form
+    `saturation` of the reading.
     """
 
     level: float
     is_ceiling: bool
-    reading: str = "the reading"
-    unit: str = ""
+    rows: BoolArray
+    reading: str
+    unit: str
 
-    @cached_property
+    def left_out_of(self, recording: Recording) -> Recording:
+        """Return the recording without the readings at the stop, and with a note that says so."""
+        level, left = f"{self.level:.6g} {self.unit}".rstrip(), np.where(self.rows, np.nan, recording.readings)
+        note = f"{count_with_noun(int(self.rows.sum()), 'reading')} left out, at {level}, where the meter stops"
+        return replace(recording, readings=left, notes=(*recording.notes, note))
+
+    @property
     def effect(self) -> NoiseEffect:
         """The stop as an effect, whose level is certain to within rounding."""
         near = 1e-9 * (1 + abs(self.level))
@@ -304,8 +310,8 @@ class MeterStop:
         )
 
 
-def meter_stops_and_masks(recording: Recording, reading: str = "the reading") -> Iterator[tuple[MeterStop, BoolArray]]:
-    """Yield stops at the largest and smallest reading, with the mask of the rows there, (n_points,).
+def find_meter_stop(recording: Recording, reading: str = "the reading") -> MeterStop | None:
+    """Return the stop at the largest reading, or else at the smallest one; None if there is none.
 
     At least eight readings must equal that reading exactly, five of them in succession: noise makes readings differ,
     unless the meter saturates after the noise. None where rounding is too coarse to tell, or at an end that was
@@ -317,7 +323,7 @@ def meter_stops_and_masks(recording: Recording, reading: str = "the reading") ->
     steps = np.abs(np.diff(readings))[in_turn]
     typical = float(np.median(steps)) if steps.size else 0.0
     if len(readings) <= _LEAST_IN_ALL or not typical > 0 or lattice_step(readings) > _FINE * typical:
-        return  # they are too few or too coarse for equal ones to tell of a stop
+        return None  # they are too few or too coarse for equal ones to tell of a stop
     for is_ceiling in (True, False):
         level = float(readings.max() if is_ceiling else readings.min())
         stands, there = readings == level, recording.readings == level
@@ -327,4 +333,5 @@ def meter_stops_and_masks(recording: Recording, reading: str = "the reading") ->
         follows = np.append(False, stands[:-1] & stands[1:] & in_turn)
         streaks = np.diff(np.flatnonzero(np.append(~follows, True)))  # of rows at the stop, or one elsewhere
         if np.mean(elsewhere == 0) <= _RARELY and streaks.max() >= _LEAST_IN_TURN:
-            yield MeterStop(level, is_ceiling, reading, recording.plan.instrumentation.unit), there
+            return MeterStop(level, is_ceiling, there, reading, recording.plan.instrumentation.unit)
+    return None

@@ -14,7 +14,6 @@ from probewise.diagnosis.apparatus import MOST_ADVISED_READINGS, Apparatus, Cand
 from probewise.diagnosis.evidence import LEAST_ROWS, N_BLOCKS, Parts
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.outlying import MeterStop
 from probewise.diagnosis.words import join_names
 from probewise.effects import Effect, Extent, LightEffect, NoiseEffect, noise
 from probewise.recordings.plan import Plan, Recording
@@ -167,8 +166,7 @@ class SimulatorApparatus(Apparatus):
     """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects."""
 
     about: ReferenceFit  # the system, its table, the first fit, and the sd of a reading
-    stop: MeterStop | None = None  # where the meter stops without having declared it, if the readings show that
-    lost: NoiseEffect | None = None  # the effect that lost readings which were left out, if any
+    left_out: tuple[NoiseEffect, ...] = ()  # the effects of readings that were left out: lost, or where the meter stops
 
     @property
     def system(self) -> System:
@@ -224,8 +222,7 @@ class SimulatorApparatus(Apparatus):
         kinds = [kind for kind in ON_NOISE if self.rows_are_in_order or kind not in _ALONG_ROWS]
         if recording.censored.any():  # a walk has no likelihood of readings at an end of the range
             kinds.remove(noise.random_walk)
-        stop = None if self.stop is None else self.stop.effect
-        beside = (*(kind.for_extent(extent) for kind in kinds), stop, self.lost)
+        beside = (*(kind.for_extent(extent) for kind in kinds), *self.left_out)
         return bind_forms(self.about) | {effect.name: effect for effect in beside if effect is not None}
 
     def proposed_formulas(self) -> dict[str, Effect]:

@@ -6,7 +6,7 @@ import pytest
 from probewise.diagnosis import diagnose_system
 from probewise.diagnosis.diagnose_simulator import prepare_system
 from probewise.diagnosis.fit_simulator import repaired_of
-from probewise.diagnosis.outlying import meter_stops_and_masks
+from probewise.diagnosis.outlying import find_meter_stop
 from probewise.systems import RunTable, Simulator, as_recording, predict_system, table_for
 
 _N, _SD = 240, 0.05
@@ -25,13 +25,13 @@ def _table(readings):
 
 def _stop(table, **more):
     simulator = _simulator(**more)
-    return next(meter_stops_and_masks(as_recording(simulator, RunTable(table, time=None, run=None))), None)
+    return find_meter_stop(as_recording(simulator, RunTable(table, time=None, run=None)))
 
 
 def test_a_meter_that_stops_after_its_noise_is_seen():
-    found, rows = _stop(_table(lambda y: np.minimum(y, 5.5)))
-    assert (found.level, found.is_ceiling, rows.sum()) == (5.5, True, np.sum(_table(lambda y: y)["y"] >= 5.5))
-    found, _ = _stop(_table(lambda y: np.maximum(y, 2.5)))
+    found = _stop(_table(lambda y: np.minimum(y, 5.5)))
+    assert (found.level, found.is_ceiling, found.rows.sum()) == (5.5, True, np.sum(_table(lambda y: y)["y"] >= 5.5))
+    found = _stop(_table(lambda y: np.maximum(y, 2.5)))
     assert (found.level, found.is_ceiling) == (2.5, False)
 
 
@@ -52,9 +52,8 @@ def test_nothing_is_seen_where_no_meter_stops(case):
 def test_lost_readings_at_the_end_of_the_range_are_no_stop():
     lost = np.random.default_rng(6).random(_N) < 0.08
     prepared = prepare_system(_simulator(), table_for(_simulator(), _table(lambda y: np.where(lost, 9.0, y))))
-    assert prepared.apparatus.stop is None
-    assert prepared.apparatus.lost is not None
-    assert prepared.apparatus.lost.known[1] == 9.0
+    (effect,) = prepared.apparatus.left_out
+    assert (effect.name, effect.known[1]) == ("dropouts", 9.0)
     assert len(prepared.recording.left_out) == lost.sum()
 
 

@@ -425,10 +425,7 @@ _STRIDES = (1, 4)
 def choose_cure_scans(
     plan: Plan, expected: Expected, ailing: Sequence[str], progress: Progress = silent
 ) -> list[Candidate]:
-    """Choose up to five scans to add, one at a time, each with the largest reduction of the deficit per reading.
-
-    They are timed one after another, in the order chosen.
-    """
+    """Choose up to five scans to add, one after another, each with the largest reduction of the deficit per reading."""
     every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Candidate] = []
     current = plan

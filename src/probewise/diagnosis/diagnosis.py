@@ -141,8 +141,6 @@ def locate_effects_and_residuals(
     """Return the places of the repair's effects, largest first, then of other significant residuals of the null.
 
     A place is a range of a covariate, such as time. Of several places with the same figure, only the first is kept.
-
-    `searched`, `test`, `judged`, `best`: result of the search; global test of the null; the verdict; the repair.
     """
     prepared, problem, law = searched.prepared, test.problem, test.problem.law
     covariates, residuals = searched.misfit_templates.covariates, test.null.found.residuals

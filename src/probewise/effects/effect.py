@@ -199,11 +199,10 @@ class Effect:
         return (2 if exchangeable else 1) * (2 if "phase" in self.prior.names else 1)
 
     def variants(self) -> tuple[Effect, ...]:
-        """List the effect with each of its discrete choices made, of prior odds `relative_odds`.
+        """List the effect with each of its discrete choices made, of prior odds `relative_odds`; the same at each call.
 
         A choice is a scan, a mounting or an interval between readings, which no gradient-based fit can find. Variants
-        differ in their `scans` or `patterns`, or only in their priors. They are the same objects at each call, so that
-        two fits have equal effects.
+        differ in their `scans` or `patterns`, or only in their priors.
         """
         return self._variants
 

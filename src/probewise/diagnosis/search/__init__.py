@@ -377,10 +377,7 @@ class Proposal(NamedTuple):
 
 
 def select_forward(state: SearchState, *, depth: int) -> None:
-    """Refit the best combinations of each size up to `depth`, extended from the best of the size before.
-
-    Fits with significant effects are stored in the state as candidates.
-    """
+    """Refit and store the best combinations of each size up to `depth`, extended from the best of the size before."""
     null = state.null
     state.progress("screening effects")
     if depth > 1:
@@ -596,9 +593,8 @@ def eliminate_backward(state: SearchState) -> None:
 def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
     """Refit the most probable combinations of effects on the mean at other numbers of Gaussians (SSF orders).
 
-    Refits with significant effects are stored in `state`. `by_mean` is the posterior probability of each combination,
-    whatever the noise. An unknown effect may lead at an order at which no named effect was tried; named ones must then
-    be tried there.
+    `by_mean` is the probability of each. An unknown effect may lead at an order at which no named effect was tried;
+    named ones must then be tried there.
     """
     known = sum(p for names, p in by_mean.items() if names != ("unknown",))
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
@@ -721,10 +717,7 @@ class UnknownEffects:
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
 
     def _is_superfluous(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
-        """Return whether one of the `rivals` makes an unknown effect added to `known` superfluous.
-
-        The rival's evidence is at most three nats lower, and an unknown effect adds less than three to it.
-        """
+        """Return whether a rival is at most three nats behind, and an unknown effect adds less than three to it."""
         average, n_named = self.state.refits.noises.average_log_evidence, len(self.state.effects_in_vocabulary)
 
         def with_unknown(candidate: WeighedFit) -> float:

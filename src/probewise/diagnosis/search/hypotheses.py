@@ -436,9 +436,7 @@ class Refits:
         return self.plain[-1]
 
     def refit_with_effect(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended:
-        """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans).
-
-        A refit made before is returned as it was, also that of a fit of the same effects that is as good to three nats.
+        """Refit a candidate with one more effect, in its likely variants (discrete choices, such as of scans), once.
 
         Returns the fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats;
         and the effect's log Bayes factor by screening, by noise model.
@@ -449,7 +447,7 @@ class Refits:
         return before
 
     def earlier_refit(self, parent: WeighedFit, effect: Effect, against: float = 0.0) -> Extended | None:
-        """Return a refit made before, as of `refit_with_effect`; None if there is none."""
+        """Return a refit made before, also that of a fit as good to three nats; None if there is none."""
         before = self.known.get((parent.n_gaussians, parent.names, effect, against))
         return None if before is None or parent.log_z > before[0].log_z + ENOUGH_NATS else before[1]
 

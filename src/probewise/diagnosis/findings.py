@@ -167,10 +167,11 @@ def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, 
     Deviations are autocorrelation, heavy tails, or a spread that depends on the level.
     """
     prepared, after = searched.prepared, best.problem
-    steps, before = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
+    steps, usable = n_rows_since_previous_usable(prepared.recording), previous_usable(prepared.recording)
     own = after.residual[: after.n_points, None]
     null = after.draw_null_residuals(N_DRAWS, rng=rng)[: after.n_points]
-    joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.fit.found.predicted, before=before)
+    previous, level = np.where(steps == 1, usable, -1), best.fit.found.predicted
+    joined = noise_statistics(np.concatenate([own, null], axis=1), previous, level)
     center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
     worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
     p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + N_DRAWS)

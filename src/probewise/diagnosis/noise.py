@@ -487,19 +487,16 @@ def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> Noi
     )
 
 
-def noise_statistics(
-    residuals: FloatArray, steps: IntArray, level: FloatArray, *, before: IntArray | None = None
-) -> FloatArray:
+def noise_statistics(residuals: FloatArray, previous: IntArray, level: FloatArray) -> FloatArray:
     """Return statistics that vanish for white normal noise.
 
-    `residuals`: whitened residuals, shape (n_points, n_draws); `steps`: rows back to the previous reading of the scan,
-    0 for none, shape (n_points,); `level`: predicted readings, shape (n_points,); `before`: number of the previous
-    reading of the scan, shape (n_points,); None where it is the one above. Returns lag-1 autocorrelation, excess
-    kurtosis, and projection of the squares on the level, (3, n_draws).
+    `residuals`: whitened residuals, (n_points, n_draws); `previous`: number of the reading in the row before of the
+    scan, -1 if there is none, (n_points,); `level`: predicted readings, (n_points,). Returns lag-1 autocorrelation,
+    excess kurtosis, and projection of the squares on the level, (3, n_draws).
     """
     r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), TINY))
-    neighbours = np.flatnonzero(steps == 1)
-    above = neighbours - 1 if before is None else before[neighbours]
+    neighbours = np.flatnonzero(previous >= 0)
+    above = previous[neighbours]
     lag_1 = (r[neighbours] * r[above]).mean(axis=0) if neighbours.size else np.zeros(r.shape[1])
     kurtosis = (r**4).mean(axis=0) - 3
     tilt = level - level.mean()

@@ -73,19 +73,12 @@ EffectNames: TypeAlias = tuple[Names, Names]
 K = TypeVar("K", bound=Hashable)
 
 
-def _sums(terms: Iterable[tuple[K, float]]) -> dict[K, float]:
-    """Add up the values of each key."""
+def _sums(terms: Iterable[tuple[K, float]], *, of_logs: bool = False) -> dict[K, float]:
+    """Add up the values of each key; if `of_logs`, they are given and returned as logs."""
     out: dict[K, float] = {}
     for key, value in terms:
-        out[key] = out.get(key, 0.0) + value
-    return out
-
-
-def _log_sums(terms: Iterable[tuple[K, float]]) -> dict[K, float]:
-    """Add up the values of each key, which are given and returned as logs."""
-    out: dict[K, float] = {}
-    for key, value in terms:
-        out[key] = float(np.logaddexp(out.get(key, -np.inf), value))
+        known = out.get(key, -math.inf if of_logs else 0.0)
+        out[key] = float(np.logaddexp(known, value)) if of_logs else known + value
     return out
 
 
@@ -706,13 +699,13 @@ class HypothesisProbabilities:
 def hypothesis_probabilities(evidences: Evidences, prior: PriorOdds, *, certain: Names) -> HypothesisProbabilities:
     """Convert evidences to probabilities of hypotheses, summed over SSF orders (numbers of Gaussians)."""
     outlying = evidences.only_outlying_readings_differ(prior, certain)
-    log_z = _log_sums(
+    of_fits = (
         ((names, noise), or_impossible(evidence.log_z))
         for (_, names), candidate in evidences.fits.items()
         if not (names and outlying)
         for noise, evidence in candidate.evidence.items()
     )
-    log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
+    log_p = {k: value + prior.log_prior_on_mean(k[0]) for k, value in _sums(of_fits, of_logs=True).items()}
     for (n, names, noise), value in evidences.unknown.items():
         if names and outlying:
             continue
@@ -857,7 +850,7 @@ class Searched:
         terms = [(n, self.log_posterior(fit)) for (n, _), fit in self.evidences.fits.items()]
         for (n, names, _), value in self.evidences.unknown.items():
             terms.append((n, value + self.prior.log_prior_with_unknown(names)))
-        by_order = _log_sums(terms)
+        by_order = _sums(terms, of_logs=True)
         return max(by_order, key=lambda n: by_order[n])
 
     @property

@@ -29,7 +29,7 @@ from probewise.diagnosis.evidence import Linearised, OrthonormalBlocks, covarian
 from probewise.diagnosis.fit import Fit, Model, residual_degrees_of_freedom
 from probewise.diagnosis.locate import Place
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, effects_out_of_vocabulary
-from probewise.diagnosis.words import Names, hypothesis_in_words
+from probewise.diagnosis.words import UNKNOWN, Names, hypothesis_in_words
 from probewise.effects import Effect, name_of_first_copy
 from probewise.recordings.plan import Plan, Recording
 
@@ -384,7 +384,7 @@ def measurement_at_place(
         candidates[best].minutes,
         float(nats[best]),
         (_null_in_words(apparatus), NO_NAME),
-        ((), ("unknown",)),
+        ((), UNKNOWN),
         nats[best] * (1 - np.eye(2)),
     )
 
@@ -460,10 +460,10 @@ def choose_next_measurement(
     `unknown_shows_in`, if anywhere.
     """
     prepared, by_mean = searched.prepared, searched.posterior.marginal_over_noise
-    plan, apparatus, unknown = prepared.recording.plan, prepared.apparatus, by_mean.get(("unknown",), 0.0)
+    plan, apparatus, unknown = prepared.recording.plan, prepared.apparatus, by_mean.get(UNKNOWN, 0.0)
     # An unknown effect makes no prediction beyond the null.
     probabilities: dict[Names, float] = {(): by_mean.get((), 0.0) + unknown}
-    probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
+    probabilities |= {names: p for names, p in by_mean.items() if names and names != UNKNOWN}
     found, held = list[WeighedFit](), 0.0  # those of the fewest hypotheses that hold .95, at most five
     for names in sorted(probabilities, key=lambda names: -probabilities[names]):
         candidate = searched.best_refit_of(names, searched.certain) if names else null
@@ -498,4 +498,4 @@ def _null_in_words(apparatus: Apparatus) -> str:
 def is_settled(searched: Searched) -> bool:
     """Return whether one hypothesis on the mean, other than an unknown effect, has .95, whatever the noise."""
     by_mean = searched.posterior.marginal_over_noise
-    return any(p >= SETTLED and names != ("unknown",) for names, p in by_mean.items())
+    return any(p >= SETTLED and names != UNKNOWN for names, p in by_mean.items())

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence import Parts
 from probewise.diagnosis.fit import Fit, Model, Null
 from probewise.diagnosis.locate import Covariate
-from probewise.diagnosis.words import Names
+from probewise.diagnosis.words import UNKNOWN, Names
 from probewise.effects import RARE_EFFECTS, Effect, is_out_of_vocabulary, name_of_first_copy
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
@@ -144,7 +144,7 @@ class PriorOdds:
     def single_effect_priors(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
         """Return the probabilities of clean, of unknown and of each effect of `names` alone, beside certain noise."""
         each = math.exp(self._log_prior_per_combination(1)) if self.n_named else self.by_size[0]
-        believed: dict[Names, float] = {(): self.clean_mean, ("unknown",): self.unknown}
+        believed: dict[Names, float] = {(): self.clean_mean, UNKNOWN: self.unknown}
         believed |= {(name,): each * (self.unlikely_weight if name in self.unlikely else 1.0) for name in names}
         total = sum(believed.values())
         return {(mean, noise): p / total for mean, p in believed.items()}

@@ -19,7 +19,7 @@ from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, noise_effect_sa
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.templates import TemplateCache, log_mean_exp
 from probewise.diagnosis.verdict import N_DRAWS, NEGLIGIBLE, Hypothesis, Judged
-from probewise.diagnosis.words import Names, p_in_words, substitute_reading_unit
+from probewise.diagnosis.words import UNKNOWN, Names, p_in_words, substitute_reading_unit
 from probewise.effects import Effect, NoiseEffect, is_out_of_vocabulary
 from probewise.effects.effect import mean_and_sd_of_samples, sentence_from_samples
 from probewise.effects.noise import sd_of_rounding
@@ -84,7 +84,7 @@ def effects_found(
     other effects are from the most probable fit that contains them or, if there is none, from the prior.
     """
     prepared, out, plan = searched.prepared, [], searched.prepared.everything.plan
-    unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
+    unknown = sum(h.probability for h in hypotheses if h.effects == UNKNOWN)
     beside = {}
     if unknown >= _IS_UNKNOWN:
         beside = searched.effect_probabilities_given_unknown() | searched.noise_probabilities_given_unknown()

@@ -25,6 +25,7 @@ from probewise.diagnosis.search.hypotheses import (
 from probewise.diagnosis.sensors import fine_structure_slopes
 from probewise.diagnosis.unknown_bases import PRODUCTS
 from probewise.diagnosis.words import (
+    UNKNOWN,
     Names,
     combination_label,
     effects_in_words,
@@ -98,7 +99,7 @@ def shared_effects(probabilities: Mapping[Names, float]) -> Names:
     """
     total, shared, of_effect = sum(probabilities.values()), frozenset[str](), dict[str, float]()
     for names, p in probabilities.items():
-        for name in names if names != ("unknown",) else ():
+        for name in names if names != UNKNOWN else ():
             of_effect[name] = of_effect.get(name, 0.0) + p
     for name in sorted(of_effect, key=lambda name: (-of_effect[name], name)):  # the most probable first
         with_all = sum(p for names, p in probabilities.items() if shared | {name} <= {*names})
@@ -127,7 +128,7 @@ class Hypothesis:
 class Judged:
     """The verdict on a recording, with probabilities.
 
-    `combination`: the effects of the verdict, sorted; () if clean or none is named, ("unknown",) if unknown. Where no
+    `combination`: the effects of the verdict, sorted; () if clean or none is named, UNKNOWN if unknown. Where no
     hypothesis decides but nearly all have some effects, the `shared` ones, it holds these, and those of the `leader`
     with a probability above one half. The model is repaired by the `leader`. `p_value`: of the global test
     of the mean, under the noise model found. `hypotheses`: all, most probable first. `unknown_shares`: probability of
@@ -173,7 +174,7 @@ class Judged:
     @property
     def unknown_probability(self) -> float:
         """Probability of an effect on the mean that is out of vocabulary and not named."""
-        return self.probability_of(("unknown",))
+        return self.probability_of(UNKNOWN)
 
     @property
     def clean_probability(self) -> float:
@@ -244,7 +245,7 @@ def hypotheses_with_verdict(
     `decided_rare_effects`), the p-value of the global test is .01 or less, and the verdict is then that they are named.
     """
     posterior, reported_as = searched.posterior, searched.evidences.reported_as
-    unknown = {mean: p for mean, p in posterior.marginal_over_noise.items() if reported_as(mean) == ("unknown",)}
+    unknown = {mean: p for mean, p in posterior.marginal_over_noise.items() if reported_as(mean) == UNKNOWN}
     rare = decided_rare_effects(searched.leading_combination_out_of_vocabulary(), unknown) if p_value <= ALARM else ()
     if rare:
         hypotheses = ranked_hypotheses(
@@ -303,7 +304,7 @@ def with_shared_effects(
 def _leader_on_mean(
     probability: Mapping[Names, float], noise_names: frozenset[str], aliases: tuple[Alias, ...]
 ) -> Names:
-    physics = {k: p for k, p in probability.items() if k != ("unknown",) and not {*k} <= noise_names}
+    physics = {k: p for k, p in probability.items() if k != UNKNOWN and not {*k} <= noise_names}
     classes = [_combination_and_alias_swaps(names, aliases) & physics.keys() for names in physics]
     likeliest = max(classes, key=lambda members: sum(physics[names] for names in members), default=set())
     return max(likeliest, key=lambda names: physics[names], default=())
@@ -322,8 +323,8 @@ def ranked_hypotheses(
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
         key = reported_as(mean)
-        key = key if key == ("unknown",) else tuple(sorted((*key, *noise_effects_in_vocabulary(noise))))
-        joined[key] = joined.get(key, 0.0) + p * (unknown_weight if key == ("unknown",) else 1.0)
+        key = key if key == UNKNOWN else tuple(sorted((*key, *noise_effects_in_vocabulary(noise))))
+        joined[key] = joined.get(key, 0.0) + p * (unknown_weight if key == UNKNOWN else 1.0)
     total = sum(joined.values())
     ranked = sorted(joined.items(), key=lambda item: -item[1])
     return tuple(Hypothesis(key, p / total) for key, p in ranked)
@@ -360,13 +361,13 @@ def verdict_and_combination(
             mean = _without(mean, noise_names) or mean
         by_mean[mean] = by_mean.get(mean, 0.0) + hypothesis.probability
         fullest.setdefault(mean, hypothesis.effects)
-    unknown, clean = by_mean.get(("unknown",), 0.0), by_mean.get((), 0.0)
-    named = {effects: p for effects, p in by_mean.items() if effects not in ((), ("unknown",))}
+    unknown, clean = by_mean.get(UNKNOWN, 0.0), by_mean.get((), 0.0)
+    named = {effects: p for effects, p in by_mean.items() if effects not in ((), UNKNOWN)}
     top = max(named, key=lambda effects: named[effects], default=())
     of_class = _combination_and_alias_swaps(top, aliases)
     verdict: Verdict = "named"
     if unknown >= 0.5:
-        verdict, top = "unknown", ("unknown",)
+        verdict, top = "unknown", UNKNOWN
     elif clean >= 0.5:
         verdict, top = "clean", ()
     elif not named:
@@ -478,7 +479,7 @@ def separating_readings_in_words(
     on_mean = {tuple(sorted({*names} - on_noise)) for names in told}
     formulas = {names for names in asked.effects if effects_out_of_vocabulary(names)} - on_mean if asked else set()
     for names in told:
-        if names == ("unknown",):  # without a formula it predicts what the null does
+        if names == UNKNOWN:  # without a formula it predicts what the null does
             named |= dict.fromkeys(formulas or {()}, hypothesis_in_words(names))
         else:
             beside = tuple(sorted({*names} - {*judged.shared}))

@@ -15,6 +15,9 @@ from probewise.systems.forms import WORDS
 Names: TypeAlias = tuple[str, ...]
 """The effects of a combination, by name."""
 
+UNKNOWN: Names = ("unknown",)
+"""The combination of an effect out of vocabulary that is not named."""
+
 _LEAST_P = 1e-300  # smallest p-value that floating point represents reliably
 
 
@@ -106,7 +109,7 @@ def hypothesis_in_words(effects: Sequence[str], *, nothing: str = "nothing is mi
     """Return a hypothesis in words, given its effects: `nothing` without any, ("unknown",) if out of vocabulary."""
     if not effects:
         return nothing
-    return "something without a name" if tuple(effects) == ("unknown",) else join_names(effects_in_words(effects))
+    return "something without a name" if tuple(effects) == UNKNOWN else join_names(effects_in_words(effects))
 
 
 def effects_in_words(names: Sequence[str]) -> list[str]:

@@ -55,7 +55,7 @@ from probewise.diagnosis.templates import (
     log_mean_exp,
 )
 from probewise.diagnosis.unknown_bases import bank_of_unknown_effects, bases_unlike_named, without_products_like
-from probewise.diagnosis.words import Names
+from probewise.diagnosis.words import UNKNOWN, Names
 from probewise.effects import (
     AGAIN,
     PROPOSAL,
@@ -596,8 +596,8 @@ def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) ->
     `by_mean` is the probability of each. An unknown effect may lead at an order at which no named effect was tried;
     named ones must then be tried there.
     """
-    known = sum(p for names, p in by_mean.items() if names != ("unknown",))
-    leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
+    known = sum(p for names, p in by_mean.items() if names != UNKNOWN)
+    leaders = sorted((names for names in by_mean if names not in ((), UNKNOWN)), key=lambda n: -by_mean[n])
     for k, names in enumerate(leaders[:_MOST_AT_OTHER_ORDERS]):
         state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), _MOST_AT_OTHER_ORDERS))
         source = state.best_candidate(names)
@@ -827,7 +827,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Hyp
     while len(shortfalls) < _MOST_REFITTED_LATE:
         state.progress("refitting combinations favoured by screening", len(shortfalls), _MOST_REFITTED_LATE)
         by_mean = posterior().marginal_over_noise
-        settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
+        settled = {(), UNKNOWN} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
         if by_mean.get(names, 0.0) <= _REFITTED_LATE or not names:
             return

@@ -36,7 +36,7 @@ from probewise.diagnosis.templates import (
     TemplateCache,
     log_mean_exp,
 )
-from probewise.diagnosis.words import Names
+from probewise.diagnosis.words import UNKNOWN, Names
 from probewise.effects import NUISANCES, PROPOSAL, Effect, NoiseEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.effects.effect import ROWS_OF_A_SIDE
 from probewise.effects.noise import (
@@ -566,7 +566,7 @@ _TIE = 0.01  # nats between hypotheses that are one: a fit stops when a step gai
 class Evidences:
     """Log evidences of hypotheses: pairs of the effects on the mean, and on the noise.
 
-    The mean ("unknown",) stands for an unknown effect, alone or with others; the SSF order is the number of Gaussians.
+    The mean UNKNOWN stands for an unknown effect, alone or with others; the SSF order is the number of Gaussians.
     `fits`: refits by (SSF order, mean), with their evidence by noise; `screened`: combinations not refitted, by
     templates: (mean, noise) -> log evidence; `unknown`: unknown effects added to fits: (SSF order, mean, noise) -> log
     evidence; `unknown_shares`: share of each family of bases, such as "time", in the evidence of an unknown effect.
@@ -590,18 +590,18 @@ class Evidences:
         return own - nothing > self.unknown[order, names, noise] - own
 
     def reported_as(self, mean: Names) -> Names:
-        """Return the names by which a combination is reported: ("unknown",) if any of its effects has no name.
+        """Return the names by which a combination is reported: UNKNOWN if any of its effects has no name.
 
         Its named part is reported instead if that alone has over half of the gain over the null.
         """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
-        if mean == ("unknown",) or named == mean:
+        if mean == UNKNOWN or named == mean:
             return mean
         nothing, own, whole = (
             max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
             for names in ((), named, mean)
         )
-        return named if named and own - nothing > 0.5 * (whole - nothing) else ("unknown",)
+        return named if named and own - nothing > 0.5 * (whole - nothing) else UNKNOWN
 
     def best_formula_beside(self, fit: WeighedFit, noise: Names) -> WeighedFit | None:
         """Return the refit of largest evidence that adds formulas alone to the effects of another fit, if any."""
@@ -710,7 +710,7 @@ def hypothesis_probabilities(evidences: Evidences, prior: PriorOdds, *, certain:
         if names and outlying:
             continue
         # A named effect remains named if a smaller unknown one is left.
-        key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
+        key = (names if evidences.named_outweigh_unknown(n, names, noise) else UNKNOWN), noise
         value = or_impossible(value) + prior.log_prior_with_unknown(names)
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value))
     for (names, noise), value in evidences.screened.items() if not outlying else ():
@@ -825,7 +825,7 @@ class Searched:
         unknown = _sums(
             (noise, p)
             for (mean, noise), p in self.posterior.probabilities.items()
-            if self.evidences.reported_as(mean) == ("unknown",)
+            if self.evidences.reported_as(mean) == UNKNOWN
         )
         total = sum(unknown.values()) or 1.0
         return _sums((name, p / total) for noise, p in unknown.items() for name in noise)
@@ -864,7 +864,7 @@ class Searched:
         own = {names: p for names, p in by_mean.items() if effects_out_of_vocabulary(names)}
         refitted = {names for _, names in self.evidences.fits}
         leader = max(own, key=lambda names: own[names], default=())
-        return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
+        return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(UNKNOWN, 0.0) else ()
 
     def probabilities_of_unknown_forms(self, *, besides: Names = ()) -> dict[str, float]:
         """Return the share of each form of an unknown effect: effects out of vocabulary, families of bases.
@@ -872,7 +872,7 @@ class Searched:
         `besides`: effects out of vocabulary that do not count as unknown.
         """
         by_mean = self.posterior.marginal_over_noise
-        unknown = by_mean.get(("unknown",), 0.0)
+        unknown = by_mean.get(UNKNOWN, 0.0)
         terms = [(family, unknown * p) for family, p in self.evidences.unknown_shares.items()]
         rare = [(effects_out_of_vocabulary(names), p) for names, p in by_mean.items()]
         shares = _sums([*terms, *((name, p) for names, p in rare if names != besides for name in names)])

@@ -125,10 +125,8 @@ class EffectBank:
 
     def _smallest(self, name: str, entries: IntArray, left: FloatArray) -> dict[int, float | None]:
         columns = np.flatnonzero(np.isin(self.entry, entries))
-        settings, lengths = (
-            np.concatenate([self.settings[k] for k in entries]),
-            np.linalg.norm(left[:, columns], axis=0),
-        )
+        settings = np.concatenate([self.settings[k] for k in entries])
+        lengths = np.linalg.norm(left[:, columns], axis=0)
         out: dict[int, float | None] = {}
         for k in self.built[name].amplitudes:
             significant = (settings[:, k] != 0) & (lengths > 1e-3)

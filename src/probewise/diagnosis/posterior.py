@@ -249,9 +249,7 @@ class HypothesisProblem:
 
     model: Model
     recording: Recording
-    noise: (
-        NoiseEvidence  # of a fit by node of the noise model (a set of its parameters): the probable are averaged over
-    )
+    noise: NoiseEvidence  # of a fit by node of the noise model (its parameters): the probable are averaged over
     near: FloatArray | None = None  # (n_params,), onto the nearest order of whose Gaussians the prior is folded
 
     @cached_property

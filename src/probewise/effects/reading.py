@@ -77,9 +77,7 @@ def dark_level(kind: LightEffect, of: Extent) -> Effect:
         way = "higher" if mean[0] > 0 else "lower"
         return f"since the calibration every reading is {value_with_sd(abs(mean[0]), sd[0])} {way}: other light"
 
-    return kind.linear(
-        of, {"offset": "reading"}, of.small_change, lambda value, theta, plan: value + theta[:, :1], says
-    )
+    return kind.linear(of, {"offset": "reading"}, of.small_change, lambda value, theta, _: value + theta[:, :1], says)
 
 
 @light_effect("gain", Stage.GAIN, _GAIN, ("level",), is_absorbed_by_ssf=lambda plan: True)

@@ -84,15 +84,8 @@ def _late_form(about: ReferenceFit, name: str, act: Act, tried: FloatArray, says
         value, of_flag = flag(is_smooth, odds=_ODDS_OF_SMOOTH if is_smooth else 1.0)
         own: Declared = {"tau_s": (prior, about.time_unit), _SMOOTH: (of_flag, "1")}
         words = in_words(f"{about.system.simulator.reading} {says}", about.time_unit)
-        given = (
-            name,
-            Stage.LAG,
-            own,
-            ("previous",),
-            act,
-            words,
-            single_column_bank(sizes_inside(prior, N_SIZES, 1.2), value),
-        )
+        bank = single_column_bank(sizes_inside(prior, N_SIZES, 1.2), value)
+        given = (name, Stage.LAG, own, ("previous",), act, words, bank)
         variants += about.form(*given, absent={0: 0.0}, needs_rising_time=True)
     first, second = (act(about.predicted[None, :], each.entries[:, 0], about.table) for each in variants)
     apart = np.sqrt(np.nansum((first - second)[:, about.has_reading] ** 2, axis=1)) / about.sd

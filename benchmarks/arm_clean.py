@@ -21,7 +21,7 @@ import numpy as np
 from probewise.arm import carry_out, read_geometry, recording_of_readings, shipped_geometry_path
 from probewise.cli._bench import ArmName, open_arm, plan_for_lego_arm
 from probewise.diagnosis import diagnose
-from probewise.proof.estimates import estimated_share
+from probewise.proof.campaign import estimated_share
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
 
 

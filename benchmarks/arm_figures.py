@@ -54,11 +54,11 @@ def run(machine_type: type[BrickMachine], places_mm: np.ndarray, *, seed: int) -
     seconds, telegrams, told = [], [], []
     with arm:
         for place in places_mm:
-            began_s, began = clock.monotonic(), link.n_asked + link.n_told
+            began_s, began = clock.monotonic(), link.n_sent
             (standing,) = arm.orientation_rad(place[None, :])
             reading = arm.measure(Pose(float(place[0]), float(place[1]), float(standing)))
             seconds.append(clock.monotonic() - began_s)
-            telegrams.append(link.n_asked + link.n_told - began)
+            telegrams.append(link.n_sent - began)
             told.append((reading.pose.x_mm, reading.pose.y_mm, reading.pose.orientation_rad))
     stood = np.array([(s.x_mm, s.y_mm, s.height_mm) for s in stands])
     off_mm = np.hypot(*(stood[:, :2] - places_mm).T)

@@ -23,11 +23,10 @@ import numpy as np
 
 from probewise.diagnosis import diagnose, weigh_thoroughly
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
-from probewise.proof.campaign import Campaign, Result
+from probewise.proof.campaign import Campaign, Result, estimated_share
 from probewise.proof.challenge import Task
-from probewise.proof.estimates import estimated_share
 from probewise.proof.refits import NullRefit
-from probewise.proof.sensors.cases import PLANS, draw_case
+from probewise.proof.sensors import PLANS, draw_case
 
 _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
 

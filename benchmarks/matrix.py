@@ -55,9 +55,8 @@ from probewise.experiment import TRUST, left_out_after_step
 from probewise.proof.campaign import Campaign
 from probewise.proof.concealed_study import CONCEALED
 from probewise.proof.refits import NullRefit, SystemRefit
-from probewise.proof.sensors.cases import Stratum
-from probewise.proof.sensors.cases import draw_effect_of_size as conceal_in_sensor
-from probewise.proof.sensors.effects import INSIDE, NEEDS_SENSOR, CleanSetup
+from probewise.proof.sensors import INSIDE, NEEDS_SENSOR, CleanSetup, Stratum
+from probewise.proof.sensors import draw_effect_of_size as conceal_in_sensor
 from probewise.proof.study import BRIGHT, DARK, footprint_pixels
 from probewise.proof.systems.cases import (
     KINDS,
@@ -65,7 +64,7 @@ from probewise.proof.systems.cases import (
     DrawnSystem,
     SystemCase,
     draw_system,
-    noise_of_size,
+    make_noise,
     write_system_case,
 )
 from probewise.proof.systems.cases import draw_effect_of_size as conceal_in_system
@@ -173,7 +172,7 @@ def conceal_form(kind: str, what: str, rng: np.random.Generator) -> SystemCase:
                 break
     name = {"quantisation": "quantised"}.get(what, what if what in OTHER_NOISE else "white")
     seen = drawn.diagnosed_row_numbers, drawn.diagnosed_table
-    noise = noise_of_size(name, 12.0, free[seen[0]], seen[1], drawn.kind.sd, rng=rng)
+    noise = make_noise(name, free[seen[0]], seen[1], drawn.kind.sd, rng=rng)
     readings = noise.draw(free, drawn.table, rng)
     return SystemCase(
         stratum=Stratum("single", 20.0),

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from probewise.calibration import FittedSensor, posterior_mean_ssf_field
-from probewise.experiment import TRUST, experiment_for, explore, left_out_after_step, repaired_sensor
+from probewise.experiment import TRUST, Exploration, experiment_for, explore, left_out_after_step, repaired_sensor
 from probewise.proof.concealed_study import ConcealedTrial, _arm_in_concealed_world
 from probewise.proof.study import (
     BRIGHT,
@@ -29,7 +29,6 @@ from probewise.proof.study import (
     REFERENCE,
     accuracy_measures,
     experiment_of,
-    has_reached_target,
 )
 from probewise.recordings import Instrumentation
 from probewise.scene import Field
@@ -69,7 +68,7 @@ def run(sensor: FittedSensor, trial: ConcealedTrial) -> tuple[FittedSensor, dict
         )
     found = left_out_after_step(last, TRUST)
     figures = {
-        "known": has_reached_target(last, experiment),
+        "known": Exploration(experiment, (last,)).target_reached,
         "readings": last.number,
         **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
         "credible": list(found.credible_set),

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-from probewise.proof.estimates import Estimate
+from probewise.proof.campaign import Estimate
 from probewise.proof.pages import readings_needed
 
 near = (Path("docs"), Path("../docs"), Path(sys.argv[0]).resolve().parent.parent / "docs")

@@ -61,7 +61,7 @@ def test_it_goes_on_behind_the_rows_that_were_taken(told):
     first = told.take(plan, first=len(plan) - 3)
     assert len(first) == 3
     # The person is asked anew: nobody knows what happened in between.
-    assert told.asked[0].startswith("lay sheet 'quadrant_b'")
+    assert told.asked[0].text.startswith("lay sheet 'quadrant_b'")
 
 
 def test_a_plan_that_the_arm_cannot_reach_moves_nothing(told):

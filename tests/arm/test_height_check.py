@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm.height_check import check_heights
+from probewise.arm.fitting import check_heights
 from probewise.errors import ParameterError
 
 HEIGHTS = np.arange(14.0, 23.0).tolist()

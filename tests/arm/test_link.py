@@ -16,11 +16,10 @@ MOVE, MOVED = "0C 00 00 04 00 32 07 01 00 20 5A 00 00 00", "03 00 02 04 00"
 STATE = "03 00 00 06 00"
 RUNNING = "19 00 02 06 00 00 32 07 01 00 20 5A 00 00 00" + 12 * " 00"
 FENCE = (BATTERY, (0.06, VOLTS))
-# Of a question with its repeats and three fences each, if bytes never cease to come.
-LONGEST_S = (1 + Timing().n_repeats) * 4 * (2 * Timing().turn_s + 2 * Timing().answer_s + Timing().silence_s)
+LONGEST_S = Timing().longest_s
 
-read = t.GetInputValues(1)
-move = t.SetOutputState(0, 50, 7, 1, 0, 0x20, 90)
+read = t.get_input_values(1)
+move = t.set_output_state(0, 50, 7, 1, run_state=0x20, limit_counts=90)
 
 
 @pytest.fixture
@@ -109,7 +108,7 @@ def test_a_move_is_sent_once_whatever_becomes_of_its_answer(link, script, answer
         link.ask(move)
     script.expect(*FENCE)
     script.expect(STATE, (0.06, RUNNING))
-    assert link.ask(t.GetOutputState(0)).limit_counts == 90
+    assert link.ask(t.get_output_state(0)).limit_counts == 90
 
 
 def test_a_question_is_given_up_after_three_times(link, script, clock):
@@ -178,11 +177,10 @@ def test_the_radio_is_given_time_to_turn_round(link, script):
     link.ask(read)
     stop = "0C 00 80 04 FF" + 9 * " 00"
     script.expect(stop)
-    link.tell(t.SetOutputState(255, 0, 0, 0, 0, 0, 0))
+    link.tell(t.set_output_state(255))
     script.expect(stop)
-    link.tell(t.SetOutputState(255, 0, 0, 0, 0, 0, 0))
+    link.tell(t.set_output_state(255))
     np.testing.assert_allclose(np.diff(script.sent_at[2:]), [0.06, 0.06, 0.06, 0.08, 0.015], atol=1e-9)
-    assert (link.n_asked, link.n_told) == (6, 2)
 
 
 def test_a_long_run_keeps_the_brick_awake(link, script, clock):

@@ -279,7 +279,7 @@ def taken(own, asked, plan, **options):
 def test_a_plan_is_carried_out_with_a_person_who_lays_patterns_and_turns_the_sensor(tmp_path):
     asked, own = [], Own(lambda pose: {"value": 2 * pose.x_mm, "lux": pose.y_mm})
     readings = taken(own, asked, plan())
-    assert [text.split(",")[0].split(" at (")[0] for text in asked] == [
+    assert [str(request).split(",")[0].split(" at (")[0] for request in asked] == [
         "lay sheet 'edge'",
         "turn the sensor on its mount to 60 degrees",
         "lay sheet 'corner'",

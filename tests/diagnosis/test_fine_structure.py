@@ -38,7 +38,7 @@ def noise_free(spot, plan) -> Recording:
 
 @pytest.mark.parametrize("plan", [paper_plan(), two_way_plan()], ids=["paper", "two_way"])
 def test_it_takes_up_what_a_free_form_leaves_of_a_ring(plan):
-    recording = noise_free(ring_spot(4.0, 1.2, pixel_mm=0.5), plan)
+    recording = noise_free(ring_spot(4.0, 1.2, center_mm=(0.0, 1.5), off_axis=0.4, pixel_mm=0.5), plan)
     found = fitted(recording)
     slopes = np.concatenate([found.slopes, fine_structure_slopes(found.model, found.z, usable(recording))], axis=1)
     z = np.pad(found.z, (0, slopes.shape[1] - len(found.z)))

@@ -21,7 +21,7 @@ def clock():
 def brick(clock):
     """A light sensor at port 2 over something that reads 57.5 %."""
     sensors = [empty_port, LightSensor(lambda lit: 57.5 if lit else 28.75, clock), empty_port, empty_port]
-    return Brick(clock, sensors=sensors, name="ARM1", programs=("arm.rxe",))
+    return Brick(clock, sensors=sensors)
 
 
 @pytest.fixture

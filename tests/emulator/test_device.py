@@ -41,11 +41,11 @@ def _made_ns(device):
 
 def test_clients_come_and_go_and_ctrl_c_ends_it(emulator, tmp_path):
     log = tmp_path / "log"
-    with emulator("--log", str(log), "--name", "ARM1") as running:
+    with emulator("--log", str(log)) as running:
         for _ in range(3):
             assert exchanged(running.device, BATTERY, len(ANSWER)) == ANSWER
         info = exchanged(running.device, bytes.fromhex("02 00 01 9B"), 35)
-        assert info[5:10] == b"ARM1\0"
+        assert info[5:10] == b"NXT\0\0"
         made_ns = _made_ns(running.device)
         running.process.send_signal(signal.SIGINT)
         _, complaint = running.process.communicate(timeout=LIMIT_S)
@@ -111,7 +111,6 @@ def test_a_link_never_replaces_a_file(tmp_path, capsys):
         (["--scene", "1,2"], "--scene"),
         (["--scene", "blob:1,2,3"], "--scene"),
         (["--sleep", "7"], "sleep_min"),
-        (["--name", "a name that is too long"], "name"),
         (["--geometry", "nowhere.toml"], "nowhere.toml"),
         (["--sensor", "nowhere.json"], "nowhere.json"),
         (["--seed", "-1"], "--seed"),

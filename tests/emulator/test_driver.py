@@ -8,7 +8,7 @@ import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.emulator import Faults, VirtualLine, read_geometry, set_up_bench, shipped_geometry_path
+from probewise.emulator import Faults, VirtualLine, read_geometry, set_up_bench
 from probewise.errors import LinkError
 from probewise.recordings import Disc
 from probewise.world.shipped import true_world
@@ -44,7 +44,7 @@ def some_places(n):
 
 
 def bench_over_circle(clock):
-    return set_up_bench(read_geometry(shipped_geometry_path()), WORLD, CIRCLE, clock, seed=SEED)
+    return set_up_bench(read_geometry(arm.shipped_geometry_path()), WORLD, CIRCLE, clock, seed=SEED)
 
 
 @pytest.mark.parametrize("play", [True, False])

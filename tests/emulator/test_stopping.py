@@ -11,7 +11,7 @@ import pytest
 from arm_faults import SENSOR
 
 from probewise.arm.nxt import Brick
-from probewise.arm.nxt.telegram import IDLE, NO_SENSOR, GetInputValues, GetOutputState
+from probewise.arm.nxt.telegram import IDLE, NO_SENSOR, get_input_values, get_output_state
 from probewise.calibration import write_sensor
 
 pytestmark = [
@@ -76,8 +76,8 @@ def test_nothing_stays_on_whatever_stops_which_command_when(task, stop, emulator
             assert "Traceback" not in said
             os.close(terminal)
         brick = Brick.open(running.device)
-        motors = [brick.link.ask(GetOutputState(port)) for port in range(3)]
-        lights = [brick.link.ask(GetInputValues(port)) for port in range(4)]
+        motors = [brick.link.ask(get_output_state(port)) for port in range(3)]
+        lights = [brick.link.ask(get_input_values(port)) for port in range(4)]
         brick.link.close()
         assert [(motor.power, motor.run_state) for motor in motors] == [(0, IDLE)] * 3
         assert not any(motor.mode for motor in motors)  # neither braked nor held

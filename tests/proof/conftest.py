@@ -18,7 +18,7 @@ def hidden(name, size=8.0, *, cosines=None, on_noise=False, in_vocabulary=True, 
 def case(kind="clean", size=0.0, *, truth=(), hides=(), said=None, p=0.97, **others):
     said = list(truth) if said is None else list(said)
     verdict = {(): "clean", ("unknown",): "unknown"}.get(tuple(said), "named")
-    scan = {"null": -120.0, "repaired": -100.0, "right": -100.0, "true": -100.0}
+    scan = {"null": -120.0, "repaired": -100.0, "right": -100.0}
     return {
         "kind": kind,
         "size": size,
@@ -51,8 +51,8 @@ def case(kind="clean", size=0.0, *, truth=(), hides=(), said=None, p=0.97, **oth
 def system_case(kind="clean", size=0.0, *, truth=(), gains=(40.0, 40.0), **others):
     """Return a case of a system, with gains in nats over the null, of the repaired and of the right model."""
     repaired, right = (-100.0 + gain / 2 for gain in gains)
-    run = {"null": -100.0, "repaired": repaired, "right": right, "true": right}
-    of_system = {"system": "tank", "law": True, "formula": False, "held_out": {"inside": run, "beyond": dict(run)}}
+    run = {"null": -100.0, "repaired": repaired, "right": right}
+    of_system = {"system": "tank", "law": True, "held_out": {"inside": run, "beyond": dict(run)}}
     hypotheses = {"hypotheses": [[list(others.get("said", truth)), others.get("p", 0.97)], [["lag"], 0.03]]}
     return case(kind, size, truth=truth, **(of_system | hypotheses | others))
 

@@ -13,8 +13,8 @@ from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 from probewise.proof import pages as of_campaigns
+from probewise.proof.campaign import Estimate, estimated_share
 from probewise.proof.concealed_study import ConcealedRow
-from probewise.proof.estimates import Estimate, estimated_share
 from probewise.recordings import read_recording, shipped
 from probewise.report import plots
 from probewise.sensor import SSFField

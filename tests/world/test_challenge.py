@@ -9,12 +9,19 @@ import pytest
 from scipy.stats import kstest
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.cases import (
+from probewise.proof.sensors import (
+    INSIDE,
+    NEEDS_SENSOR,
     NOISE_LEVELS,
     NOISE_NAMES,
+    OUTSIDE,
     PLANS,
+    SAMPLERS,
+    SINGLES,
     SSFS,
     WHEEL,
+    CleanSetup,
+    CovariateRegion,
     Stratum,
     draw_case,
     draw_plan_with_displaced_patterns,
@@ -22,15 +29,6 @@ from probewise.proof.sensors.cases import (
     held_out_plans,
     held_out_recordings,
     stratum_of,
-)
-from probewise.proof.sensors.effects import (
-    INSIDE,
-    NEEDS_SENSOR,
-    OUTSIDE,
-    SAMPLERS,
-    SINGLES,
-    CleanSetup,
-    CovariateRegion,
 )
 from probewise.recordings import fingerprint, read_recording, write_recording
 

@@ -11,7 +11,6 @@ from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane
 from probewise.world import Blob, World, gaussian_spot
 from probewise.world import concealed as known
-from probewise.world import unlisted as strange
 
 CENTER, SD, RHO = (0.4, 1.5), (4.0, 2.5), 0.2
 SPOT = gaussian_spot([Blob(1.0, CENTER, SD, RHO)], pixel_mm=0.4)
@@ -78,19 +77,19 @@ FORMULAS = {
 
 FORMULAS |= {
     "thermal_gain": (
-        strange.thermal_gain(0.05, 200.0, (0.1, 1.0, 2.0)),
+        known.thermal_gain(0.05, 200.0, (0.1, 1.0, 2.0)),
         lambda y, p: 10 + (y - 10) * (1 + 0.05 * _waves(p.time_s, 200, (0.1, 1.0, 2.0))),
     ),
     "cross_talk": (
-        strange.cross_talk(0.1, 0.3),
+        known.cross_talk(0.1, 0.3),
         lambda y, p: 10 + (y - 10) * (1 + 0.1 * np.cos(2 * p.orientation_rad + 0.3)),
     ),
-    "floor": (strange.floor(0.2), lambda y, p: np.where(y - 10 < 0.2 * 50, 10.0, y)),
+    "floor": (known.floor(0.2), lambda y, p: np.where(y - 10 < 0.2 * 50, 10.0, y)),
     "peak_memory": (
-        strange.peak_memory(0.1),
+        known.peak_memory(0.1),
         lambda y, p: y + 0.1 * np.array([(y[: k + 1][p.scan[: k + 1] == p.scan[k]] - 10).max() for k in range(len(y))]),
     ),
-    "gain_loss": (strange.gain_loss(0.02, 2.0), lambda y, p: 10 + (y - 10) * np.clip(1 - 0.01 * p.time_s, 0, None)),
+    "gain_loss": (known.gain_loss(0.02, 2.0), lambda y, p: 10 + (y - 10) * np.clip(1 - 0.01 * p.time_s, 0, None)),
 }
 
 
@@ -115,12 +114,12 @@ STANDS = {
         lambda p: _moved_along_x(p, 0.5 * np.sin(2 * np.pi * p.x_mm / 7 + 0.4)),
     ),
     "sensor_tilt": (known.sensor_tilt(0.6, -0.3), lambda p: places(p) + np.array([0.6, -0.3])),
-    "bent_rail": (strange.bent_rail(0.5), lambda p: _moved_along_x(p, 0.005 * p.x_mm**2)),
-    "twisted_rail": (strange.twisted_rail(0.5), lambda p: _moved_along_x(p, 0.0005 * p.x_mm**3)),
-    "place_step": (strange.place_step(0.5, 1.0), lambda p: _moved_along_x(p, np.where(p.x_mm > 1, 0.5, 0))),
-    "stick_slip": (strange.stick_slip(0.5, 8.0, 0.25), lambda p: _moved_along_x(p, np.mod(p.x_mm + 2, 8) / 8 - 0.5)),
+    "bent_rail": (known.bent_rail(0.5), lambda p: _moved_along_x(p, 0.005 * p.x_mm**2)),
+    "twisted_rail": (known.twisted_rail(0.5), lambda p: _moved_along_x(p, 0.0005 * p.x_mm**3)),
+    "place_step": (known.place_step(0.5, 1.0), lambda p: _moved_along_x(p, np.where(p.x_mm > 1, 0.5, 0))),
+    "stick_slip": (known.stick_slip(0.5, 8.0, 0.25), lambda p: _moved_along_x(p, np.mod(p.x_mm + 2, 8) / 8 - 0.5)),
     "play_of_axes": (
-        strange.play_of_axes(2.0, 1.0),
+        known.play_of_axes(2.0, 1.0),
         lambda p: places(p) - np.array([[1, 0], [-1, 0], [1, 0], [0, 0.5]])[p.scan],
     ),
 }
@@ -312,7 +311,7 @@ def test_a_sagging_battery_needs_its_voltage(plan):
 def test_slipped_paper_lies_elsewhere_from_then_on(plan, clean):
     at_s = float(plan.time_s[30])
     moved = read(replace(plan, patterns={**plan.patterns, "boundary": HalfPlane(0.1, 1.5)}))
-    got = read(plan, strange.slipped_paper(0.8, at_s))
+    got = read(plan, known.slipped_paper(0.8, at_s))
     boundary = plan.pattern == 0
     expected = np.where(plan.time_s > at_s, moved, clean)
     np.testing.assert_allclose(got[boundary], expected[boundary], atol=1e-9)
@@ -320,11 +319,11 @@ def test_slipped_paper_lies_elsewhere_from_then_on(plan, clean):
 
 def test_a_ghost_is_a_faint_second_look_from_elsewhere(plan, clean):
     beside = read(replace(plan, x_mm=plan.x_mm + 6.0, y_mm=plan.y_mm - 2.0))
-    np.testing.assert_allclose(read(plan, strange.ghost(0.1, 6.0, -2.0)), 0.9 * clean + 0.1 * beside, atol=1e-9)
+    np.testing.assert_allclose(read(plan, known.ghost(0.1, 6.0, -2.0)), 0.9 * clean + 0.1 * beside, atol=1e-9)
 
 
 def test_each_rise_is_followed_by_a_pulse_that_dies_off(plan, clean):
-    got = read(plan, strange.after_glow(4.0, 6.0, 35.0))
+    got = read(plan, known.after_glow(4.0, 6.0, 35.0))
     expected = clean.copy()
     for k in range(1, len(plan)):
         if clean[k - 1] <= 35 < clean[k]:
@@ -336,7 +335,7 @@ def test_each_rise_is_followed_by_a_pulse_that_dies_off(plan, clean):
 
 def test_a_chirp_swings_ever_faster(plan, clean):
     """The phase is the integral of the frequency: summed up in small steps."""
-    effect = strange.chirp(2.0, 0.01, 0.0005, 0.4)
+    effect = known.chirp(2.0, 0.01, 0.0005, 0.4)
     fine = np.linspace(0, plan.time_s[-1], 200_001)
     hz = 0.01 + 0.0005 * fine
     turns = np.concatenate([[0.0], np.cumsum((hz[1:] + hz[:-1]) / 2 * np.diff(fine))])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm, t
 
-from probewise.proof.sensors.cases import OTHER_NOISE, with_noise_model
+from probewise.proof.sensors import OTHER_NOISE, with_noise_model
 from probewise.recordings import Plan, Ramp
 from probewise.world import World, gaussian_spot
 from probewise.world import concealed as known

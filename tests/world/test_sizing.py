@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.effects import CleanSetup, amplitude_of_size
+from probewise.proof.sensors import CleanSetup, amplitude_of_size
 from probewise.world import World, gaussian_spot
 from probewise.world import concealed as known
 from probewise.world.spots import Blob

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Uniform, paper_plan, two_way_plan
-from probewise.world import Blob, World, gaussian_spot, simulate
+from probewise.world import Blob, World, gaussian_spot
 from probewise.world import concealed as known
 from probewise.world.stages import acts_at
 
@@ -57,7 +57,7 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
 
 
 def test_readings_are_rounded_to_the_step():
-    readings = simulate(paper_plan(), world(step=0.5), rng=np.random.default_rng(7)).readings
+    readings = world(step=0.5).simulate(paper_plan(), rng=np.random.default_rng(7)).readings
     np.testing.assert_array_equal(readings * 2, np.round(readings * 2))
 
 

@@ -1,7 +1,7 @@
 """Instruments that take readings: one interface, a simulated arm and the LEGO arm (paper, section 2.1)."""
 
 from probewise.arm.carry_out import RequestToPerson, carry_out, readings_of_recording, recording_of_readings
-from probewise.arm.geometry import Geometry, Joint
+from probewise.arm.geometry import Geometry, Joint, SoftLimits
 from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import (
     FIELD_MM,
@@ -10,13 +10,11 @@ from probewise.arm.instrument import (
     Reach,
     Reading,
     ReadingScale,
-    Workspace,
     require_within_reach,
 )
-from probewise.arm.lego import LegoArm, percent_to_lego_units
-from probewise.arm.machine import DryRun, Machine, SoftLimits
+from probewise.arm.lego import DryRun, LegoArm, percent_to_lego_units
 from probewise.arm.own import Measures, OwnInstrument, as_instrument
-from probewise.arm.simulated import Light, SimulatedArm, Speed
+from probewise.arm.simulated import Light, SimulatedArm, Speed, Workspace
 
 __all__ = [
     "FIELD_MM",
@@ -26,7 +24,6 @@ __all__ = [
     "Joint",
     "LegoArm",
     "Light",
-    "Machine",
     "Measures",
     "OwnInstrument",
     "Pose",

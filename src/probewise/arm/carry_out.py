@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,23 +25,20 @@ BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 PATTERN = "field"  # under readings of no plan
 
 
-class RequestToPerson(str):
-    """A request to the person at the bench: a sentence, and attributes for a simulated bench.
+@dataclass(frozen=True)
+class RequestToPerson:
+    """A request to the person at the bench: a sentence, and for a simulated bench what is to be done.
 
     `pattern` is the name of the pattern to be laid under the arm, `turned_rad` the angle to which the sensor is to be
     turned on its mount, anticlockwise from its usual one; None: unchanged.
     """
 
-    __slots__ = ("pattern", "turned_rad")
+    text: str
+    pattern: str | None = None
+    turned_rad: float | None = None
 
-    pattern: str | None
-    turned_rad: float | None
-
-    def __new__(cls, text: str, *, pattern: str | None = None, turned_rad: float | None = None) -> RequestToPerson:
-        """Build a request from its sentence."""
-        request = super().__new__(cls, text)
-        request.pattern, request.turned_rad = pattern, turned_rad
-        return request
+    def __str__(self) -> str:
+        return self.text
 
 
 def carry_out(
@@ -61,7 +59,7 @@ def carry_out(
     different to a turned one.
 
     `arm` is entered already, or any object with a `measure(pose)`, see `as_instrument`; `origin_mm` the place of the
-    plan's origin on the field, lab frame; `ask` shows a `RequestToPerson` (a str) to a person and returns when it is
+    plan's origin on the field, lab frame; `ask` shows a `RequestToPerson` to a person and returns when it is
     done; rows before `first` have been taken. Yields a reading for each row, in the plan's frame, at the place and
     orientation that the arm measured, or at the planned ones. Raises ReachError if a row is out of the arm's reach
     (nothing moves); ParameterError if the plan needs the LED off, or a height at which this arm does not read.

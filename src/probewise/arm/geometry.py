@@ -8,6 +8,7 @@ nadir); about the vertical, the sensor turns with the base alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Side
-from probewise.errors import ShapeError, require
+from probewise.errors import ReachError, ShapeError, require
 
 JOINTS = ("base", "shoulder", "elbow")
 """The joints in the order of the columns of all arrays of angles."""
@@ -273,6 +274,56 @@ class Geometry:
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
         within = away[self._room_to_approach_mask(places)]
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
+
+
+N_CHECKED = 33  # points checked along a move
+
+
+class SoftLimits:
+    """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts."""
+
+    def __init__(self, geometry: Geometry) -> None:
+        self._geometry = geometry
+        self._counts = [0, 0, 0]
+
+    def record_present_count(self, joint: int, count: int) -> None:
+        """Record the present count of one joint's motor."""
+        self._counts[joint] = count
+
+    @property
+    def last_counts(self) -> tuple[int, int, int]:
+        """Last recorded counts of the motors: base, shoulder, elbow; 0 at the start."""
+        base, shoulder, elbow = self._counts
+        return base, shoulder, elbow
+
+    def heights_along_move_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
+        """Return the sensor's height at 33 points along a move of one joint to the count `to`, shape (33,).
+
+        `counts` are those of all motors at the start, but for the moving joint's where `here` is given.
+        """
+        joints = self._geometry.joints
+        way = np.empty((N_CHECKED, 3))
+        way[:] = [mechanics.angle_at(count) for mechanics, count in zip(joints, counts, strict=True)]
+        start = joints[joint].angle_at(counts[joint] if here is None else here)
+        way[:, joint] = np.linspace(start, joints[joint].angle_at(to), N_CHECKED)
+        return np.asarray(self._geometry.position_mm(way)[:, 2])
+
+    def require_allowed_move(self, joint: int, here: int, to: int) -> None:
+        """Raise ReachError if a move of one joint from count `here` to `to` leaves the allowed range.
+
+        The others are at rest. A joint beyond its limits may move back, and a sensor below the lowest height may rise.
+        """
+        geometry, mechanics = self._geometry, self._geometry.joints[joint]
+        angle, start = mechanics.angle_at(to), mechanics.angle_at(here)
+        low, high = min(mechanics.low_rad, start), max(mechanics.high_rad, start)
+        if not low <= angle <= high:
+            allowed = f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees"
+            raise ReachError(JOINTS[joint], f"{math.degrees(angle):.1f} degrees", allowed)
+        heights = self.heights_along_move_mm(self.last_counts, joint, to, here)
+        if heights.min() < min(geometry.lowest_mm, float(heights[0])):
+            moving = f"the sensor's height while the {JOINTS[joint]} moves"
+            allowed = f"{geometry.lowest_mm:g} mm or more; is the arm where its counters say? home it"
+            raise ReachError(moving, f"{heights.min():.0f} mm", allowed)
 
 
 def _position_mm(arm: Geometry, angles_rad: FloatArray, links_mm: Any, axis_mm: Any, shoulder_mm: Any) -> FloatArray:

@@ -138,17 +138,6 @@ class ReachablePlaces(Protocol):
         """Describe the allowed places in words."""
 
 
-class Workspace(ReachablePlaces, Protocol):
-    """Reachable places of an arm, and the sensor's orientation there: a `Reach`, or the `Geometry` of a real arm."""
-
-    @property
-    def rest_mm(self) -> tuple[float, float]:
-        """Rest position (x, y) of the sensor."""
-
-    def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
-        """Return the orientation at places, (n_places, 2), of a sensor that is not turned: (n_places,)."""
-
-
 def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
     """Raise ReachError if any place, (n_places, 2), is out of reach, before anything moves.
 

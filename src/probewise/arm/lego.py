@@ -8,17 +8,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_finite_number
 from probewise._signals import defer_signals
-from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
+from probewise.arm.geometry import JOINTS, ROOM_COUNTS, Geometry, SoftLimits, wrapped_to_pi
 from probewise.arm.instrument import Clock, Pose, Reading, ReadingScale, Side, require_within_reach
-from probewise.arm.machine import Machine
 from probewise.errors import LinkError, ReachError
+
+if TYPE_CHECKING:
+    from probewise.arm.nxt.brick import BrickMachine
 
 BASE, SHOULDER, ELBOW = range(3)
 N_RISES = 3  # coarse moves, of which the first one or two may stop short
@@ -59,7 +61,9 @@ class LegoArm:
     # A person turns the sensor, and it reads at one height.
     turns = lifts = False
 
-    def __init__(self, machine: Machine, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0) -> None:
+    def __init__(
+        self, machine: BrickMachine | DryRun, geometry: Geometry, *, clock: Clock = time, start_s: float = 0.0
+    ) -> None:
         self._machine, self.geometry, self._clock = machine, geometry, clock
         self.reach, self.read_height_mm = geometry, geometry.read_height_mm
         self._zero_s = clock.monotonic() - start_s
@@ -334,3 +338,54 @@ class LegoArm:
     def _move_joint_near(self, joint: int, counts: int) -> None:
         self._machine.move_near(joint, counts)
         self._arrived[joint] = 0
+
+
+class DryRun:
+    """A machine of which nothing moves: `say` is called with a line per commanded move, and nothing is read."""
+
+    def __init__(self, geometry: Geometry, say: Callable[[str], None]) -> None:
+        self._geometry, self._say = geometry, say
+        self.limits = SoftLimits(geometry)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def move_to(self, joint: int, goal: int, side: Side) -> None:
+        self._check_and_print_move(joint, goal, "up" if side > 0 else "down")
+
+    def move_near(self, joint: int, goal: int) -> None:
+        self._check_and_print_move(joint, goal, "roughly")
+
+    def release(self) -> None:
+        self._say("release all motors")
+
+    def find_stop(self, joint: int, side: Side) -> None:
+        self.limits.record_present_count(joint, self._geometry.joints[joint].stop_counts)
+        self._say(f"{JOINTS[joint]:<8} {'up' if side > 0 else 'down'} to its stop")
+
+    def reset(self, joints: Sequence[int]) -> None:
+        for joint in joints:
+            self.limits.record_present_count(joint, 0)
+        self._say(f"set to 0 the counters of {', '.join(JOINTS[joint] for joint in joints)}")
+
+    def read_percent(self) -> float:
+        self._say("read the light sensor")
+        return math.nan
+
+    def battery_mv(self) -> float:
+        """Return NaN: there is no battery."""
+        return math.nan
+
+    def keep_awake(self) -> None:
+        """Do nothing."""
+
+    def _check_and_print_move(self, joint: int, goal: int, how: str) -> None:
+        here = self.limits.last_counts[joint]
+        self.limits.require_allowed_move(joint, here, goal)
+        self.limits.record_present_count(joint, goal)
+        if goal != here:
+            angle = math.degrees(self._geometry.joints[joint].angle_at(goal))
+            self._say(f"{JOINTS[joint]:<8} to {angle:7.1f} degrees, motor from {here} to {goal} counts, {how}")

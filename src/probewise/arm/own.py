@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_finite_number, require_callable, require_like
@@ -143,10 +144,9 @@ class OwnInstrument:
         if own is None:
             return np.ones(len(places_mm), dtype=np.bool_)
         with self._errors_located("reachable"):
-            held = np.asarray(_array_per_place("reachable", own(places_mm), len(places_mm), "True or False"))
-            if held.dtype.kind not in "biu":
-                raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
-            return held.astype(np.bool_)
+            return _array_per_place("reachable", own(places_mm), len(places_mm), "biu", "True or False").astype(
+                np.bool_
+            )
 
     contains = reachable
     """Its name in `ReachablePlaces`."""
@@ -157,7 +157,9 @@ class OwnInstrument:
         with self._errors_located("orientation_rad"):
             angles = own(places_mm) if callable(own) else own
             allowed = "a finite number of radians"
-            return _floats_per_place("orientation_rad", angles, len(places_mm), allowed, finite=True)
+            turns = _array_per_place("orientation_rad", angles, len(places_mm), "biuf", allowed).astype(np.float64)
+            require(np.isfinite(turns).all(), "what orientation_rad returned", angles, allowed)
+            return np.asarray(turns)
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Return the seconds to move from `start` to each place and read, (n_places,); default: 100 mm/s plus 1.2 s."""
@@ -167,7 +169,8 @@ class OwnInstrument:
             return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
         with self._errors_located("travel_s"):
             allowed = "seconds, finite, 0 or more; nan out of reach"
-            seconds = _floats_per_place("travel_s", own(start, places_mm), len(places_mm), allowed, finite=False)
+            found = _array_per_place("travel_s", own(start, places_mm), len(places_mm), "biuf", allowed)
+            seconds: FloatArray = found.astype(np.float64)
             wrong = ~((seconds >= 0) & (seconds < math.inf))
             if wrong.any() and (wrong[self.reachable(places_mm)].any() or (seconds[wrong] < math.inf).any()):
                 raise ParameterError("what travel_s returned", float(seconds[wrong][0]), allowed)
@@ -187,23 +190,23 @@ class OwnInstrument:
         if isinstance(found, Reading):
             require(not math.isinf(found.value), f"value{_RETURNED}", found.value, _OR_NAN)
             own = {"time_s": found.time_s} | {name: getattr(found.pose, name) for name in _OF_THE_POSE}
-            known = {name: _checked_covariate(name, number) for name, number in found.covariates.items()}
-            reading = dataclasses.replace(found, covariates=known) if known else found
+            reading, known = found, found.covariates
         else:
+            allowed = f'a dict with "value", or a number: {_A_READING}'
+            require(not isinstance(found, Mapping) or "value" in found, "what measure returned", found, allowed)
+            told = found if isinstance(found, Mapping) else {}
+            value = _number(f"value{_RETURNED}" if told else "what measure returned", told.get("value", found))
             own = {"time_s": self._clock.monotonic() - self._zero_s}
             own |= {name: getattr(pose, name) for name in _OF_THE_POSE}
-            if not isinstance(found, Mapping):
-                return Reading(_checked_value("what measure returned", found), pose, own["time_s"])
-            require("value" in found, "what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
-            known = {
-                name: _checked_covariate(name, number) for name, number in found.items() if name not in (*own, "value")
-            }
-            own = {name: _float_or_nan(name, found.get(name, usual)) for name, usual in own.items()}
-            there = Pose(own["x_mm"], own["y_mm"], own["orientation_rad"], pose.height_mm)
-            reading = Reading(_checked_value(f"value{_RETURNED}", found["value"]), there, own["time_s"], known)
+            known = {name: number for name, number in told.items() if name not in (*own, "value")}
+            own = {name: _number_or_nan(name, told.get(name, usual)) for name, usual in own.items()}
+            there = dataclasses.replace(pose, **{name: own[name] for name in _OF_THE_POSE})
+            reading = Reading(value, there, own["time_s"])
         for name, number in own.items():
             checked_finite_number(f"{name}{_RETURNED}", number)
-        return reading
+        return dataclasses.replace(
+            reading, covariates={n: _checked_covariate(n, number) for n, number in known.items()}
+        )
 
     @contextlib.contextmanager
     def _errors_located(self, what: str) -> Iterator[None]:
@@ -259,16 +262,17 @@ def require_measures(name: str, own: object) -> None:
     require_callable(f"measure of {name}", getattr(own, "measure", None), "a method measure(pose)")
 
 
-def _item(found: object) -> object:
-    """Return a NumPy scalar or array without dimensions as Python's own number, anything else unchanged."""
-    return found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
+def _number(name: str, found: object, allowed: str = _A_READING, *, may_be_nan: bool = False) -> float:
+    """Return a number, also one of NumPy, as a float; ParameterError unless it is finite, or NaN where that may be."""
+    number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
+    wrong = not isinstance(number, Real) or math.isinf(number)
+    if wrong or not (may_be_nan or (math.isfinite(number) and not isinstance(number, bool))):  # type: ignore[arg-type]
+        raise ParameterError(name, found, allowed)
+    return float(number)  # type: ignore[arg-type]
 
 
-def _checked_value(name: str, found: object) -> float:
-    number = _item(found)
-    if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
-        raise ParameterError(name, found, _A_READING)
-    return float(number)
+def _number_or_nan(name: str, found: object) -> float:
+    return _number(f"{name}{_RETURNED}", found, _OR_NAN, may_be_nan=True)
 
 
 def _checked_covariate(name: object, number: object) -> float:
@@ -281,28 +285,16 @@ def _checked_covariate(name: object, number: object) -> float:
         raise ParameterError("a name in what measure returned", name, allowed)
     if not isinstance(name, str) or not name.isprintable() or name != name.strip() or not name:
         raise ParameterError("a name in what measure returned", name, "a printable text without blanks around it")
-    return _float_or_nan(name, number)
+    return _number_or_nan(name, number)
 
 
-def _float_or_nan(name: str, number: object) -> float:
-    number = _item(number)
-    if not isinstance(number, Real) or math.isinf(number):
-        raise ParameterError(f"{name}{_RETURNED}", number, _OR_NAN)
-    return float(number)
-
-
-def _array_per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
-    """Return one value per place, or one for all repeated, as an array (n_places,); ShapeError for another shape."""
+def _array_per_place(name: str, found: object, n_places: int, kinds: str, allowed: str) -> NDArray[Any]:
+    """Return one value per place, or one for all repeated, as an array (n_places,) of one of NumPy's `kinds`."""
     array = np.asarray(found)
     if array.ndim == 0:
         array = np.full(n_places, array)
     if array.shape != (n_places,):
         raise ShapeError(f"{name} returned shape {array.shape}; allowed: ({n_places},), {allowed} for each place")
-    return array
-
-
-def _floats_per_place(name: str, found: object, n_places: int, allowed: str, *, finite: bool) -> FloatArray:
-    array = _array_per_place(name, found, n_places, allowed)
-    if array.dtype.kind not in "biuf" or (finite and not np.isfinite(array).all()):
+    if array.dtype.kind not in kinds:
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
-    return np.asarray(array, dtype=np.float64)
+    return array

@@ -11,10 +11,14 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import checked_number, require_callable, require_like
-from probewise.arm.instrument import Pose, Reach, Reading, ReadingScale, Workspace, require_pose, require_within_reach
+from probewise.arm.geometry import Geometry
+from probewise.arm.instrument import Pose, Reach, Reading, ReadingScale, require_pose, require_within_reach
 from probewise.errors import ReachError, ShapeError, require
 
 LEGO = ReadingScale()
+
+Workspace: TypeAlias = Reach | Geometry
+"""Reachable places of an arm, and the sensor's orientation there; a `Geometry` is that of a real arm."""
 
 Light: TypeAlias = Callable[[Pose, float, float], float]
 """Function of pose, time (s) and height (mm); returns the sensor's reading."""

@@ -31,6 +31,8 @@ from probewise.arm import (
     ReadingScale,
     RequestToPerson,
     SimulatedArm,
+    read_geometry,
+    shipped_geometry_path,
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli._common import CommandError, print_result, print_warning, say, write_to_terminal
@@ -201,8 +203,9 @@ def open_emulated_arm_and_bench(
     The clock runs as fast as possible. When the arm's `with` block ends, it warns if the sensor hit the table.
     """
     clock = emulator.VirtualClock()
-    numbers = emulator.read_geometry(Path(geometry_file or emulator.shipped_geometry_path()))
-    bench = emulator.set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
+    built = Path(geometry_file or shipped_geometry_path())
+    read_geometry(built)  # the emulator takes numbers from a file without a fault
+    bench = emulator.set_up_bench(emulator.read_geometry(built), world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(emulator.VirtualLine(bench.radio, clock), clock=clock), clock=clock)
 
     class TableContactReporter(LegoArm):

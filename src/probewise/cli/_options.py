@@ -562,7 +562,6 @@ def _emulate_nxt(to: argparse.ArgumentParser) -> None:
         "minute; may be given several times"
     )
     add(to, "--fault NAME[=RATE]", about, action="append", default=[])
-    add(to, "--name", "the brick's name, up to 14 characters (default NXT)", default="NXT")
     about = "minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)"
     add(to, "--sleep MIN", about, type=int, default=10)
     add(to, "--link PATH", "a symbolic link to keep on the device, also after a disconnection", type=parse_path)

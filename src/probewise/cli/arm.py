@@ -21,10 +21,16 @@ from probewise.arm import (
     require_within_reach,
     shipped_geometry_path,
 )
-from probewise.arm.fitting import fit_geometry, read_turns_and_places, spread_mark_places, write_marks
+from probewise.arm.fitting import (
+    LEAST_P,
+    check_heights,
+    fit_geometry,
+    read_turns_and_places,
+    spread_mark_places,
+    write_marks,
+)
 from probewise.arm.geometry import JOINTS
 from probewise.arm.geometry_file import text_with_fitted_values
-from probewise.arm.height_check import LEAST_P, check_heights
 from probewise.arm.nxt import percent_from_counts
 from probewise.cli import _bench, _record
 from probewise.cli._common import CommandError, message_to_resume, print_result, print_warning, say

@@ -14,6 +14,7 @@ from pathlib import Path
 from probewise import emulator
 from probewise._signals import reporting_what_is_kept
 from probewise._writing import checked_output_file
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli._bench import world_and_scale
 from probewise.cli._common import print_result, say
 from probewise.errors import LinkError, ParameterError
@@ -23,10 +24,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Emulate the LEGO brick until Ctrl-C, or until it goes to sleep; return the exit status."""
     if not hasattr(os, "openpty"):
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
-    from probewise.emulator.pty import Terminal, serve
+    from probewise.emulator.radio import Terminal, serve
 
     log = arguments.log and checked_output_file(arguments.log, arguments.sensor, arguments.geometry, option="--log")
-    geometry = emulator.read_geometry(arguments.geometry or emulator.shipped_geometry_path())
+    file = arguments.geometry or shipped_geometry_path()
+    read_geometry(file)  # the emulator takes numbers from a file without a fault
+    geometry = emulator.read_geometry(file)
     surface = emulator.parse_scene(arguments.scene)
     faults = emulator.Faults.parse(arguments.fault)
     world, _ = world_and_scale(arguments.sensor)
@@ -37,7 +40,6 @@ def run(arguments: argparse.Namespace) -> int:
             surface,
             time.monotonic,
             seed=arguments.seed,
-            name=arguments.name,
             faults=faults,
             sleep_min=arguments.sleep,
             trace=trace,

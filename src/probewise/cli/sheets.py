@@ -49,7 +49,7 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[sheets.Sheet, ...]:
         if what == MARKS:
             return (sheets.marks_sheet(geometry),)
         if what == JIG:
-            return sheets.arm_home_jig_sheets(geometry)
+            return (sheets.arm_home_jig_sheet(geometry),)
         if arguments.target is None:
             if what == TARGET:
                 raise CommandError("--target is missing: give a shape, such as --target circle:524,260,80")

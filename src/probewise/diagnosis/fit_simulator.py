@@ -61,10 +61,10 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     apparatus, model = diagnosis.apparatus, getattr(diagnosis, which)
     if not isinstance(apparatus, SimulatorApparatus):
         raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
-    return _fitted_system_from_samples(apparatus.about, model, diagnosis.recording, diagnosis.before.readings)
+    return fitted_system_from_samples(apparatus.about, model, diagnosis.recording, diagnosis.before.readings)
 
 
-def _fitted_system_from_samples(
+def fitted_system_from_samples(
     about: ReferenceFit, model: ModelSamples, recording: Recording, predicted: FloatArray
 ) -> FittedSystem:
     """Return posterior samples of a system with effects as a FittedSystem, which can be written to a file.
@@ -230,7 +230,7 @@ def fit_simulator(
     recording = replace(recording, notes=(*recording.notes, *said))
     mean = predicted.mean(axis=0)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(noise_sd**2) * recording.relative_sd**2)
-    fitted = _fitted_system_from_samples(about, samples, recording, mean)
+    fitted = fitted_system_from_samples(about, samples, recording, mean)
     fitted = replace(fitted, best=tuple(system.theta(modes[:1])[0].tolist()))
     evidence = Evidence(draws.log_z, max(draws.log_z_error, _LEAST_ERROR), "importance sampling")
     beside = _nested_sampling(problem, z, rng=rng, progress=progress) if thorough else None

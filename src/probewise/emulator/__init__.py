@@ -4,36 +4,30 @@ The emulator answers LEGO's Bluetooth protocol byte for byte, simulates motors t
 over a `world`. It shares no code with the driver in `arm`, so each tests the other.
 """
 
-from probewise.emulator.arm import (
+from probewise.emulator.bench import (
     EmulatedArm,
-    Geometry,
-    Joint,
-    JointParameters,
+    EmulatedBench,
+    LightModel,
     SensorPose,
+    Tabletop,
+    parse_scene,
     read_geometry,
-    shipped_geometry_path,
+    set_up_bench,
 )
-from probewise.emulator.bench import EmulatedBench, LightModel, Tabletop, parse_scene, set_up_bench
-from probewise.emulator.brick import Brick
-from probewise.emulator.inputs import LightSensor, Sensor, empty_port
+from probewise.emulator.brick import Brick, LightSensor, empty_port
 from probewise.emulator.motors import Motor
-from probewise.emulator.protocol import Clock, VirtualClock
+from probewise.emulator.protocol import VirtualClock
 from probewise.emulator.radio import Faults, Radio, Trace, VirtualLine
 
 __all__ = [
     "Brick",
-    "Clock",
     "EmulatedArm",
     "EmulatedBench",
     "Faults",
-    "Geometry",
-    "Joint",
-    "JointParameters",
     "LightModel",
     "LightSensor",
     "Motor",
     "Radio",
-    "Sensor",
     "SensorPose",
     "Tabletop",
     "Trace",
@@ -43,5 +37,4 @@ __all__ = [
     "parse_scene",
     "read_geometry",
     "set_up_bench",
-    "shipped_geometry_path",
 ]

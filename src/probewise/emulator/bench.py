@@ -1,21 +1,125 @@
-"""The whole emulated bench: a scene on the table, arm, light sensor, brick and radio link."""
+"""The whole emulated bench: the arm as built, a scene on the table, light sensor, brick and radio link.
+
+Motors turn joints through gears with backlash, and joints place the sensor. The arm takes its numbers from the geometry
+file itself, so that driver and emulator cannot share a mistake.
+"""
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
-from probewise.emulator.arm import EmulatedArm, Geometry, SensorPose
-from probewise.emulator.brick import Brick
-from probewise.emulator.inputs import LightSensor, Sensor, empty_port
+from probewise.emulator.brick import Brick, LightSensor, Sensor, empty_port
+from probewise.emulator.motors import Motor
 from probewise.emulator.protocol import Clock
 from probewise.emulator.radio import Faults, Radio, Trace, ignore_trace
 from probewise.errors import ParameterError
+from probewise.recordings import read_text
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Uniform
 from probewise.world import Oval, Surface, World
+
+Numbers: TypeAlias = Mapping[str, Any]
+"""The tables and entries of a geometry file, in mm and degrees; the shipped one explains each."""
+
+
+def read_geometry(path: Path) -> Numbers:
+    """Read an arm's dimensions from a TOML file of format "arm/1", in which `probewise.arm` finds no fault."""
+    return tomllib.loads(read_text(path, "an arm's file of format arm/1"))
+
+
+_BEYOND_LIMITS_DEG = 3.0  # a mechanical stop that the file does not give lies this far outside the limit
+
+
+@dataclass(frozen=True)
+class SensorPose:
+    """Pose of the sensor in the lab frame: place, height of its face above the surface, angle from X to its u axis."""
+
+    x_mm: float
+    y_mm: float
+    height_mm: float
+    orientation_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint and the motor that drives it through gears; backlash is measured at the motor."""
+
+    numbers: Numbers
+    motor: Motor
+
+    @classmethod
+    def create_at_home(cls, numbers: Numbers) -> Self:
+        """Make a joint at its home position, with the motor at 0."""
+        low_deg, high_deg = numbers["low_deg"] - _BEYOND_LIMITS_DEG, numbers["high_deg"] + _BEYOND_LIMITS_DEG
+        if (stop_deg := numbers.get("stop_deg", low_deg)) >= numbers["high_deg"]:
+            high_deg = stop_deg
+        else:
+            low_deg = stop_deg
+        ratio = numbers["gear_ratio"]
+        ends = sorted((angle_deg - numbers["home_deg"]) * ratio for angle_deg in (low_deg, high_deg))
+        play_deg = numbers["play_deg"] * abs(ratio)
+        # The stops are the joint's: its motor turns half the backlash further.
+        stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
+        return cls(numbers, Motor(stops_deg=stops_deg, play_deg=play_deg))
+
+    @property
+    def angle_rad(self) -> float:
+        """Angle of the joint, which follows its motor with backlash."""
+        return math.radians(self.numbers["home_deg"] + self.motor.driven_deg / self.numbers["gear_ratio"])
+
+    def set_angle_by_hand(self, angle_deg: float) -> None:
+        """Set the joint to an angle, as by hand; the motor follows and rests in the middle of the backlash."""
+        self.motor.angle_deg = self.motor.driven_deg = (angle_deg - self.numbers["home_deg"]) * self.numbers[
+            "gear_ratio"
+        ]
+        self.motor.speed_deg_s = 0.0
+
+
+class EmulatedArm:
+    """The arm, at first at home: `joints` base, shoulder and elbow, and the sensor at its end.
+
+    `lowest` is the lowest pose of the sensor so far; a height below 0 means that it went through the table.
+    """
+
+    def __init__(self, numbers: Numbers) -> None:
+        self._numbers = numbers
+        self.joints = tuple(Joint.create_at_home(numbers["joints"][name]) for name in ("base", "shoulder", "elbow"))
+        self.lowest = self.sensor_pose()
+
+    def motors(self) -> tuple[Motor, ...]:
+        """Return the motors at ports A, B, C."""
+        by_port = {joint.numbers["port"]: joint.motor for joint in self.joints}
+        return tuple(by_port[port] for port in "ABC")
+
+    def record_lowest(self) -> None:
+        """Update `lowest`, the lowest pose of the sensor so far."""
+        here = self.sensor_pose()
+        if here.height_mm < self.lowest.height_mm:
+            self.lowest = here
+
+    def sensor_pose(self) -> SensorPose:
+        """Return the sensor's pose (the paper's arm: two links on a turning base)."""
+        base, links, sensor = (self._numbers[name] for name in ("base", "links", "sensor"))
+        turned, shoulder, elbow = (joint.angle_rad for joint in self.joints)
+        lower, upper_mm, lower_mm = elbow, links["upper_mm"], links["lower_mm"]
+        if links["elbow"] == "relative":
+            lower = shoulder + elbow
+        out_mm = base["shoulder_forward_mm"] + upper_mm * math.cos(shoulder) + lower_mm * math.cos(lower)
+        out_mm += sensor["forward_mm"]
+        up_mm = base["shoulder_height_mm"] + upper_mm * math.sin(shoulder) + lower_mm * math.sin(lower)
+        return SensorPose(
+            x_mm=base["x_mm"] + out_mm * math.cos(turned),
+            y_mm=base["y_mm"] + out_mm * math.sin(turned),
+            height_mm=up_mm - sensor["drop_mm"],
+            orientation_rad=math.radians(sensor["mounting_deg"] - 90) + turned,
+        )
+
 
 FORMS = (
     "[circle:]X,Y,RADIUS",
@@ -151,34 +255,34 @@ class EmulatedBench:
 
 
 def set_up_bench(
-    geometry: Geometry,
+    numbers: Numbers,
     world: World,
     surface: Surface,
     clock: Clock,
     *,
     seed: int,
-    name: str = "NXT",
     faults: Faults | None = None,
     sleep_min: int = 10,
     trace: Trace = ignore_trace,
 ) -> EmulatedBench:
-    """Build a bench over a surface, the arm at home.
+    """Build a bench over a surface, the arm, of a geometry file's numbers, at home.
 
-    `seed` is that of the sensor's noise and of the link's faults; `world` simulates the light sensor at the geometry's
-    reading height; `name`, `sleep_min` as for `Brick`, `faults` and `trace` as for `Radio`. ParameterError if the name
-    or `sleep_min` is invalid.
+    `seed` is that of the sensor's noise and of the link's faults; `world` simulates the light sensor at the arm's
+    reading height; `sleep_min` as for `Brick`, `faults` and `trace` as for `Radio`. ParameterError if
+    `sleep_min` is invalid.
     """
     faults = Faults() if faults is None else faults
-    arm = EmulatedArm(geometry)
+    arm = EmulatedArm(numbers)
     table = Tabletop(surface)
-    light = LightModel(world, table, arm.sensor_pose, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
+    light = LightModel(
+        world, table, arm.sensor_pose, read_height_mm=numbers["sensor"]["read_height_mm"], seed=seed, clock=clock
+    )
     sensors: list[Sensor] = [empty_port] * 4
-    sensors[geometry.sensor_port - 1] = LightSensor(light, clock)
+    sensors[numbers["sensor"]["port"] - 1] = LightSensor(light, clock)
     brick = Brick(
         clock,
         motors=arm.motors(),
         sensors=sensors,
-        name=name,
         sag_mv_min=faults.sag,
         sleep_min=sleep_min,
         watch=arm.record_lowest,

@@ -1,14 +1,114 @@
-"""The brick: programs, battery, sleep timer, replies to telegrams; what an arm never asks for is an unknown command."""
+"""The brick: input ports with their sensors, battery, sleep timer, and replies to telegrams.
+
+What an arm never asks for is an unknown command.
+"""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
-from probewise.emulator.inputs import InputPorts, Sensor, empty_port
 from probewise.emulator.motors import Motor, OutputPorts
 from probewise.emulator.protocol import Clock, RefusedError, Status, build_reply, parse_request
-from probewise.errors import ParameterError, require
+from probewise.errors import require
+
+AD_MAX = 1023
+
+
+Sensor: TypeAlias = Callable[[bool], int]
+"""What an input port's AD converter reads, 0 to 1023 for 0 to 5 V: a function of whether the LED is on."""
+
+
+def empty_port(lit: bool) -> int:
+    """Return 1023, the full voltage: of an empty port, the pull-up resistor alone."""
+    return AD_MAX
+
+
+@dataclass
+class LightSensor:
+    """The light sensor 9844, of whose converter a sample is taken every 3 ms: more light gives a lower voltage.
+
+    `seen` is a function of whether the LED is on; it returns an unrounded reading on the firmware's scale 0 to 100.
+    """
+
+    seen: Callable[[bool], float]
+    clock: Clock
+    _sample: tuple[int, bool, int] = field(default=(-1, False, AD_MAX))
+
+    def __call__(self, lit: bool) -> int:
+        """Return the AD converter's current sample, 0 to 1023."""
+        number = int(self.clock() / 0.003)
+        if self._sample[:2] != (number, lit):
+            # The inverse of `_normalized_light`: 0 % is 896 counts, 100 % is 200; beyond, linear within 0 to 1023.
+            raw = round(_BRIGHT_COUNTS + _SPAN_PERCENT / 100 * (AD_MAX - self.seen(lit) * AD_MAX / 100))
+            self._sample = (number, lit, min(max(raw, 0), AD_MAX))
+        return self._sample[2]
+
+
+_NONE, _LIGHT_ON, _LIGHT_OFF = 0x00, 0x05, 0x06
+_RAW, _PERCENT = 0x00, 0x80
+_BRIGHT_COUNTS, _SPAN_PERCENT = 200, 68  # counts at full scale, percent of the converter's range
+
+
+@dataclass
+class _InputPort:
+    """An input port: its sensor, the type (`kind`) and mode to which it is set, and its last values."""
+
+    sensor: Sensor
+    kind: int = _NONE
+    mode: int = _RAW
+    valid_s: float = 0.0  # time from which readings are valid
+    shown: tuple[int, int, int] = (0, 0, 0)  # raw, normalized, scaled: the last conversion
+
+
+class InputPorts:
+    """The input ports 1 to 4 with their sensors, and by opcode the commands that set and read them (`commands`)."""
+
+    def __init__(self, sensors: Sequence[Sensor], clock: Clock) -> None:
+        self.clock = clock
+        self._ports = tuple(_InputPort(sensor) for sensor in sensors)
+        self.commands: Mapping[int, Callable[..., bytes]] = {0x05: self._set_mode, 0x07: self._get_values}
+
+    def _set_mode(self, number: int, kind: int, mode: int) -> bytes:
+        """Set a port's type and mode; its readings are invalid for some milliseconds, and the old values stay."""
+        port = self._checked_port(number)
+        self._update_reading(port)
+        now_s = self.clock()
+        port.valid_s = now_s + 0.021 if kind != port.kind else max(port.valid_s, now_s + 0.001)
+        port.kind, port.mode = kind, mode
+        return b""
+
+    def _get_values(self, number: int) -> bytes:
+        port = self._checked_port(number)
+        valid = self._update_reading(port)
+        raw, normalized, scaled = port.shown
+        return struct.pack(
+            "<BBBBBHHhh", number, valid, False, port.kind, port.mode, raw, normalized, scaled, normalized
+        )
+
+    def _update_reading(self, port: _InputPort) -> bool:
+        """Read the port's sensor and update the port's values; return whether they are valid."""
+        if self.clock() < port.valid_s:
+            return False
+        if port.kind != _NONE:
+            raw = port.sensor(port.kind == _LIGHT_ON)
+            normalized = _normalized_light(raw) if port.kind in (_LIGHT_ON, _LIGHT_OFF) else raw
+            scaled = normalized * 100 // AD_MAX if port.mode & 0xE0 == _PERCENT else normalized
+            port.shown = (raw, normalized, scaled)
+        return True
+
+    def _checked_port(self, number: int) -> _InputPort:
+        if number >= len(self._ports):
+            raise RefusedError(Status.OUT_OF_RANGE)
+        return self._ports[number]
+
+
+def _normalized_light(raw: int) -> int:
+    """Scale counts to 0..1023 in integers, as the firmware does; more light gives a larger value."""
+    return AD_MAX - min(max(raw - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT, AD_MAX)
+
 
 ADDRESS = bytes.fromhex("0016530A0B0C")
 SLEEP_MIN = (0, 2, 5, 10, 30, 60)
@@ -16,11 +116,10 @@ SLEEP_MIN = (0, 2, 5, 10, 30, 60)
 
 _FLASH_BYTES = 61440
 _VERSIONS = bytes((124, 1, 31, 1))  # protocol 1.124, firmware 1.31, the smaller number first
-_LONGEST_NAME = 14
 
 
 class Brick:
-    """An NXT brick, switched on at construction; ParameterError if the name or `sleep_min` is invalid.
+    """An NXT brick, switched on at construction; ParameterError if `sleep_min` is none of its menu's.
 
     Parameters
     ----------
@@ -28,12 +127,10 @@ class Brick:
         Time in seconds, for motors and timers.
     motors, sensors
         Motors at ports A, B, C; sensors at ports 1 to 4.
-    name, sleep_min
-        Up to 14 characters of Latin-1; minutes without KEEPALIVE until the brick switches itself off, 0: never.
+    sleep_min
+        Minutes without KEEPALIVE until the brick switches itself off, 0: never.
     full_mv, sag_mv_min
         The battery's voltage at the start, and its loss per minute, in mV.
-    programs
-        Names of the programs in flash; one that starts or stops resets all ports, and does nothing else.
     watch
         Function called every 10 ms while a motor turns.
     """
@@ -44,36 +141,27 @@ class Brick:
         *,
         motors: Sequence[Motor] | None = None,
         sensors: Sequence[Sensor] | None = None,
-        name: str = "NXT",
         full_mv: float = 7412.0,
         sag_mv_min: float = 0.0,
         sleep_min: int = 10,
-        programs: Sequence[str] = ("idle.rxe",),
         watch: Callable[[], None] = lambda: None,
     ) -> None:
-        if not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable() or any(ord(c) > 255 for c in name):
-            raise ParameterError("name", name, f"1 to {_LONGEST_NAME} printable characters of Latin-1")
         require(sleep_min in SLEEP_MIN, "sleep_min", sleep_min, f"one of {', '.join(map(str, SLEEP_MIN))}")
         self._clock, self._sleep_s = clock, 60.0 * sleep_min
         self._began_s = self._awake_s = clock()
         self._full_mv, self._sag_mv_min = full_mv, sag_mv_min
-        self._name = name.encode("latin-1")
-        self._programs, self._running = programs, b""
         plugged = [Motor() for _ in range(3)] if motors is None else motors
         self.outputs = OutputPorts(plugged, now_s=self._began_s, watch=watch)
         self.inputs = InputPorts([empty_port] * 4 if sensors is None else sensors, clock)
         self._commands: Mapping[int, Callable[..., bytes]] = {
             **self.outputs.commands,
             **self.inputs.commands,
-            0x00: self._start_program,
-            0x01: self._stop_program,
             0x03: lambda hertz, ms: b"",
             0x0B: lambda: struct.pack("<H", int(self.battery_mv)),
             0x0D: self._keep_alive,
-            0x11: self._running_name,
+            0x11: self._refuse_name_of_program,
             0x88: lambda: _VERSIONS,
-            0x98: self._rename_brick,
-            0x9B: lambda: struct.pack("<15s7s4xI", self._name, ADDRESS, _FLASH_BYTES),
+            0x9B: lambda: struct.pack("<15s7s4xI", b"NXT", ADDRESS, _FLASH_BYTES),
         }
 
     @property
@@ -111,30 +199,9 @@ class Brick:
             status, payload = refused.status, bytes(0 if request.command is None else request.command.error_bytes)
         return build_reply(request.opcode, status, payload) if request.wants_reply else None
 
-    def _start_program(self, name: bytes) -> bytes:
-        if name.split(b"\0")[0].decode("latin-1") not in self._programs:
-            raise RefusedError(Status.OUT_OF_RANGE)
-        return self._switch_program(name)
-
-    def _stop_program(self) -> bytes:
-        self._running_name()
-        return self._switch_program(b"")
-
-    def _switch_program(self, name: bytes) -> bytes:
-        self._running = name
-        self.outputs.release()
-        self.inputs.reset_ports()
-        return b""
-
-    def _running_name(self) -> bytes:
-        if not self._running:
-            raise RefusedError(Status.NO_PROGRAM)
-        return self._running
+    def _refuse_name_of_program(self) -> bytes:
+        raise RefusedError(Status.NO_PROGRAM)  # none ever runs
 
     def _keep_alive(self) -> bytes:
         self._awake_s = self._clock()
         return struct.pack("<I", int(1000 * self._sleep_s))
-
-    def _rename_brick(self, name: bytes) -> bytes:
-        self._name = name.split(b"\0")[0][:15]
-        return b""

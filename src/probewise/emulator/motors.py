@@ -252,7 +252,7 @@ class OutputPorts:
             moving = [port for port in moving if not port.is_at_rest]  # one at rest stays there without a command
 
     def release(self) -> None:
-        """Let all motors coast, as the firmware does when a program starts or ends."""
+        """Let all motors coast."""
         for port in self.ports:
             port.apply_setting(OutputSetting())
 

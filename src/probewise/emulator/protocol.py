@@ -65,27 +65,23 @@ class RefusedError(Exception):
 class CommandLayout:
     """Layout of a command's telegram after the opcode, and length of its error reply after the status.
 
-    `layout` is in the format of Python's `struct`; with `more`, any further bytes are the last field. After the status
-    of an error follow `error_bytes` zeros, as in the firmware.
+    `layout` is in the format of Python's `struct`. After the status of an error follow `error_bytes` zeros, as in the
+    firmware.
     """
 
     name: str
     layout: str = ""
     error_bytes: int = 0
-    more: bool = False
 
     def parse_fields(self, body: bytes) -> tuple[FieldValue, ...]:
         """Parse the bytes after the opcode; RefusedError if there are too few."""
         size = struct.calcsize("<" + self.layout)
         if len(body) < size:
             raise RefusedError(Status.MALFORMED)
-        found: tuple[FieldValue, ...] = struct.unpack("<" + self.layout, body[:size])
-        return (*found, body[size:]) if self.more else found
+        return struct.unpack("<" + self.layout, body[:size])
 
 
 COMMANDS: dict[int, CommandLayout] = {
-    0x00: CommandLayout("STARTPROGRAM", "20s"),
-    0x01: CommandLayout("STOPPROGRAM"),
     0x03: CommandLayout("PLAYTONE", "HH"),
     0x04: CommandLayout("SETOUTPUTSTATE", "BbBBbBI"),
     0x05: CommandLayout("SETINPUTMODE", "BBB"),
@@ -96,7 +92,6 @@ COMMANDS: dict[int, CommandLayout] = {
     0x0D: CommandLayout("KEEPALIVE"),
     0x11: CommandLayout("GETCURRENTPROGRAMNAME", "", 20),
     0x88: CommandLayout("GETFIRMWAREVERSION"),
-    0x98: CommandLayout("SETBRICKNAME", more=True),
     0x9B: CommandLayout("GETDEVICEINFO"),
 }
 

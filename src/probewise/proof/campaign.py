@@ -1,23 +1,30 @@
-"""Run many independent tasks on any executor, with one line of a file per result, resumable after any stop.
+"""Run many independent tasks on any executor, keep their results in a file, and estimate with 95 % intervals.
 
-Format "campaign/1". The first line holds the settings that determine the results. Every further line
-is a finished task: its key and its result, in order of completion. Results are returned in the order
-of the tasks, so that nothing depends on the executor. What a finished task leaves in the file, which may have been
-changed by hand, fits a schema: a dict of keys (one that ends with "?" may be missing), {str: schema} for any keys,
-[schema] for a list, (schema, ...) for a list of so many, (schema, None) for null too, or bool, int, float, str.
+A campaign can be resumed after any stop.
+
+Format "campaign/1". The first line holds the settings that determine the results. Every further line is a finished
+task: its key and its result, in order of completion. Results are returned in the order of the tasks, so that nothing
+depends on the executor. What a finished task leaves in the file, which may have been changed by hand, fits a schema: a
+dict of keys, {str: schema} for any keys, [schema] for a list, (schema, ...) for a list of so many, (schema, None) for
+null too, or bool, int, float, str.
 """
 
 from __future__ import annotations
 
 import json
 import lzma
+import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
+import numpy as np
+from scipy.stats import binom, binomtest, t
+
+from probewise._arrays import FloatArray
 from probewise._tasks import results_as_tasks_end
 from probewise._writing import write_and_sync
 from probewise.errors import FileError, ParameterError, shown
@@ -163,8 +170,6 @@ _HIDDEN = {
     "in_vocabulary": bool,
     "shows_in": [str],
     "cosines": {str: float},  # after the refit, with effects that are like it
-    "size_beside?": float,  # of a pair: in sds, when the other effect is in the model
-    "rival_nats?": {str: float},  # of a system: what rivals lose
 }
 _CASE = {
     "kind": str,
@@ -180,7 +185,7 @@ _CASE = {
 }
 _SETTLED = {"readings": int, **_STATEMENTS}  # of readings that were advised
 _INTERVALS = {str: (float, float, float)}  # by parameter: truth, and the ends of the 95 % interval
-_LOG_DENSITIES = {str: float}  # of held-out readings, by model ("null", "repaired", "right", "true"), nats
+_LOG_DENSITIES = {str: float}  # of held-out readings, by model ("null", "repaired", "right"), nats
 
 SENSOR_CASE: Schema = {
     **_CASE,
@@ -200,9 +205,9 @@ SYSTEM_CASE: Schema = {
     **_CASE,
     "system": str,
     "law": bool,
+    "hidden": [{**_HIDDEN, "rival_nats": {str: float}}],  # what rivals lose
     "where": [str],
     "parameters": {str: _INTERVALS},
-    "formula": bool,
     "held_out": dict.fromkeys(("inside", "beyond"), _LOG_DENSITIES),
 }
 
@@ -211,19 +216,16 @@ _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 
 def misfit(value: Any, schema: Schema, name: str = "result") -> tuple[str, str] | None:
     """Return what of a JSON value does not fit a schema, and what is allowed; None if it fits."""
+    if isinstance(schema, tuple) and schema[-1] is None:
+        return None if value is None else misfit(value, schema[0], name)
     children: list[tuple[Any, Schema, str]] = []
     if isinstance(schema, dict):
         fits, allowed = isinstance(value, dict), "an object"
-        if fits and str in schema:
-            children = [(own, schema[str], f"{name}.{key}") for key, own in value.items()]
-        elif fits:
-            needed = sorted(key for key in schema if not key.endswith("?"))
-            if missing := [key for key in needed if key not in value]:
-                return f"{name}.{missing[0]} is missing", ", ".join(needed)
-            of = {key.removesuffix("?"): each for key, each in schema.items()}
-            children = [(value[key], each, f"{name}.{key}") for key, each in of.items() if key in value]
-    elif isinstance(schema, tuple) and schema[-1] is None:
-        return None if value is None else misfit(value, schema[0], name)
+        if fits:
+            each = dict.fromkeys(value, schema[str]) if str in schema else schema
+            if missing := sorted(key for key in each if key not in value):
+                return f"{name}.{missing[0]} is missing", ", ".join(sorted(each))
+            children = [(value[key], own, f"{name}.{key}") for key, own in each.items()]
     elif isinstance(schema, list | tuple):
         n = len(schema)
         fits = isinstance(value, list) and (isinstance(schema, list) or len(value) == n)
@@ -250,3 +252,95 @@ def misfit_of_case(result: Mapping[str, Any], schema: Schema) -> tuple[str, str]
     if result["kind"] == "alias" and result["cosine"] is None:
         return "result.cosine is null", "a number where the kind is alias"
     return None
+
+
+LEAST_FOR_MEDIAN = 6
+"""Smallest number of values whose range covers the median with 95 %: 1 - 2 / 2^6 is 97 %."""
+
+_DRAWS = 400
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimate, the ends of its 95 % interval (or one standard error to either side), and the sample size if known.
+
+    NaN for an empty sample.
+    """
+
+    value: float
+    low: float
+    high: float
+    n: int = 0
+
+    @property
+    def half_width(self) -> float:
+        """Half the length of the interval."""
+        return 0.5 * (self.high - self.low)
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} ± {self.half_width:.2g}"
+
+
+_NOTHING = Estimate(math.nan, math.nan, math.nan)
+
+
+def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """Return the values of each key, in order."""
+    out: dict[K, list[V]] = {}
+    for key, value in pairs:
+        out.setdefault(key, []).append(value)
+    return out
+
+
+def estimated_share(hits: Iterable[bool]) -> Estimate:
+    """Estimate a proportion, with Wilson's interval."""
+    n_hits, n = sum(each := list(hits)), len(each)
+    if not n:
+        return _NOTHING
+    found = binomtest(n_hits, n).proportion_ci(method="wilson")
+    return Estimate(n_hits / n, float(found.low), float(found.high), n)
+
+
+def estimated_mean(values: Iterable[float]) -> Estimate:
+    """Estimate a mean, with Student's interval (infinite for one value)."""
+    each = list(values)
+    if not each:
+        return _NOTHING
+    center, n = float(np.mean(each)), len(each)
+    half = float(t.ppf(0.975, n - 1) * np.std(each, ddof=1) / math.sqrt(n)) if n > 1 else math.inf
+    return Estimate(center, center - half, center + half, n)
+
+
+def estimated_statistic(rows: FloatArray, statistic: Callable[[FloatArray], float]) -> Estimate:
+    """Estimate a statistic of rows (n, ...), with the basic bootstrap interval from random draws with a fixed seed.
+
+    The basic interval reflects the draws about the estimate, which corrects the bias of small samples (Davison and
+    Hinkley 1997, section 5.2). It is infinite for one row.
+    """
+    if not len(rows):
+        return _NOTHING
+    if len(rows) == 1:
+        return Estimate(statistic(rows), -math.inf, math.inf, 1)
+    rng = np.random.default_rng(len(rows))
+    draws = [statistic(rows[rng.integers(len(rows), size=len(rows))]) for _ in range(_DRAWS)]
+    value, (low, high) = statistic(rows), np.quantile(draws, [0.025, 0.975])
+    return Estimate(value, float(2 * value - high), float(2 * value - low), len(rows))
+
+
+def mean_with_error(values: Iterable[float]) -> Estimate:
+    """Estimate a mean with its standard error to either side; NaN for fewer than two values."""
+    each = np.array([*values], dtype=np.float64)
+    if each.size < 2:
+        return _NOTHING
+    mean, error = float(each.mean()), float(each.std(ddof=1)) / math.sqrt(each.size)
+    return Estimate(mean, mean - error, mean + error, each.size)
+
+
+def median_with_interval(values: Iterable[float]) -> Estimate:
+    """Estimate a median with a distribution-free 95 % interval of order statistics, NaN bounds below six values."""
+    ordered = np.sort(np.array([*values], dtype=np.float64))
+    if (n := ordered.size) < LEAST_FOR_MEDIAN:
+        return Estimate(float(np.median(ordered)), math.nan, math.nan, n) if n else _NOTHING
+    below = max(int(binom.ppf(0.025, n, 0.5)) - 1, 0)
+    return Estimate(float(np.median(ordered)), float(ordered[below]), float(ordered[n - 1 - below]), n)

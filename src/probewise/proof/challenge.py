@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, own_arithmetic
 from probewise._version import __version__
@@ -21,9 +20,8 @@ from probewise.calibration import predict
 from probewise.diagnosis import Diagnosis, EffectFound, ModelSamples, Place, diagnose, model_with
 from probewise.diagnosis.diagnose_simulator import diagnose_system
 from probewise.diagnosis.evidence import covariance_root
-from probewise.diagnosis.simulator_rows import SimulatorApparatus
+from probewise.diagnosis.fit_simulator import calibrated_of, fitted_system_from_samples, repaired_of
 from probewise.effects import VOCABULARY, Extent
-from probewise.effects.noise_distribution import log_gaussian_density
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, ProbewiseError
 from probewise.investigation import investigate
 from probewise.proof.campaign import ROUNDS_CASE, SENSOR_CASE, SYSTEM_CASE, Campaign, Result, misfit_of_case
@@ -32,21 +30,25 @@ from probewise.proof.refits import (
     SystemRefit,
     cosines_with_vocabulary,
     nats_of_alternative,
-    residual_norms_with_one_named,
     rivals_with_nats,
-    run_table,
 )
-from probewise.proof.sensors.cases import Case, HiddenEffect, Stratum, draw_case, held_out_recordings, stratum_of
-from probewise.proof.sensors.effects import NO_PHYSICS, CleanSetup, CovariateRegion
+from probewise.proof.sensors import (
+    NO_PHYSICS,
+    Case,
+    CleanSetup,
+    CovariateRegion,
+    HiddenEffect,
+    Stratum,
+    draw_case,
+    held_out_recordings,
+    stratum_of,
+)
 from probewise.proof.systems.cases import SystemCase, draw_system_case, system_stratum_of, write_system_case
 from probewise.proof.systems.forms import SystemEffect
 from probewise.proof.tables import HONEST_NATS, NOISE, names_in_label
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import footprint_of
-from probewise.systems import RunTable, read_simulator, read_table_for
-from probewise.systems.forms import ReferenceFit, extract_stored_fit, has_value_per_run, rebind_forms
-from probewise.systems.prediction import draw_value_for_new_run
-from probewise.systems.system import SystemChain
+from probewise.systems import FittedSystem, RunTable, predict_system, read_simulator, read_table_for
 from probewise.world.world import World
 
 __all__ = ["challenge", "run_case"]
@@ -111,15 +113,15 @@ def place_overlap(region: CovariateRegion, places: Sequence[Place]) -> float:
 def log_densities_of_scans(
     case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
 ) -> dict[str, dict[str, float]]:
-    """Return the log predictive density of each held-out scan, by its name, under up to four models, by name, in nats.
+    """Return the log predictive density of each held-out scan, by its name, under up to three models, by name, in nats.
 
     "null" and "repaired" are the diagnosis's models without effects and with those found. "right", if all concealed
     effects are in the vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the
-    same readings. "true" is an upper limit (exact for white noise): it knows the noise-free readings and the noise sd.
+    same readings.
     """
     fitting, *drawing = rng.spawn(4)
     models = {"null": diagnosis.null, "repaired": diagnosis.repaired}
-    extent, world = Extent.of(case.recording), case.world
+    extent = Extent.of(case.recording)
     names = [h.name for h in case.hidden if h.name not in NO_PHYSICS and h.name in VOCABULARY]
     showing = [name for name in names if VOCABULARY[name].for_extent(extent) is not None]
     if showing and len(showing) == len(case.hidden):
@@ -134,10 +136,6 @@ def log_densities_of_scans(
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
         scored = {scan: predict(sensor, later.plan, later.readings).log_density for scan, later in scans.items()}
         scores[name] = {scan: float(np.nansum(density)) for scan, density in scored.items()}
-    scores["true"] = {}
-    for scan, later in scans.items():
-        density = log_gaussian_density(later.readings, world.expected_readings(later.plan), world.noise_sd)
-        scores["true"][scan] = float(density[later.usable].sum())
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
 
 
@@ -229,11 +227,6 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
         changed = None if on_noise else setup.recording_with_effects(one.effect)
         like = {} if changed is None else cosines_with_vocabulary(refit, setup.clean_recording, changed)
         hidden.append(_hidden_result(one, {name: rho for name, rho in like.items() if rho > _LEAST_COSINE}, on_noise))
-    if len(hidden) == 2:  # the size of each, in sds, when the other is in the model
-        both = setup.recording_with_effects(*(one.effect for one in case.hidden))
-        left = residual_norms_with_one_named(refit, setup.clean_recording, both, [one.name for one in case.hidden])
-        for own, other in zip(hidden, reversed(hidden), strict=True):
-            own["size_beside"] = left[other["name"]] / case.world.noise_sd
     return {
         **{name: getattr(case, name) for name in ("plan", "ssf", "noise_level", "noise_model")},
         "readings": len(case.recording),
@@ -312,8 +305,7 @@ def challenge(
     return Campaign(work, tasks, settings, partial(misfit_of_case, schema=schema), "cases")
 
 
-_N_SAMPLES = 200
-_N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the density must not depend on a few draws
+_N_SAMPLES = 500
 
 
 def log_densities_of_runs(
@@ -321,39 +313,32 @@ def log_densities_of_runs(
 ) -> dict[str, dict[str, float]]:
     """Return as `log_densities_of_scans` for the held-out runs "inside" the range of the recorded ones and "beyond" it.
 
-    "right" knows the concealed effects: absent without effects or if the fit fails. "true" knows the noise-free
-    reading. What is not finite is left out.
+    "right" knows the concealed effects: absent without effects or if the fit fails. What cannot be predicted is left
+    out.
     """
-    fitting, *drawing = rng.spawn(3)
-    drawn, rows = case.drawn, case.drawn.held_out_row_numbers
-    readings = later.covariates[drawn.kind.reading]
-    about = cast(SimulatorApparatus, diagnosis.apparatus).about
-    null, repaired = diagnosis.null, diagnosis.repaired
-    scores = {
-        "null": _log_mean_density(*predict_runs(null, about, later, rng=drawing[0]), readings),
-        "true": _log_mean_density(case.noise_free[None, rows], np.array([drawn.kind.sd]), readings),
-    }
-    scores["repaired"] = scores["null"]
-    if repaired is not null:
-        scores["repaired"] = _log_mean_density(*predict_runs(repaired, about, later, rng=drawing[1]), readings)
+    fitting, *drawing = rng.spawn(4)
+    models = {"null": (calibrated_of(diagnosis), later), "repaired": (repaired_of(diagnosis), later)}
     if case.effects:
         with suppress(NotConvergedError):  # no fit was possible, so the case does not count for the share
-            scores["right"] = _log_mean_density(*_right_predictions(case, refit, rng=fitting), readings)
-    run = drawn.table.run[rows]
-    names = {drawn.table.n_runs - 2: "inside", drawn.table.n_runs - 1: "beyond"}
-    return {
-        name: {model: float(own[run == k].sum()) for model, own in scores.items() if np.isfinite(own[run == k]).all()}
-        for k, name in names.items()
-    }
+            models["right"] = _right_model_and_readings(case, later, refit, rng=fitting)
+    drawn, scores = case.drawn, {"inside": dict[str, float](), "beyond": dict[str, float]()}
+    run = drawn.table.run[drawn.held_out_row_numbers]
+    for (name, (model, table)), child in zip(models.items(), drawing, strict=False):
+        with suppress(ParameterError):  # no reading can be predicted
+            density = predict_system(model, table, rng=child).log_density
+            for of_run, number in zip(scores.values(), np.unique(run), strict=True):
+                if np.isfinite(density[run == number]).all():
+                    of_run[name] = float(density[run == number].sum())
+    return scores
 
 
-def _right_predictions(
-    case: SystemCase, refit: SystemRefit, *, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Predict the held-out runs, as `predict_runs` does, by the model without effects fitted beside the true ones.
+def _right_model_and_readings(
+    case: SystemCase, later: RunTable, refit: SystemRefit, *, rng: np.random.Generator
+) -> tuple[FittedSystem, RunTable]:
+    """Return the model without effects, fitted beside the true ones, and held-out readings without their change.
 
-    It is fitted to the readings without the change by the effects at the true parameters, which is added to what it
-    predicts. An effect's values for the held-out runs, which nobody can know, are the mean of the others.
+    It is fitted to the readings without the change by the effects at the true parameters. An effect's values for the
+    held-out runs, which nobody can know, are the mean of the others.
     """
     drawn, known = case.drawn, []
     for effect in case.effects:
@@ -366,45 +351,10 @@ def _right_predictions(
     found = refit.refit(drawn, (case.readings - change)[seen])
     z = found.z + rng.standard_normal((_N_SAMPLES, len(found.z))) @ covariance_root(found.slopes, sd**2).T
     samples = ModelSamples(found.model.chain, found.model.theta(z), np.full(len(z), sd), 0)
-    later = run_table(drawn.table.select_rows(rows), drawn.kind, case.readings[rows])
-    predicted, sds = predict_runs(samples, refit.reference(found), later, rng=rng)
-    return predicted + change[rows], sds
-
-
-def predict_runs(
-    samples: ModelSamples, about: ReferenceFit, table: RunTable, *, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Predict the new runs of a table: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
-
-    Parameters per run are drawn from their prior, and an effect's values per run as `predict_system` draws them.
-    `about`: the reference fit of the diagnosis, from which its effects have their scales.
-    """
-    chain = cast(SystemChain, samples.chain)
-    system = replace(chain.system, runs=tuple(dict.fromkeys((*chain.system.runs, *table.scan_names))))
-    own = [effect.name for effect in chain.effects if has_value_per_run(effect.name)]
-    longer = rebind_forms(own, system.simulator, extract_stored_fit(about), more_runs=table.scan_names)
-    effects = tuple(longer.get(effect.name, effect) for effect in chain.effects)
-    wider = replace(chain, system=system, effects=effects)
-    of_run = [name for name in wider.names if name not in chain.names]
-    n = _N_OF_A_RUN if of_run else _N_SAMPLES
-    chosen = rng.permutation(np.arange(n) % len(samples.theta))
-    known = dict(zip(chain.names, samples.theta[chosen].T, strict=True))
-    drawn = {}
-    for name in of_run:
-        if name in system.marginals:  # stratified: one from each of n parts of equal prior mass
-            drawn[name] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
-        else:
-            effect = next(own_name for own_name in own if name.startswith(f"{own_name}."))
-            drawn[name] = draw_value_for_new_run(samples.effect_samples(effect)[chosen], rng=rng)
-    theta = np.stack([(known | drawn)[name] for name in wider.names], axis=1)
-    with np.errstate(all="ignore"):
-        predicted = np.concatenate([wider.predict(part, table) for part in np.array_split(theta, max(n // 500, 1))])
-    return predicted, samples.noise_sd[chosen]
-
-
-def _log_mean_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
-    each = log_gaussian_density(readings, predicted, sd[:, None])
-    return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
+    model = fitted_system_from_samples(
+        refit.reference(found), samples, refit.recording(case.readings[seen]), found.predicted
+    )
+    return model, later.with_columns({drawn.kind.reading: later.covariates[drawn.kind.reading] - change[rows]})
 
 
 _LIKELY = 0.05
@@ -452,7 +402,6 @@ def _system_diagnosis_result(case: SystemCase, task: Task, refit: SystemRefit) -
         "alternative_nats": nats_of_alternatives(case, said, refit),
         "where": [place.covariate for place in diagnosis.where],
         "parameters": _intervals_of_named(diagnosis, truths),
-        "formula": any(getattr(e, "expression", "") for e in getattr(diagnosis.repaired.chain, "effects", ())),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, refit, rng=later),
         "cpu_s": cpu_s,
     }

@@ -20,11 +20,10 @@ from probewise._arrays import FloatArray, own_arithmetic
 from probewise._kinds import checked_whole
 from probewise._version import __version__
 from probewise.arm import Pose, Reading, SimulatedArm, Speed
-from probewise.experiment import CLEAN, TRUST, Experiment, left_out_after_step, recording_of
+from probewise.experiment import CLEAN, TRUST, Experiment, Exploration, left_out_after_step, recording_of
 from probewise.experiment.result import WRONG_MM
 from probewise.inference import Rounded
-from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Result, misfit
-from probewise.proof.estimates import Estimate, estimated_share, grouped
+from probewise.proof.campaign import CONCEALED_TRIAL, Campaign, Estimate, Result, estimated_share, grouped, misfit
 from probewise.proof.study import (
     BLOB,
     BRIGHT,
@@ -38,7 +37,6 @@ from probewise.proof.study import (
     disc_of,
     experiment_of,
     footprint_pixels,
-    has_reached_target,
     mixture_of,
     timed_steps,
     true_circle,
@@ -46,8 +44,7 @@ from probewise.proof.study import (
 from probewise.recordings.table import csv_text_of_rows
 from probewise.sensor import Chain
 from probewise.world import Blob, Concealed, World
-from probewise.world import concealed as known
-from probewise.world import unlisted as strange
+from probewise.world import concealed as conceal
 
 _MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)
 _MOVE_S = 0.8  # of a reading: what a move takes, about
@@ -96,73 +93,75 @@ def _and_tenfold(least: float) -> tuple[float, float, float]:
 
 
 def _step_at_any_moment(a: float, now: Conditions, rng: np.random.Generator) -> Concealed:
-    return known.ambient_step(a, float(now.each_s * rng.uniform(1, 20)))
+    return conceal.ambient_step(a, float(now.each_s * rng.uniform(1, 20)))
 
 
-_W, _UNITS, _PLACES, _SHARES = FIELD.width_mm, (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4)
+_W = FIELD.width_mm
+_UNITS, _PLACES, _SHARES, _STEPS = (1.5, 4.0, 8.0), (1.5, 6.0, 12.0), (0.05, 0.2, 0.4), (2.0, 8.0, 16.0)
+_LEVELS, _LOST, _SCALES = (55.0, 40.0, 25.0), (0.03, 0.1, 0.2), _and_tenfold(0.005)
 
 CONCEALED_BY_FORM: Mapping[str, Mapping[str, Row]] = {
     "in the list": {
-        "backlash": (_of(known.backlash), _PLACES),
-        "saturation": (_of(known.saturation), (55.0, 40.0, 25.0)),
-        "nonlinearity": (_of(known.nonlinearity), (1.1, 1.5, 2.2)),
-        "albedo_gradient": (lambda a, now, rng: known.albedo_gradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
-        "ambient_gradient": (lambda a, now, rng: known.ambient_gradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
-        "ambient_step": (lambda a, now, rng: known.ambient_step(a, 6 * now.each_s), (2.0, 8.0, 16.0)),
-        "offset_drift": (lambda a, now, rng: known.offset_drift(a * 3600 / (30 * now.each_s)), (2.0, 8.0, 16.0)),
-        "gain_drift": (lambda a, now, rng: known.gain_drift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
-        "edge_blur": (_of(known.edge_blur), (3.0, 11.0, 20.0)),
-        "halo": (_of(known.halo, 25.0), _SHARES),
-        "dropouts": (_of(known.dropouts, DARK), (0.03, 0.1, 0.2)),
-        "outliers": (_of(known.outliers, 12.0), (0.03, 0.1, 0.2)),
-        "gain_loss": (lambda a, now, rng: strange.gain_loss(a, now.each_s), (0.001, 0.005, 0.01), "gain_drift"),
-        "hysteresis": (_of(known.hysteresis), _and_tenfold(1.0)),
-        "lag": (_of(known.lag), (2.0, 4.0, 8.0)),
-        "flicker": (_of(known.flicker, 0.37, 1.0), _UNITS),
-        "edge_shadow": (_of(known.edge_shadow, 8.0), _SHARES),
-        "correlated_noise": (_of(known.correlated_noise), (0.3, 0.6, 0.9)),
-        "signal_dependent_noise": (_of(known.signal_dependent_noise), (1.0, 8.0, 30.0)),
-        "quantisation": (_of(known.quantisation), (2.0, 5.0, 10.0)),
-        "periodic_position_error": (_of(known.periodic_position_error, 60.0, 0.0), _and_tenfold(1.0)),
-        "height_gradient": (lambda a, now, rng: known.height_gradient(a / _W), (0.5, 2.0, 5.0)),
-        "albedo_patch": (_of(known.albedo_patch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
-        "glint": (_of(known.glint, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
-        "sensor_tilt": (_of(known.sensor_tilt, 0.0), (2.0, 6.0, 12.0), CLEAN),
-        "position_scale": (lambda a, now, rng: known.position_scale(a, a), (0.005, 0.02, 0.05), CLEAN),
-        "dark_level": (_of(known.ambient_step, -math.inf), _and_tenfold(2.0)),
-        "gain": (_of(known.gain_drift, math.inf), _and_tenfold(0.05)),
-        "noise_sd": (lambda a, now, rng: known.drifting_noise(1 + a, 1e-9), _and_tenfold(0.5)),
-        "play_of_axes": (lambda a, now, rng: strange.play_of_axes(a, a / 2), _PLACES, "backlash"),
-        "scale_of_x": (_of(known.position_scale, 0.0), (0.005, 0.02, 0.05), "position_scale"),
-        "step_at_any_moment": (_step_at_any_moment, (2.0, 8.0, 16.0), "ambient_step"),
+        "backlash": (_of(conceal.backlash), _PLACES),
+        "saturation": (_of(conceal.saturation), _LEVELS),
+        "nonlinearity": (_of(conceal.nonlinearity), (1.1, 1.5, 2.2)),
+        "albedo_gradient": (lambda a, now, rng: conceal.albedo_gradient(-a / _W, 0.0), (0.1, 0.3, 0.5)),
+        "ambient_gradient": (lambda a, now, rng: conceal.ambient_gradient(a / _W, 0.0), (2.0, 10.0, 25.0)),
+        "ambient_step": (lambda a, now, rng: conceal.ambient_step(a, 6 * now.each_s), _STEPS),
+        "offset_drift": (lambda a, now, rng: conceal.offset_drift(a * 3600 / (30 * now.each_s)), _STEPS),
+        "gain_drift": (lambda a, now, rng: conceal.gain_drift(a, 15 * now.each_s), (0.05, 0.15, 0.3)),
+        "edge_blur": (_of(conceal.edge_blur), (3.0, 11.0, 20.0)),
+        "halo": (_of(conceal.halo, 25.0), _SHARES),
+        "dropouts": (_of(conceal.dropouts, DARK), _LOST),
+        "outliers": (_of(conceal.outliers, 12.0), _LOST),
+        "gain_loss": (lambda a, now, rng: conceal.gain_loss(a, now.each_s), (0.001, 0.005, 0.01), "gain_drift"),
+        "hysteresis": (_of(conceal.hysteresis), _and_tenfold(1.0)),
+        "lag": (_of(conceal.lag), (2.0, 4.0, 8.0)),
+        "flicker": (_of(conceal.flicker, 0.37, 1.0), _UNITS),
+        "edge_shadow": (_of(conceal.edge_shadow, 8.0), _SHARES),
+        "correlated_noise": (_of(conceal.correlated_noise), (0.3, 0.6, 0.9)),
+        "signal_dependent_noise": (_of(conceal.signal_dependent_noise), (1.0, 8.0, 30.0)),
+        "quantisation": (_of(conceal.quantisation), (2.0, 5.0, 10.0)),
+        "periodic_position_error": (_of(conceal.periodic_position_error, 60.0, 0.0), _and_tenfold(1.0)),
+        "height_gradient": (lambda a, now, rng: conceal.height_gradient(a / _W), _and_tenfold(0.5)),
+        "albedo_patch": (_of(conceal.albedo_patch, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
+        "glint": (_of(conceal.glint, *_MIDDLE_MM, 100.0), _and_tenfold(3.0)),
+        "sensor_tilt": (_of(conceal.sensor_tilt, 0.0), (2.0, 6.0, 12.0), CLEAN),
+        "position_scale": (lambda a, now, rng: conceal.position_scale(a, a), _SCALES, CLEAN),
+        "dark_level": (_of(conceal.ambient_step, -math.inf), _and_tenfold(2.0)),
+        "gain": (_of(conceal.gain_drift, math.inf), _and_tenfold(0.05)),
+        "noise_sd": (lambda a, now, rng: conceal.drifting_noise(1 + a, 1e-9), _and_tenfold(0.5)),
+        "play_of_axes": (lambda a, now, rng: conceal.play_of_axes(a, a / 2), _PLACES, "backlash"),
+        "scale_of_x": (_of(conceal.position_scale, 0.0), _SCALES, "position_scale"),
+        "step_at_any_moment": (_step_at_any_moment, _STEPS, "ambient_step"),
     },
     "another form": {
         "thermal_gain": (
-            lambda a, now, rng: strange.thermal_gain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10))),
+            lambda a, now, rng: conceal.thermal_gain(a, 50 * now.each_s, tuple(rng.uniform(0, 2 * math.pi, 10))),
             *(_and_tenfold(0.02), "gain_drift"),
         ),
-        "soft_saturation": (_of(known.saturation, 10.0), (55.0, 40.0, 25.0), "saturation"),
-        "dead_zone": (_of(strange.floor), _and_tenfold(0.05), "nonlinearity"),
-        "ghost": (_of(strange.ghost, 25.0, 0.0), _SHARES, "halo"),
-        "stick_slip": (_of(strange.stick_slip, 60.0, 0.0), _and_tenfold(1.0), "periodic_position_error"),
+        "soft_saturation": (_of(conceal.saturation, 10.0), _LEVELS, "saturation"),
+        "dead_zone": (_of(conceal.floor), _and_tenfold(0.05), "nonlinearity"),
+        "ghost": (_of(conceal.ghost, 25.0, 0.0), _SHARES, "halo"),
+        "stick_slip": (_of(conceal.stick_slip, 60.0, 0.0), _and_tenfold(1.0), "periodic_position_error"),
         "chirp": (
-            lambda a, now, rng: strange.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0),
+            lambda a, now, rng: conceal.chirp(a, 0.05 / now.each_s, 0.005 / now.each_s**2, 0.0),
             *(_UNITS, "flicker"),
         ),
     },
     "in no list": {
-        "bent_rail": (lambda a, now, rng: strange.bent_rail(a * (10 / _W) ** 2), _and_tenfold(2.0)),
-        "place_step": (_of(strange.place_step, _MIDDLE_MM[0]), _and_tenfold(1.0)),
-        "after_glow": (lambda a, now, rng: strange.after_glow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)), _UNITS),
-        "peak_memory": (_of(strange.peak_memory), _SHARES),
+        "bent_rail": (lambda a, now, rng: conceal.bent_rail(a * (10 / _W) ** 2), _and_tenfold(2.0)),
+        "place_step": (_of(conceal.place_step, _MIDDLE_MM[0]), _and_tenfold(1.0)),
+        "after_glow": (lambda a, now, rng: conceal.after_glow(a, 3 * now.each_s, 0.5 * (DARK + BRIGHT)), _UNITS),
+        "peak_memory": (_of(conceal.peak_memory), _SHARES),
     },
     "two at once": {
         "backlash_and_step": (
-            lambda a, now, rng: (known.backlash(a), _step_at_any_moment(a, now, rng)),
+            lambda a, now, rng: (conceal.backlash(a), _step_at_any_moment(a, now, rng)),
             *(_PLACES, "backlash ambient_step"),
         ),
         "gain_and_dark_level": (
-            lambda a, now, rng: (known.gain_drift(a / 50, math.inf), known.ambient_step(a, -math.inf)),
+            lambda a, now, rng: (conceal.gain_drift(a / 50, math.inf), conceal.ambient_step(a, -math.inf)),
             *(_and_tenfold(2.0), "gain dark_level"),
         ),
     },
@@ -233,7 +232,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     last = steps[-1]
     left_out = left_out_after_step(last, trial.trust)
     return {
-        "known": has_reached_target(last, experiment),
+        "known": Exploration(experiment, (last,)).target_reached,
         "readings": last.number,
         **accuracy_measures(last, experiment, trial.true_circle_in_arm_frame),
         "p_truth": round(sum(left_out.probability.get(name, 0.0) for name in trial.right_answers), 4),

@@ -16,9 +16,8 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._words import count_with_noun
 from probewise.diagnosis.words import effect_has_words, effect_in_words
 from probewise.experiment import least_readings
-from probewise.proof.campaign import Result
+from probewise.proof.campaign import LEAST_FOR_MEDIAN, Estimate, Result
 from probewise.proof.concealed_study import ConcealedRow, ConcealedTrial, concealed_csv, concealed_rows
-from probewise.proof.estimates import LEAST_FOR_MEDIAN, Estimate
 from probewise.proof.study import (
     REFERENCE,
     SearchConfiguration,
@@ -475,7 +474,7 @@ def challenge_page(
 
 _CHALLENGE_LEGEND = (
     "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is undecided. "
-    "Intervals: Wilson for shares, Student's t for means, bootstrap for all others. "
+    "Intervals: Wilson for shares, Student's t for means, order statistics for medians, bootstrap for all others. "
     "Rows on detection and covariates count effects on the mean; those on held-out gain, cases with white noise. "
     "Aliases are effects that a plan of this many readings could tell apart by less than 3 nats."
 )
@@ -538,7 +537,7 @@ def _case_cells(number: int, result: Result) -> tuple[str, ...]:
     # Beside a concealed effect, all of which act on the mean, names of noise effects are ignored.
     physics = tuple(name for name in names if name not in NOISE) if result["hidden"] else names
     right = are_names_right(result, physics, noise=not result["hidden"])
-    gains = gains_on_held_out_runs(result, "right")
+    gains = gains_on_held_out_runs(result)
     said = " and ".join(names) or "clean"
     return (
         *begun,

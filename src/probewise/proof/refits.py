@@ -48,14 +48,10 @@ class NullRefit:
 
     def __call__(self, clean: Recording, changed: Recording) -> float:
         """Return the norm of an effect's residuals after a full refit of the null, in reading units."""
-        return float(np.linalg.norm(self.refit(clean, changed).residuals))
-
-    def refit(self, clean: Recording, changed: Recording) -> Fit:
-        """Return the null model's fit to `changed`, as if the model fitted `clean` exactly."""
-        return self.rivalry(clean, changed).found
+        return float(np.linalg.norm(self.rivalry(clean, changed).found.residuals))
 
     def rivalry(self, clean: Recording, changed: Recording) -> _Rivalry:
-        """Return that fit with the readings to which it is made: `changed` minus the null's residuals on `clean`."""
+        """Return the null's fit to `changed` minus its residuals on `clean`, as if it fitted `clean` exactly."""
         null, readings = self.null_fit(clean), changed.readings.copy()
         readings[clean.usable] -= null.residuals
         without = Recording(changed.plan, readings)
@@ -164,27 +160,6 @@ def cosines_with_vocabulary(
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
         more = _fits_with_one_more_gaussian(rivalry.found, rivalry.readings, Extent.of(clean))
         out["ssf_order"] = rivalry.cosine(min(more, key=lambda f: float(np.linalg.norm(f.residuals))))
-    return out
-
-
-def residual_norms_with_one_named(
-    refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
-) -> dict[str, float]:
-    """Return the norm of two effects' residuals after a fit of the null model and one of them, by its name.
-
-    `clean`, `both`: noise-free readings without any effect and with both. Divided by the noise sd, the norm is the size
-    of the other effect given this one. It may be much smaller than its size alone: a saturation can hide a stain.
-    """
-    rivalry = refit.rivalry(clean, both)
-    out = {}
-    for name in names:
-        effect = VOCABULARY[name].for_extent(Extent.of(clean))
-        fits = [rivalry.found]
-        if effect is not None:
-            templates, entries, _ = rivalry.entries(effect)
-            _, first = np.unique(templates.choice[entries], return_index=True)
-            fits += rivalry.refits(effect, templates, entries[np.sort(first)[:_STARTS]])
-        out[name] = min(float(np.linalg.norm(by.residuals)) for by in fits)
     return out
 
 

@@ -23,6 +23,7 @@ from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm, Speed
 from probewise.errors import ParameterError, require
 from probewise.experiment import (
     Experiment,
+    Exploration,
     MethodName,
     NestedSampling,
     Step,
@@ -31,14 +32,22 @@ from probewise.experiment import (
     probability_of_length_off,
 )
 from probewise.experiment.from_sensor import AdjustedMixture, sensor_change_prior
-from probewise.experiment.judgement import is_target_reached
 from probewise.experiment.paper import student_t_likelihood
 from probewise.experiment.result import WRONG_MM
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
 from probewise.nested import NESTED_STOP, NestedStop
-from probewise.proof.campaign import TRIAL, Campaign, Result, misfit
-from probewise.proof.estimates import Estimate, estimated_share, grouped, mean_with_error, median_with_interval
+from probewise.proof.campaign import (
+    TRIAL,
+    Campaign,
+    Estimate,
+    Result,
+    estimated_share,
+    grouped,
+    mean_with_error,
+    median_with_interval,
+    misfit,
+)
 from probewise.recordings import Disc
 from probewise.scene import Circle, Field, HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
@@ -234,7 +243,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         if first_white is None and last.reading.value > _ON_WHITE:
             first_white, bits_at_white = last.number, round(last.bits, 3)
     return {
-        "reached": has_reached_target(last, experiment),
+        "reached": Exploration(experiment, (last,)).target_reached,
         "readings": last.number,
         "first_white": first_white,
         "bits": round(last.bits, 3),
@@ -257,12 +266,6 @@ def timed_steps(
         for step in steps:
             yield step, time.process_time() - before
             before = time.process_time()
-
-
-def has_reached_target(last: Step, experiment: Experiment) -> bool:
-    """Return whether a run reached the target precision with a posterior that fits its readings."""
-    known = is_target_reached(experiment, last.sd, last.shapes, last.chance_off)
-    return known and not experiment.fit_is_doubtful(last.p_value) and not last.unexplained
 
 
 def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:

@@ -16,10 +16,16 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.words import Names
 from probewise.effects import VOCABULARY
-from probewise.proof.campaign import Result
-from probewise.proof.estimates import Estimate, estimated_mean, estimated_share, estimated_statistic, grouped
-from probewise.proof.sensors.cases import NOISE_NAMES
-from probewise.proof.sensors.effects import NO_PHYSICS, SINGLES
+from probewise.proof.campaign import (
+    Estimate,
+    Result,
+    estimated_mean,
+    estimated_share,
+    estimated_statistic,
+    grouped,
+    median_with_interval,
+)
+from probewise.proof.sensors import CLEAR, FAINT, GROSS, NO_PHYSICS, NOISE_NAMES, SINGLES, SMALL
 
 Results: TypeAlias = Sequence[Result]
 
@@ -319,13 +325,10 @@ def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
 Decision: TypeAlias = Literal["met", "missed", "open"]
 
 _GAUSSIAN = ("gaussian", "two_lobes")  # SSFs that are mixtures of Gaussians
-_BESIDE = 0.8  # least share of an effect's size given the other: sqrt(1 - 0.5^2), less some tolerance
-_SCANS = ("angle", "pattern", "direction")
-_RUNS = ("inside", "beyond")
+_ALPHA, _STRICT = 0.05, 0.01  # p-values that are rejected
 _MOST_NATS = 100.0  # cap on a recording's held-out gain
 _LEAST_NATS = 3.0  # least gain of the right model for a share of it to be meaningful
 _AS_GOOD = 0.8  # share of the true law's held-out gain that counts as equally good
-_BOOTSTRAPS = 2000
 
 
 @dataclass(frozen=True)
@@ -369,7 +372,7 @@ def _rejected(results: Iterable[Result], alpha: float) -> list[bool]:
 
 def _alarms_by_noise(other: Results, most: float = math.inf) -> Iterator[ScoreRow]:
     for model, own in sorted(grouped((r["noise_model"], r) for r in other).items()):
-        yield _share(f"  {model}", _rejected(own, 0.05), most=most)
+        yield _share(f"  {model}", _rejected(own, _ALPHA), most=most)
 
 
 def _first_covariate_is_right(result: Result) -> bool:
@@ -407,27 +410,27 @@ def _seconds(part: str, *kinds: tuple[object, str, float]) -> Part:
     return rows
 
 
-def detected_and_named_by_effect(results: Results, size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
-    """Return by name of single effects of this size: (share detected at alpha .01, share with the right name first)."""
-    singles = _of((r for r in results if "failed" not in r), "single", size=size)
+def detected_and_named_by_effect(results: Results) -> dict[str, tuple[Estimate, Estimate]]:
+    """Return by name of single effects of lambda 8: (share detected at alpha .01, share with the right name first)."""
+    singles = _of((r for r in results if "failed" not in r), "single", size=SMALL)
     return {
-        name: (estimated_share(_rejected(own, 0.01)), estimated_share(map(is_leading_name_right, own)))
+        name: (estimated_share(_rejected(own, _STRICT)), estimated_share(map(is_leading_name_right, own)))
         for name, own in grouped((r["hidden"][0]["name"], r) for r in singles).items()
     }
 
 
 def _alarms_and_detection(done: list[Result]) -> Iterator[ScoreRow]:
     white, other = (_of(done, "clean", other_noise=is_other) for is_other in (False, True))
-    yield _share("false alarms, clean, alpha .05", _rejected(white, 0.05), 0.04, 0.06)
-    yield _share("false alarms, clean, alpha .01", _rejected(white, 0.01), 0.006, 0.015)
-    yield _share("false alarms, other noise, alpha .05", _rejected(other, 0.05), most=0.06)
+    yield _share("false alarms, clean, alpha .05", _rejected(white, _ALPHA), 0.04, 0.06)
+    yield _share("false alarms, clean, alpha .01", _rejected(white, _STRICT), 0.006, 0.015)
+    yield _share("false alarms, other noise, alpha .05", _rejected(other, _ALPHA), most=0.06)
     yield from _alarms_by_noise(other, most=0.06)
     for kind, words, most in (("clean", "clean", 0.005), ("ssf_order", "one Gaussian more", 0.01)):
         yield _share(f"physics named, {words}", map(names_effect_on_mean, _of(done, kind)), most=most)
     # The p-value does not test the noise, and one more Gaussian in the SSF imitates some effects.
     visible = [r for r in done if acts_on_mean(r) and is_distinguishable_from_ssf(r)]
-    for size, least in ((5.0, 0.8), (6.0, 0.93), (8.0, 0.995)):
-        found = _rejected(_of(visible, "single", size=size), 0.01)
+    for size, least in ((5.0, 0.8), (FAINT, 0.93), (SMALL, 0.995)):
+        found = _rejected(_of(visible, "single", size=size), _STRICT)
         yield _share(f"detection, alpha .01, lambda {size:g}", found, least)
     each = [detected for detected, _ in detected_and_named_by_effect(visible).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=estimated_share([]))
@@ -436,7 +439,7 @@ def _alarms_and_detection(done: list[Result]) -> Iterator[ScoreRow]:
 
 def _names(done: list[Result]) -> Iterator[ScoreRow]:
     shares = []
-    for size, least in ((6.0, 0.9), (8.0, 0.97), (12.0, 0.99), (20.0, 0.995)):
+    for size, least in ((FAINT, 0.9), (SMALL, 0.97), (CLEAR, 0.99), (GROSS, 0.995)):
         singles = _of(done, "single", size=size)
         yield (row := _share(f"right name first, lambda {size:g}", map(is_leading_name_right, singles), least))
         oracle = [oracle_name_rate(r["hidden"][0]) for r in singles]
@@ -457,7 +460,7 @@ def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
 
 def _probabilities(done: list[Result]) -> Iterator[ScoreRow]:
     yield _share("95 % credible set holds the truth", [credible_set_holds_truth(r, merged=False) for r in done], 0.95)
-    for size, most in ((8.0, 1.25), (12.0, 1.1)):
+    for size, most in ((SMALL, 1.25), (CLEAR, 1.1)):
         singles = _of(done, "single", size=size)
         merged = map(credible_set_size_with_aliases_merged, singles)
         oracle = [oracle_credible_set_size(r["hidden"][0]) for r in singles]
@@ -469,10 +472,10 @@ def _probabilities(done: list[Result]) -> Iterator[ScoreRow]:
 
 
 def _places_and_intervals(done: list[Result]) -> Iterator[ScoreRow]:
-    for size, least in ((12.0, 0.8), (20.0, 0.9)):
+    for size, least in ((CLEAR, 0.8), (GROSS, 0.9)):
         overlaps = [r["overlap"] for r in _of(done, "single", size=size) if r["overlap"] is not None]
         yield _mean(f"overlap of the place, lambda {size:g}", overlaps, least)
-    shown = [r for r in _of(done, "single", size=8.0) if acts_on_mean(r)]
+    shown = [r for r in _of(done, "single", size=SMALL) if acts_on_mean(r)]
     yield _share("right covariate first, lambda 8", map(_first_covariate_is_right, shown), 0.98)
     yield _mean("  oracle against the hardest rival", [oracle_covariate_rate(r["hidden"][0]) for r in shown])
     named = (r for r in done if names_match(r["combination"], right_names_of_each_effect(r, merged=False)))
@@ -484,50 +487,31 @@ def _places_and_intervals(done: list[Result]) -> Iterator[ScoreRow]:
     yield _share("95 % intervals of SSF and levels cover", _covered(of_sensors), 0.93)
 
 
+def _held_out_gain(result: Result, model: str) -> float:
+    """Return the gain of a model over the null, in nats, summed over what is held out."""
+    return float(sum(scores[model] - scores["null"] for scores in result["held_out"].values()))
+
+
+def _have_densities(result: Result, *models: str) -> bool:
+    return all(model in scores for scores in result["held_out"].values() for model in models)
+
+
 def _held_out_scans(done: list[Result]) -> Iterator[ScoreRow]:
-    inside = [r for r in _of(done, "single", "pair") if acts_on_mean(r)]
-    gains = _gains_by_scan([r for r in inside if all("right" in s for s in r["held_out"].values())], "right")
-    yield ScoreRow("held-out gain, share of the right model's", estimated_statistic(gains, _ratio_of_gains), 0.98)
-    for k, scan in enumerate(_SCANS):
-        yield ScoreRow(f"  a new {scan}", estimated_statistic(gains[:, k], _ratio_of_gains))
-    shares = {
-        "  share of what the truth itself would gain": inside,
-        "  the same, outside the vocabulary": _of(done, "outside"),
-    }
-    for name, cases in shares.items():
-        of_truth = _gains_by_scan([r for r in cases if r["noise_model"] == "white"], "true")
-        yield ScoreRow(name, estimated_statistic(of_truth, _ratio_of_gains))
-    worse = [_summed_gains(r, _SCANS, "true")[0] < -1.0 for r in done]
+    known = [r for r in _of(done, "single", "pair") if acts_on_mean(r) and _have_densities(r, "right")]
+    gains = np.array([[_held_out_gain(r, model) for model in ("repaired", "right")] for r in known]).reshape(-1, 2)
+    share = estimated_statistic(gains, lambda rows: float(rows[:, 0].sum() / rows[:, 1].sum()))
+    yield ScoreRow("held-out gain, share of the right model's", share, 0.98)
+    worse = [_held_out_gain(r, "repaired") < -1.0 for r in done]
     yield _share("held-out worse than the null by over 1 nat", worse, most=0.01)
     # The scatter that noise alone causes in the best gain possible with these readings.
-    by_chance = [bool(g < -1.0) for g in gains[:, :, 1].sum(axis=1)]
-    yield _share("  of the right model, fitted to the same", by_chance)
-
-
-def _gains_by_scan(results: Results, best: str) -> FloatArray:
-    """Return the gains in nats over the null of the repaired model and of model `best`, (n_cases, n_scans, 2)."""
-    gains = [[_summed_gains(r, [scan], best) for scan in _SCANS] for r in results]
-    return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
-
-
-def _summed_gains(result: Result, parts: Sequence[str], best: str) -> tuple[float, float]:
-    scores = [result["held_out"][part] for part in parts]
-    return sum(s["repaired"] - s["null"] for s in scores), sum(s[best] - s["null"] for s in scores)
-
-
-def _ratio_of_gains(gains: FloatArray) -> float:
-    repaired, true = gains.reshape(-1, 2).sum(axis=0)
-    return float(repaired / true)
+    yield _share("  of the right model, fitted to the same", [bool(gain < -1.0) for gain in gains[:, 1]])
 
 
 def _pairs_aliases_and_unlisted(done: list[Result]) -> Iterator[ScoreRow]:
     pairs, aliased = _of(done, "pair"), _of(done, "alias")
-    # Each effect keeps most of its size when the other is in the model.
-    shown = [r for r in pairs if all(h.get("size_beside", 0) >= _BESIDE * h["size_lambda"] for h in r["hidden"])]
     yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.95)
-    yield _share("  where neither hides the other", map(is_leading_name_right, shown))
     yield _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03)
-    for size, least in ((12.0, 0.9), (20.0, 0.97)):
+    for size, least in ((CLEAR, 0.9), (GROSS, 0.97)):
         outside = [r for r in done if is_out_of_vocabulary(r) and r["size"] == size]
         name = f"outside the vocabulary: unknown, or a rare effect named right, lambda {size:g}"
         yield _share(name, map(is_recognised_as_out_of_vocabulary, outside), least)
@@ -545,26 +529,22 @@ def _rounds(last: list[Result]) -> Iterator[ScoreRow]:
     for after_last, after_first in zip(_of_round(last), _of_round(first), strict=True):
         yield after_last
         yield ScoreRow(f"  after one round: {after_first.name}", after_first.found)
-    further = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in last], dtype=np.float64)
-    further, extra = further[further > 0], estimated_mean([])
-    if further.size:  # a bootstrap's percentiles
-        drawn = np.random.default_rng(0).choice(further, (_BOOTSTRAPS, further.size))
-        low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
-        extra = Estimate(float(np.median(further)), float(low), float(high), int(further.size))
+    further = [sum(each["readings"] for each in r["rounds"][1:]) for r in last]
+    extra = median_with_interval([n for n in further if n > 0])
     yield ScoreRow("extra readings, median of those not settled at once", extra, most=80.0)
     yield _share("settled at last", [r["rounds"][-1]["settled"] for r in last])
     yield _mean("processor time of an investigation (s)", [r["cpu_s"] for r in last])
 
 
 def _of_round(results: list[Result]) -> Iterator[ScoreRow]:
-    small, large = (_of(results, "single", size=size) for size in (8.0, 12.0))
+    small, large = (_of(results, "single", size=size) for size in (SMALL, CLEAR))
     pairs, holds = _of(results, "pair"), [credible_set_holds_truth(r, merged=False) for r in results]
     yield _share("right name first, lambda 8", map(is_leading_name_right, small), 0.985)
     yield _share("right name first, lambda 12", map(is_leading_name_right, large), 0.995)
     yield _mean("size of the credible set, lambda 8", _set_sizes(small), most=1.15)
     yield _mean("size of the credible set, lambda 12", _set_sizes(large), most=1.05)
     yield _share("95 % credible set holds the truth", holds, 0.95)
-    yield _share("detection, alpha .01, lambda 8", _rejected(filter(acts_on_mean, small), 0.01), 0.995)
+    yield _share("detection, alpha .01, lambda 8", _rejected(filter(acts_on_mean, small), _STRICT), 0.995)
     yield _share("two effects: both named", map(is_leading_name_right, pairs), 0.96)
     yield _share("two effects: a false extra", map(has_false_extra_effect, pairs), most=0.03)
     yield _share("physics named, clean", map(names_effect_on_mean, _of(results, "clean")), most=0.005)
@@ -577,19 +557,17 @@ def name_without_target(name: str) -> str:
 
 def _alarms_and_names_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
     white, other = (_of(done, "clean", other_noise=is_other) for is_other in (False, True))
-    yield _share("false alarms, no effect, white noise, alpha .05", _rejected(white, 0.05), 0.03, 0.06)
-    yield _share("false alarms, no effect, other noise, alpha .05", _rejected(other, 0.05), most=0.06)
+    yield _share("false alarms, no effect, white noise, alpha .05", _rejected(white, _ALPHA), 0.03, 0.06)
+    yield _share("false alarms, no effect, other noise, alpha .05", _rejected(other, _ALPHA), most=0.06)
     yield from _alarms_by_noise(other)
     yield _share("physics named, no effect, white noise", map(names_effect_on_mean, white), most=0.005)
     yield _share("physics named, no effect, other noise", map(names_effect_on_mean, other), most=0.005)
-    noise_is_right = [leading_hypothesis(r)[0] == tuple(r["truth"]) for r in other]
-    yield _share("noise named right, no effect, other noise", noise_is_right)
-    for size, least in ((6.0, -math.inf), (8.0, 0.9), (12.0, 0.95), (20.0, 0.98)):
+    for size, least in ((FAINT, -math.inf), (SMALL, 0.9), (CLEAR, 0.95), (GROSS, 0.98)):
         singles = _of(done, "single", size=size)
         yield _share(f"right name and target first, lambda {size:g}", map(is_leading_name_right, singles), least)
         if oracle := [oracle_name_rate(hidden) for hidden in _effects_with_rivals(singles)]:
             yield _mean(f"  oracle against the hardest rival, lambda {size:g}", oracle)
-    shown, pairs = _of(done, "single", size=12.0), _of(done, "pair")
+    shown, pairs = _of(done, "single", size=CLEAR), _of(done, "pair")
     yield _share("right covariate first, lambda 12", map(_first_covariate_is_right, shown), 0.95)
     yield _share("two effects, lambda 12 each: both named", map(is_leading_name_right, pairs), 0.85)
 
@@ -599,7 +577,7 @@ def _effects_with_rivals(singles: Results) -> list[Result]:
 
 
 def _probabilities_and_intervals_of_systems(done: list[Result]) -> Iterator[ScoreRow]:
-    singles = _of(done, "single", size=12.0)
+    singles = _of(done, "single", size=CLEAR)
     holds, holds_in_all = ([credible_set_holds_truth(r, merged=True) for r in rs] for rs in (singles, done))
     yield _share("95 % credible set holds the truth or its alias, lambda 12", holds, 0.95)
     yield _share("  the same, all cases", holds_in_all)
@@ -611,32 +589,28 @@ def _probabilities_and_intervals_of_systems(done: list[Result]) -> Iterator[Scor
     yield _share("wrong name stated above .9", wrong, most=0.01)
     yield ScoreRow("expected calibration error", calibration_error(done))
     stated = [item for r in done for effect in r["parameters"].values() for item in effect.items()]
-    others, per_run = ([i for name, i in stated if name.startswith("values[") is of_runs] for of_runs in (False, True))
-    yield _share("95 % intervals of effect parameters cover", _covered(others), 0.92, 0.98)
-    if per_run:
-        yield _share("  of values per run", _covered(per_run))
+    # One effect has a value for each run: they would outnumber all others.
+    shared = [interval for name, interval in stated if not name.startswith("values[")]
+    yield _share("95 % intervals of effect parameters cover", _covered(shared), 0.92, 0.98)
 
 
-def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:
-    """Return (gain of the repaired model, gain of model `best`) over the null in nats, summed over the held-out runs.
+def gains_on_held_out_runs(result: Result) -> tuple[float, float] | None:
+    """Return (gain of the repaired model, of the right one) over the null in nats, summed over the held-out runs.
 
     Each is capped at 100. None if a run lacks a density under one of the three models.
     """
-    if any(model not in result["held_out"][run] for run in _RUNS for model in ("null", "repaired", best)):
+    if not _have_densities(result, "null", "repaired", "right"):
         return None
-    repaired, most = _summed_gains(result, _RUNS, best)
-    return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
+    return min(_held_out_gain(result, "repaired"), _MOST_NATS), min(_held_out_gain(result, "right"), _MOST_NATS)
 
 
 def _held_out_runs(done: list[Result]) -> Iterator[ScoreRow]:
-    named = (gains_on_held_out_runs(r, "right") for r in _of(done, "single", "pair"))
-    shares = np.array([gains[0] / gains[1] for gains in named if gains is not None and gains[1] >= _LEAST_NATS])
-    found = estimated_statistic(shares, lambda values: float(np.median(values)))
-    yield ScoreRow("held-out runs: median share of the right model's gain", found, 0.95)
-    clean = "held-out worse than the null by over 3 nats", "  of those without an effect on the mean"
-    for name, cases in zip(clean, (done, _of(done, "clean")), strict=True):
-        each = (gains_on_held_out_runs(r, "true") for r in cases)
-        yield _share(name, [bool(gains[0] < -3.0) for gains in each if gains is not None])
+    named = map(gains_on_held_out_runs, _of(done, "single", "pair"))
+    shares = [gains[0] / gains[1] for gains in named if gains is not None and gains[1] >= _LEAST_NATS]
+    yield ScoreRow("held-out runs: median share of the right model's gain", median_with_interval(shares), 0.95)
+    scored = (r for r in done if _have_densities(r, "null", "repaired"))
+    worse = [_held_out_gain(r, "repaired") < -3.0 for r in scored]
+    yield _share("held-out worse than the null by over 3 nats", worse)
 
 
 def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:
@@ -646,7 +620,6 @@ def _unlisted_laws(done: list[Result]) -> Iterator[ScoreRow]:
     name = "out of vocabulary, lambda 20: unknown, a right name, or 0.8 of the held-out gain"
     yield _share(name, recognised, 0.9)
     yield _share("  the same without unknown", good, 0.6)
-    yield _share("  a formula found", [bool(r["formula"]) for r in outside])
     yield _share("false unknown", _unknown(r for r in done if r["kind"] != "outside" and not is_out_of_vocabulary(r)))
 
 
@@ -655,7 +628,7 @@ def _gains_as_much_as_true_law(result: Result) -> bool:
     names = leading_hypothesis(result)[0]
     if names_match(names, right_names_of_each_effect(result, merged=True)) and result["verdict"] != "unknown":
         return True
-    gains = gains_on_held_out_runs(result, "right")
+    gains = gains_on_held_out_runs(result)
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
 
 

@@ -24,17 +24,14 @@ LEFT_MM, RIGHT_MM, TOP_MM, BOTTOM_MM = 16.0, 12.0, 10.5, 20.0
 """Margins of a page: printers leave some 6 mm blank; the rest holds text."""
 
 OVERLAP_MM = 6.0
-CROSS_MM = 15.0  # half of a cross: long enough to show beyond a block of two LEGO studs
 """Width of the strip printed beyond the cut, on which the next page is glued."""
+CROSS_MM = 15.0  # half of a cross: long enough to show beyond a block of two LEGO studs
 
 AROUND_MM = 40.0  # margin beyond the outermost reading, which the sensor still sees
-BEAM_MM = 8.0
-"""Width of a LEGO beam."""
-
 PATTERN_FRAME = "the pattern's origin"
 _MOST_PAGES = 400
 _ROUND_MM = 5.0
-_JIG_MM, _JIG_BASE_MM = 20.0, 40.0
+_JIG_MM = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +47,8 @@ class Sheet:
     crosses_mm: FloatArray | None = None  # to bring the sensor or a joint to, (n, 2)
     cross_names: tuple[str, ...] = ()  # text beside each cross; empty: its number and place
     strokes_mm: tuple[FloatArray, ...] = ()  # further lines, (n, 2) each
-    words: tuple[tuple[float, float, str], ...] = ()  # further texts, each with x and y of its left end before it
     frame: str = PATTERN_FRAME  # origin of x and y, in words
     orientations_rad: tuple[float, ...] = ()  # of the sensor over the sheet
-    skips_blank_pages: bool = False  # whether pages without a line or cross are left out
 
     @property
     def is_pattern(self) -> bool:
@@ -109,10 +104,7 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
         low, high = (x_mm[column], y_mm[row]), (x_mm[column + 1], y_mm[row + 1])
         beyond = (OVERLAP_MM * (column < n_columns - 1), OVERLAP_MM * (row < n_rows - 1))
         tiles.append(Tile(column, row, low, high, page, beyond))
-    if not sheet.skips_blank_pages:
-        return tuple(tiles)
-    points = points_of_lines(sheet)  # inside a page, not only along its edge
-    return tuple(t for t in tiles if ((points > t.low_mm) & (points < t.high_mm)).all(axis=1).any())
+    return tuple(tiles)
 
 
 def lines_of_crosses(sheet: Sheet) -> FloatArray:
@@ -120,15 +112,6 @@ def lines_of_crosses(sheet: Sheet) -> FloatArray:
     arms = CROSS_MM * np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 1.0]]])
     marks = np.empty((0, 2)) if sheet.crosses_mm is None else np.asarray(sheet.crosses_mm)
     return (marks[:, None, None, :] + arms).reshape(-1, 2, 2)
-
-
-def points_of_lines(sheet: Sheet) -> FloatArray:
-    """Return places half a millimetre apart along the lines of a sheet, those of its crosses too, (n, 2)."""
-    lines = [*sheet.strokes_mm, *lines_of_crosses(sheet), *([] if sheet.outline_mm is None else [sheet.outline_mm])]
-    places = [
-        np.linspace(a, b, 2 + math.ceil(2 * math.dist(a, b))) for line in lines for a, b in itertools.pairwise(line)
-    ]
-    return np.concatenate([np.empty((0, 2)), *places])
 
 
 def pattern_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tuple[Sheet, ...]:
@@ -175,87 +158,31 @@ def marks_sheet(geometry: Geometry) -> Sheet:
     return Sheet("marks", Uniform(1.0), (0.0, 0.0), geometry.field_mm, lines, crosses_mm=marks, frame=frame)
 
 
-def arm_home_jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
-    """Return two sheets that show an arm at its home angles: its links from the side, and its base from above."""
+def arm_home_jig_sheet(geometry: Geometry) -> Sheet:
+    """Make the sheet of an arm's links at their home angles, from the side: places from the base's axis and height."""
     base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
-    turns = (shoulder, shoulder + elbow if geometry.elbow_is_relative else elbow)
-    *joints, face = geometry.joints_from_side_mm(shoulder, elbow)
-    return _links_from_side_sheet(geometry, joints, face, turns), _base_from_above_sheet(geometry, base, float(face[0]))
-
-
-def _links_from_side_sheet(
-    geometry: Geometry, joints: list[FloatArray], face: FloatArray, turns: tuple[float, float]
-) -> Sheet:
-    """Make the jig's sheet of the links: places from the base's axis and above the table, `turns` of both links."""
-    crosses, links = np.array([*joints, face]), list(itertools.pairwise(joints))
-    beams = [_beam_outline(a, b) for a, b in links]
-    drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
-    low, high = _sheet_corners_around(drawn, _JIG_MM)
-    if drawn[:, 1].min() >= 0:
+    joints = np.array(geometry.joints_from_side_mm(shoulder, elbow))
+    low, high = _sheet_corners_around(np.concatenate([joints, np.zeros((1, 2))]), _JIG_MM)
+    if joints[:, 1].min() >= 0:
         low = low[0], 0.0  # cut there, the sheet stands on the table
-    words = [(3.0, 40.0, "the base's axis"), (4.0, 4.0, "the table")]
-    for name, length, angle, (a, b) in zip(("upper", "lower"), geometry.links_mm, turns, links, strict=True):
-        (x, y), degrees = ((a + b) / 2 + 8.0).tolist(), math.degrees(angle)
-        words.append((x, y, f"{name} link, {length:g} mm\n{degrees:.4g} degrees from the horizontal"))
-    axis, table = [[0.0, max(low[1], 0.0)], [0.0, high[1]]], [[low[0], 0.0], [high[0], 0.0]]
     lines = (
         "the links at home, from the side, outwards to the right",
         "glue it on card, cut it at y = 0, stand it on the table beside the",
-        "links, the base's axis at x = 0; bring the joints' axles to the crosses",
+        "links, the base's axis at x = 0; bring the joints' axles to the crosses;",
+        f"the base is at {math.degrees(base):.4g} degrees from the field's x axis",
     )
+    axis, table = [[0.0, max(low[1], 0.0)], [0.0, high[1]]], [[low[0], 0.0], [high[0], 0.0]]
     return Sheet(
-        "jig, side",
+        "jig",
         Uniform(1.0),
         low,
         high,
         lines,
-        crosses_mm=crosses,
-        cross_names=("shoulder", "elbow", "wrist", f"sensor's face, {face[1]:.1f} mm up"),
-        strokes_mm=(*beams, *map(np.array, links), np.array(axis), np.array(table)),
-        words=tuple(words),
+        crosses_mm=joints,
+        cross_names=("shoulder", "elbow", "wrist", f"sensor's face, {joints[-1, 1]:.1f} mm up"),
+        strokes_mm=(joints[:-1], np.array(axis), np.array(table)),
         frame="where the base's axis meets the table; y is the height",
-        skips_blank_pages=True,
     )
-
-
-def _base_from_above_sheet(geometry: Geometry, base_rad: float, out_mm: float) -> Sheet:
-    """Make the jig's sheet of the base, whose sensor is `out_mm` from its axis."""
-    axis = np.array(geometry.axis_mm)
-    rest = axis + out_mm * np.array([math.cos(base_rad), math.sin(base_rad)])
-    low, high = _sheet_corners_around(np.array([axis, rest]), _JIG_BASE_MM)
-    x_low, y_low, x_high, y_high = *low, *high
-    width, height = geometry.field_mm
-    edges = [np.array([[max(x_low, 0.0), y], [min(x_high, width), y]]) for y in (0.0, height) if y_low < y < y_high]
-    edges += [np.array([[x, max(y_low, 0.0)], [x, min(y_high, height)]]) for x in (0.0, width) if x_low < x < x_high]
-    lines = (
-        f"the base at home, from above: {math.degrees(base_rad):.4g} degrees from the x axis",
-        "lay its cross below the base's axis and its line on the field's edge",
-        "(cut out what the base covers); turn the base until the links are",
-        "above the line",
-    )
-    return Sheet(
-        "jig, base",
-        Uniform(1.0),
-        low,
-        high,
-        lines,
-        crosses_mm=np.array([axis, rest]),
-        cross_names=("the base's axis", "sensor"),
-        strokes_mm=(np.array([axis, rest]), *edges),
-        words=tuple((max(edge[0, 0], x_low) + 4.0, edge[0, 1] + 3.0, "edge of the field") for edge in edges),
-        frame="the field's lower left corner",
-    )
-
-
-def _beam_outline(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
-    """Return the closed outline, (n, 2), of a beam with round ends, given the centres of its outer holes."""
-    turn = math.atan2(*(end_mm - start_mm)[::-1].tolist())
-    half = np.linspace(math.pi / 2, 3 * math.pi / 2, 37)
-    ends = [
-        centre + BEAM_MM / 2 * np.stack([np.cos(half + turn + way), np.sin(half + turn + way)], axis=-1)
-        for centre, way in ((start_mm, 0.0), (end_mm, math.pi))
-    ]
-    return np.concatenate([*ends, ends[0][:1]])
 
 
 def _sheet_corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:

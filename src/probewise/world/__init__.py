@@ -4,13 +4,11 @@ It shares only the file formats with the rest of the package: data simulated by 
 the model. The summed integral is the paper's eq. RwithSSF.
 """
 
-from probewise.world import unlisted
 from probewise.world.concealed import ambient_gradient, backlash, correlated_noise, gain_drift, nonlinearity, saturation
-from probewise.world.rays import seen_white_fraction
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.stages import Concealed, Rows
-from probewise.world.surfaces import CoveredSurface, Oval, Surface, albedo_at
-from probewise.world.world import View, World, simulate
+from probewise.world.surfaces import CoveredSurface, Oval, Surface, albedo_at, seen_white_fraction
+from probewise.world.world import View, World
 
 __all__ = [
     "Blob",
@@ -34,7 +32,5 @@ __all__ = [
     "ring_spot",
     "saturation",
     "seen_white_fraction",
-    "simulate",
     "tailed_spot",
-    "unlisted",
 ]

@@ -110,14 +110,14 @@ def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
 
 
 def ridge_spot(
-    radius_mm: float = 9.0,
+    radius_mm: float,
     *,
-    center_mm: tuple[float, float] = (0.0, 1.5),
-    lobes: float = 0.35,
-    ridge_mm: float = -3.0,
-    ridge_width_mm: float = 1.2,
-    shadow: float = 0.6,
-    pixel_mm: float = 0.25,
+    center_mm: tuple[float, float],
+    lobes: float,
+    ridge_mm: float,
+    ridge_width_mm: float,
+    shadow: float,
+    pixel_mm: float,
 ) -> Spot:
     """Make a cosine disc with two lobes and the shadow of a ridge across it; not a mixture of Gaussians.
 
@@ -135,13 +135,7 @@ def ridge_spot(
     return raster_spot(light_density, radius_mm + pixel_mm, center_mm=center_mm, pixel_mm=pixel_mm)
 
 
-def tailed_spot(
-    core_mm: tuple[float, float] = (3.0, 1.8),
-    *,
-    center_mm: tuple[float, float] = (0.0, 1.5),
-    skew: float = 0.4,
-    pixel_mm: float = 0.25,
-) -> Spot:
+def tailed_spot(core_mm: tuple[float, float], *, center_mm: tuple[float, float], skew: float, pixel_mm: float) -> Spot:
     """Make a skewed footprint with exponential tails, exp(-r) in stretched axes; not a mixture of Gaussians.
 
     `core_mm` are the decay lengths along u and v; `skew`, 0 to below 1 (else ParameterError), lengthens the tail
@@ -159,12 +153,7 @@ def tailed_spot(
 
 
 def ring_spot(
-    radius_mm: float = 4.0,
-    width_mm: float = 1.6,
-    *,
-    center_mm: tuple[float, float] = (0.0, 1.5),
-    off_axis: float = 0.4,
-    pixel_mm: float = 0.25,
+    radius_mm: float, width_mm: float, *, center_mm: tuple[float, float], off_axis: float, pixel_mm: float
 ) -> Spot:
     """Make a ring, brighter on one side, as of an LED off the lens axis; not a mixture of Gaussians.
 

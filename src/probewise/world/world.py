@@ -13,10 +13,9 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError, require
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.rays import seen_white_fraction
 from probewise.world.spots import Spot
 from probewise.world.stages import STAGES, Concealed, FootprintPart, Rows, Stage
-from probewise.world.surfaces import Surface, common_edge_normal, distance_to_nearest_edge
+from probewise.world.surfaces import Surface, common_edge_normal, distance_to_nearest_edge, seen_white_fraction
 
 _Surfaces = Sequence[tuple[Surface, IntArray]]
 """Each surface with the rows read over it."""
@@ -219,8 +218,3 @@ class World:
         for name, _ in rows_by_pattern:
             require(name in known, "pattern", name, f"one of {', '.join(known) or 'none'}, or give it in surfaces")
         return [(known[name], rows) for name, rows in rows_by_pattern]
-
-
-def simulate(plan: Plan, world: World, *, rng: np.random.Generator) -> Recording:
-    """Simulate the recording of a plan in a world (`World.simulate` as a function)."""
-    return world.simulate(plan, rng=rng)

@@ -6,7 +6,7 @@ import pytest
 
 from probewise.errors import FileError
 from probewise.proof.challenge import Task, challenge, run_case
-from probewise.proof.sensors.cases import stratum_of
+from probewise.proof.sensors import stratum_of
 from probewise.proof.tables import score
 
 

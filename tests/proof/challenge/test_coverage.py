@@ -7,7 +7,7 @@ import pytest
 
 from probewise.diagnosis import EffectFound, ModelSamples, ParameterFound, Place
 from probewise.proof.challenge import effect_truths_and_intervals, place_overlap, sensor_truths_and_intervals
-from probewise.proof.sensors.effects import CovariateRegion
+from probewise.proof.sensors import CovariateRegion
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
 from probewise.world.concealed import flicker

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from probewise.effects import VOCABULARY
-from probewise.proof.refits import NullRefit, cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.proof.refits import NullRefit, cosines_with_vocabulary
 from probewise.proof.tables import score
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
-from probewise.world.concealed import ambient_step, halo, hysteresis
+from probewise.world.concealed import ambient_step, halo
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
@@ -68,15 +68,6 @@ def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, 
     assert cosines_with_vocabulary(refit, clean, skirt)["ssf_order"] > 0.99
     step = replace(world, concealed=(ambient_step(0.4, 300.0),)).simulate(plan, rng=None)
     assert "ssf_order" not in cosines_with_vocabulary(refit, clean, step)
-
-
-def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan, clean):
-    """Two routes: one effect fitted to both, and the null fitted to the other alone."""
-    hidden = ambient_step(0.8, float(np.quantile(plan.time_s, 0.4))), hysteresis(0.5)
-    both = replace(world, concealed=hidden).simulate(plan, rng=None)
-    alone = replace(world, concealed=hidden[1:]).simulate(plan, rng=None)
-    left = residual_norms_with_one_named(refit, clean, both, ["ambient_step"])
-    assert left["ambient_step"] == pytest.approx(refit(clean, alone), rel=0.1)
 
 
 def test_an_alarm_is_due_on_physics_alone(make):

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2, poisson
 
 from probewise.errors import ParameterError
-from probewise.proof.estimates import estimated_share
+from probewise.proof.campaign import estimated_share
 from probewise.proof.study import SearchConfiguration, summarise
 
 from ..conftest import search

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.proof.sensors.cases import Stratum
+from probewise.proof.sensors import Stratum
 from probewise.proof.systems.cases import (
     KINDS,
     SystemCase,
     draw_system,
-    noise_of_size,
+    make_noise,
     simulator_file_text,
     write_system_case,
 )
@@ -23,9 +23,7 @@ def _case(kind, said='noise = {"sd": 0.5}', seed=5):
     rng = np.random.default_rng(seed)
     drawn = draw_system(kind, rng=rng)
     noise_free = drawn.simulate_all_rows([])
-    noise = noise_of_size(
-        "white", 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_table, kind.sd, rng=rng
-    )
+    noise = make_noise("white", noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_table, kind.sd, rng=rng)
     labels = tuple(f"r{k}" for k in range(drawn.table.n_runs))
     return SystemCase(Stratum("clean"), drawn, (), noise, said, labels, noise_free, np.round(noise_free, 9))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from probewise.proof.challenge import _right_predictions
-from probewise.proof.refits import SystemRefit, nats_of_alternative, rivals_with_nats
+from probewise.proof.challenge import _right_model_and_readings
+from probewise.proof.refits import SystemRefit, nats_of_alternative, rivals_with_nats, run_table
 from probewise.proof.systems import cases
 from probewise.proof.systems.cases import (
     KINDS,
@@ -15,12 +15,13 @@ from probewise.proof.systems.cases import (
     draw_effect_of_size,
     draw_system,
     draw_system_case,
-    noise_of_size,
+    make_noise,
     simulator_file_text,
     system_stratum_of,
     table_text,
 )
 from probewise.proof.systems.forms import SystemEffect, forms_of
+from probewise.systems import predict_system
 
 BY_NAME = {kind.name: kind for kind in KINDS}
 
@@ -44,7 +45,7 @@ def _size(drawn, effect):
 def _case(drawn, effects):
     """A case without noise."""
     free = drawn.simulate_all_rows(effects)
-    noise = noise_of_size("white", 12.0, free, drawn.table, drawn.kind.sd, rng=np.random.default_rng(0))
+    noise = make_noise("white", free, drawn.table, drawn.kind.sd, rng=np.random.default_rng(0))
     return SystemCase(Stratum("single"), drawn, tuple(effects), noise, "", (), free, free)
 
 
@@ -104,11 +105,13 @@ def test_the_right_model_knows_what_nobody_can_but_not_the_held_out_runs_own_val
     n, form = drawn.table.n_runs, _form(drawn, "offset_per_run")
     values = dict.fromkeys([f"values[{k}]" for k in range(n)], 0.2) | {f"values[{n - 1}]": 5.0}
     case = _case(drawn, [SystemEffect(form, values, 12.0)])
-    predicted, sd = _right_predictions(case, refit, rng=np.random.default_rng(0))
     held = drawn.held_out_row_numbers
-    np.testing.assert_allclose(sd, drawn.kind.sd)
-    off = np.abs(predicted.mean(axis=0) - drawn.simulate_all_rows([])[held] - 0.2)
-    assert off.max() < 0.5 * drawn.kind.sd
+    later = run_table(drawn.table.select_rows(held), drawn.kind, case.readings[held])
+    model, table = _right_model_and_readings(case, later, refit, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(table.covariates[drawn.kind.reading], case.readings[held] - 0.2)
+    np.testing.assert_allclose(model.noise_sd, drawn.kind.sd)
+    found = predict_system(model, table, rng=np.random.default_rng(1))
+    assert np.abs(found.mean - drawn.simulate_all_rows([])[held]).max() < 0.5 * drawn.kind.sd
 
 
 def test_half_of_the_wheel_is_clean():

@@ -4,26 +4,29 @@ Telegrams are pure values and bytes; the link sends and receives them; motor, li
 interface. Each layer can be used and tested without those above it.
 """
 
-from probewise.arm.nxt.brick import Brick, BrickMachine
-from probewise.arm.nxt.light import LightSensor, SensorError, normalized_from_counts, percent_from_counts
-from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, SerialPort, Timing
-from probewise.arm.nxt.motor import DriveParameters, Guard, Motor, MotorError
-from probewise.arm.nxt.telegram import BrickError, Reply, Request, TelegramError, decode, encode, framed
+from probewise.arm.nxt.brick import (
+    Brick,
+    BrickMachine,
+    LightSensor,
+    SensorError,
+    normalized_from_counts,
+    percent_from_counts,
+)
+from probewise.arm.nxt.link import Link, NoAnswerError, SerialPort, Timing
+from probewise.arm.nxt.motor import DriveParameters, Motor, MotorError
+from probewise.arm.nxt.telegram import BrickError, Reply, TelegramError, decode, encode, framed
 
 __all__ = [
     "Brick",
     "BrickError",
     "BrickMachine",
-    "ByteStream",
     "DriveParameters",
-    "Guard",
     "LightSensor",
     "Link",
     "Motor",
     "MotorError",
     "NoAnswerError",
     "Reply",
-    "Request",
     "SensorError",
     "SerialPort",
     "TelegramError",

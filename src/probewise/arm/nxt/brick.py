@@ -1,4 +1,7 @@
-"""The brick and the arm wired to it: motors, light sensor, battery; at the end all motors stop and LEDs go off."""
+"""The brick and the arm wired to it: motors, light sensor, battery; at the end all motors stop and LEDs go off.
+
+The light sensor is LEGO's 9844, whose A/D counts are converted as in the brick's firmware.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +14,128 @@ from types import TracebackType
 from typing import Self
 
 from probewise._signals import defer_signals
-from probewise.arm.geometry import ROOM_COUNTS, Geometry
+from probewise.arm.geometry import ROOM_COUNTS, Geometry, SoftLimits
 from probewise.arm.instrument import Clock, Side
-from probewise.arm.machine import SoftLimits
-from probewise.arm.nxt.light import LightSensor, percent_from_counts
 from probewise.arm.nxt.link import Link, SerialPort
 from probewise.arm.nxt.motor import DriveParameters, Guard, Motor
 from probewise.arm.nxt.telegram import (
     ALL_OUTPUTS,
+    GET_BATTERY_LEVEL,
+    GET_CURRENT_PROGRAM_NAME,
+    GET_DEVICE_INFO,
+    GET_FIRMWARE_VERSION,
+    LED_OFF,
+    LED_ON,
+    NO_SENSOR,
+    RAW,
     BrickError,
     FirmwareVersion,
-    GetBatteryLevel,
-    GetCurrentProgramName,
-    GetDeviceInfo,
-    GetFirmwareVersion,
+    InputValues,
     Request,
-    SetOutputState,
+    TelegramError,
+    get_input_values,
+    set_input_type,
+    set_output_state,
 )
-from probewise.errors import LinkError, LowBatteryWarning
+from probewise.errors import LinkError, LowBatteryWarning, require
+
+AD_MAX = 1023
+N_INVALID = 3  # least number of attempts, since one may use up the allowed time on a slow connection
+_BRIGHT_COUNTS = 200  # 800 mV of 5000 mV in the firmware's integer arithmetic: 5 V is 1023 counts
+_SPAN_PERCENT = 68  # share of the converter's range between bright and dark, in percent
+
+
+class SensorError(LinkError):
+    """Raised for a sensor that gives no usable reading."""
+
+
+def normalized_from_counts(raw_counts: int) -> int:
+    """Convert A/D counts, 0 to 1023 (else ParameterError), which fall with brightness, to 0 (dark) to 1023 (bright).
+
+    The firmware's integer arithmetic for types 05 and 06: only 697 of the 1024 values occur.
+    """
+    require(0 <= raw_counts <= AD_MAX, "raw_counts", raw_counts, f"0 to {AD_MAX}")
+    dark = max(raw_counts - _BRIGHT_COUNTS, 0) * 100 // _SPAN_PERCENT
+    return AD_MAX - min(dark, AD_MAX)
+
+
+def percent_from_counts(raw_counts: int) -> float:
+    """Convert A/D counts to percent, 0 (dark) to 100 (bright), about seven steps per percent."""
+    return normalized_from_counts(raw_counts) * 100 / AD_MAX
+
+
+class LightSensor:
+    """A light sensor at one of the brick's inputs, 0 to 3 for 1 to 4, read in RAW mode: A/D counts.
+
+    While the brick marks a reading as invalid, the read is repeated for `valid_s`, three times at least.
+    """
+
+    def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:
+        self._link, self.port, self._clock, self._valid_s = link, port, clock, valid_s
+        self._type: int | None = None
+
+    def set_led(self, lit: bool = True) -> None:
+        """Switch the LED on (`lit`) or off, and set the input to raw readings."""
+        self._type = LED_ON if lit else LED_OFF
+        self._link.ask(set_input_type(self.port, self._type))
+
+    def flash(self) -> int:
+        """Light the LED for one reading, as in the paper: it is at the same temperature in all of them.
+
+        The reading is the first that the brick marks as valid, 20 ms or more after the LED came on. A lost connection
+        afterwards does not lose it. Raises as `read` does.
+        """
+        self.set_led()
+        try:
+            return self.read()
+        finally:
+            self._type = None
+            with contextlib.suppress(LinkError):
+                self._link.tell(self.off_command)
+
+    def read(self) -> int:
+        """Read once, with the LED as last set (by default on).
+
+        Raises SensorError if the brick marks every reading as invalid, TelegramError if its answers remain
+        inconsistent.
+        """
+        if self._type is None:
+            self.set_led()
+        deadline = self._clock.monotonic() + self._valid_s
+        number = 0
+        while True:
+            number += 1
+            values = self._link.ask(get_input_values(self.port), check=_require_consistent)
+            as_set = (values.type, values.mode) == (self._type, RAW)
+            # An invalid reading still holds the old values.
+            if as_set and values.valid:
+                return values.raw
+            if number >= N_INVALID and self._clock.monotonic() > deadline:
+                raise SensorError(
+                    f"input {self.port + 1} gave no valid reading for {self._valid_s:g} s; "
+                    "is the light sensor plugged in?"
+                )
+            if not as_set:  # a program that starts or stops resets all settings
+                self.set_led(self._type == LED_ON)
+
+    @property
+    def off_command(self) -> Request[None]:
+        """The command that switches the LED off and unconfigures the input."""
+        return set_input_type(self.port, NO_SENSOR)
+
+
+def _require_consistent(values: InputValues) -> None:
+    """Raise TelegramError if counts and converted values contradict each other: a byte was corrupted on the way.
+
+    The protocol has no checksum, but the firmware sends each reading four times, as counts and converted.
+    """
+    possible = values.valid in (0, 1) and not values.calibrated and values.raw <= AD_MAX
+    if possible and values.valid and values.type in (LED_ON, LED_OFF) and values.mode == RAW:
+        converted = {values.normalized, values.scaled, values.calibrated_value}
+        possible = converted == {normalized_from_counts(values.raw)}
+    if not possible:
+        raise TelegramError(f"input {values.port + 1} says {values}: counts and converted values contradict each other")
+
 
 LOW_MV = 6000
 """Voltage below which six cells are nearly empty: motors slow down, and the brick soon switches itself off."""
@@ -86,7 +193,7 @@ class Brick:
         LinkError if the brick does not answer, or no two of six successive voltages agree.
         """
         for _ in range(N_ASKED):
-            before, self._last_mv = self._last_mv, self.link.ask(GetBatteryLevel())
+            before, self._last_mv = self._last_mv, self.link.ask(GET_BATTERY_LEVEL)
             if before is not None and abs(self._last_mv - before) <= STEP_MV:
                 break
         else:
@@ -105,16 +212,16 @@ class Brick:
 
     def name(self) -> str:
         """Return the brick's name."""
-        return self.link.ask(GetDeviceInfo())
+        return self.link.ask(GET_DEVICE_INFO)
 
     def version(self) -> FirmwareVersion:
         """Return the versions of the brick's firmware and protocol."""
-        return self.link.ask(GetFirmwareVersion())
+        return self.link.ask(GET_FIRMWARE_VERSION)
 
     def running_program(self) -> str | None:
         """Return the file name of the program running on the brick, which could drive motors and sensors, or None."""
         try:
-            return self.link.ask(GetCurrentProgramName())
+            return self.link.ask(GET_CURRENT_PROGRAM_NAME)
         except BrickError as error:
             if error.status == NO_PROGRAM:
                 return None
@@ -126,7 +233,7 @@ class Brick:
         First send all commands without asking for answers, which may be missing or late; then send them with answers.
         """
         commands: list[Request[None]] = [
-            SetOutputState(ALL_OUTPUTS),
+            set_output_state(ALL_OUTPUTS),
             *(light.off_command for light in self._lights.values()),
         ]
         failures = []
@@ -141,7 +248,12 @@ class Brick:
 
 
 class BrickMachine:
-    """A brick wired as in the arm's geometry: the machine of a `LegoArm`."""
+    """A brick wired as in the arm's geometry: three motors and a light sensor, the machine of a `LegoArm`.
+
+    Joints 0 to 2 are base, shoulder and elbow. `move_to` approaches a count with the count rising (side 1) or falling
+    (-1), `move_near` reaches it approximately; both then hold the motor. `find_stop` turns a joint gently to its stop,
+    with the angle rising or falling; its count becomes `stop_counts`. The light is read with the LED on, 0 to 100.
+    """
 
     def __init__(self, brick: Brick, geometry: Geometry) -> None:
         self.brick = brick

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 from probewise.arm.instrument import Clock
 from probewise.arm.nxt.telegram import (
+    GET_BATTERY_LEVEL,
+    GET_FIRMWARE_VERSION,
+    KEEP_ALIVE,
     LONGEST,
     BrickError,
-    GetBatteryLevel,
-    GetFirmwareVersion,
-    KeepAlive,
     Reply,
     Request,
     TelegramError,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 A = TypeVar("A")
 
-FENCES: tuple[Request[Any], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())
+FENCES: tuple[Request[Any], ...] = (GET_BATTERY_LEVEL, GET_FIRMWARE_VERSION, KEEP_ALIVE)
 UNKNOWN = -1  # a question sent by another program before this one began
 
 
@@ -73,9 +73,8 @@ class Timing:
     @property
     def longest_s(self) -> float:
         """Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
-        draining_s = self.answer_s + self.silence_s
-        waiting_s = 2 * self.turn_s + self.answer_s
-        return (1 + self.n_repeats) * (waiting_s + draining_s + len(FENCES) * (waiting_s + draining_s))
+        draining_s, waiting_s = self.answer_s + self.silence_s, 2 * self.turn_s + self.answer_s
+        return (1 + self.n_repeats) * (1 + len(FENCES)) * (waiting_s + draining_s)
 
 
 class NoAnswerError(LinkError):
@@ -83,11 +82,11 @@ class NoAnswerError(LinkError):
 
 
 class Link:
-    """A connection to a brick over an open stream; `n_asked` counts questions, `n_told` commands without answer."""
+    """A connection to a brick over an open stream; `n_sent` counts telegrams."""
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:
         self._stream, self._clock, self._timing, self.name = stream, clock, timing, stream.name
-        self.n_asked = self.n_told = 0
+        self.n_sent = 0
         self._owed = {UNKNOWN}
         self._free_at = clock.monotonic()
         self._awake_until = clock.monotonic()
@@ -109,7 +108,7 @@ class Link:
                 if check is not None:
                     check(answer)
             except (NoAnswerError, TelegramError):
-                self._owed.add(request.OPCODE)
+                self._owed.add(request.opcode)
                 if not n_left:
                     raise
             except BrickError:
@@ -122,7 +121,6 @@ class Link:
     def tell(self, request: Request[A]) -> None:
         """Send a command without requesting an answer; whether the brick executed it is unknown."""
         self._send(encode(request, wants_reply=False))
-        self.n_told += 1
         self._free_at = self._clock.monotonic() + self._timing.gap_s
 
     def keep_awake(self) -> None:
@@ -131,7 +129,7 @@ class Link:
             return
         # Set first: `ask` calls this method.
         self._awake_until = self._clock.monotonic() + self._timing.keep_awake_s
-        limit_s = self.ask(KeepAlive()) / 1000
+        limit_s = self.ask(KEEP_ALIVE) / 1000
         if limit_s > 0:
             self._awake_until = self._clock.monotonic() + min(self._timing.keep_awake_s, limit_s / 3)
 
@@ -141,13 +139,12 @@ class Link:
 
     def _exchange(self, request: Request[A]) -> Reply:
         """Send a command and return its reply, which counts as owed until received."""
-        self._owed.add(request.OPCODE)
+        self._owed.add(request.opcode)
         self._send(encode(request))
-        self.n_asked += 1
         sent_at = self._clock.monotonic()
         self._free_at = sent_at + 2 * self._timing.turn_s
         reply = self._await_reply(request, sent_at + self._timing.answer_s)
-        self._owed.discard(request.OPCODE)
+        self._owed.discard(request.opcode)
         self._free_at = max(self._free_at, self._clock.monotonic() + self._timing.turn_s)
         return reply
 
@@ -155,7 +152,7 @@ class Link:
         """Ensure that no answer to an earlier command can still arrive; LinkError if the brick answers no fence."""
         self._drain()
         for fence in FENCES:
-            if fence.OPCODE in self._owed:
+            if fence.opcode in self._owed:
                 continue
             try:
                 self._exchange(fence)
@@ -175,6 +172,7 @@ class Link:
     def _send(self, telegram: bytes) -> None:
         self._await_turn()
         self._stream.write(framed(telegram))
+        self.n_sent += 1
 
     def _await_turn(self) -> None:
         wait_s = self._free_at - self._clock.monotonic()
@@ -191,7 +189,7 @@ class Link:
                 reply = decode(telegram)
             except TelegramError:
                 continue  # a program on the brick may send telegrams too
-            if reply.opcode == request.OPCODE:
+            if reply.opcode == request.opcode:
                 return reply
             if reply.opcode not in self._owed:
                 raise TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")

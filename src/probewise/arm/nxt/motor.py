@@ -24,11 +24,11 @@ from probewise.arm.nxt.telegram import (
     REGULATED,
     RUNNING,
     BrickError,
-    GetOutputState,
     OutputState,
-    ResetMotorPosition,
-    SetOutputState,
     TelegramError,
+    get_output_state,
+    reset_rotation_counter,
+    set_output_state,
 )
 from probewise.errors import LinkError
 
@@ -101,14 +101,14 @@ class Motor:
     def reset_counter(self) -> None:
         """Set the rotation counter to 0."""
         state = self._read_confirmed_state()
-        self._link.ask(ResetMotorPosition(self.port, 0))
+        self._link.ask(reset_rotation_counter(self.port))
         if self._target is not None:
             self._target -= state.rotation_counts
         self._offsets = state.tacho_counts, state.tacho_counts - state.block_counts
 
     def hold(self) -> None:
         """Stop the motor and hold its position against a load."""
-        self._link.ask(self._drive_command(0, 0))
+        self._link.ask(set_output_state(self.port, 0, DRIVEN, BY_SPEED, run_state=RUNNING))
 
     def stop_and_settle(self) -> int:
         """Stop and hold the motor; return its count once it has settled."""
@@ -118,7 +118,7 @@ class Motor:
 
     def release(self) -> None:
         """Let the motor turn freely."""
-        self._link.ask(SetOutputState(self.port))
+        self._link.ask(set_output_state(self.port))
         self._arrived = None
 
     def move_to(self, goal: int, side: Side) -> int:
@@ -157,8 +157,7 @@ class Motor:
         """
         start = self._find_firmware_target()
         power = side * self.drive.seek_power
-        gently = SetOutputState(self.port, power, BRAKED, run_state=RUNNING, limit_counts=farthest)
-        while not self._try_to_start_limited_move(start + side * farthest, side, gently):
+        while not self._try_to_start_limited_move(start + side * farthest, side, power, farthest, gently=True):
             start = self._find_firmware_target()
         target, far = start + side * farthest, side * (farthest + self.drive.runaway_counts)
         trouble = self._await_idle_or_trouble(start, far, target)
@@ -209,8 +208,8 @@ class Motor:
         stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
-        command = self._drive_command(side * power, side * (target - self._checked_target))
-        if not self._try_to_start_limited_move(target, side, command):
+        limit = side * (target - self._checked_target)
+        if not self._try_to_start_limited_move(target, side, side * power, limit):
             return self.stop_and_settle()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
         trouble = self._await_idle_or_trouble(here, stop + side * self.drive.runaway_counts - here, target)
@@ -225,13 +224,16 @@ class Motor:
         self._coast[power, side] = (self._coast.get((power, side), ran_on) + ran_on) / 2
         return here
 
-    def _try_to_start_limited_move(self, target: int, side: Side, command: SetOutputState) -> bool:
+    def _try_to_start_limited_move(
+        self, target: int, side: Side, power: int, limit: int, *, gently: bool = False
+    ) -> bool:
         """Command a limited move, exactly once; return whether the brick accepted it; at the third refusal raise."""
+        mode, regulation = (BRAKED, 0) if gently else (DRIVEN, BY_SPEED)
         try:
-            self._link.ask(command)
+            self._link.ask(set_output_state(self.port, power, mode, regulation, run_state=RUNNING, limit_counts=limit))
         except (NoAnswerError, TelegramError, BrickError) as error:
             # Holding sets the limit to 0 after every move, so this limit confirms that the brick accepted the command.
-            took = self._read_confirmed_state(lambda state: False).limit_counts == command.limit_counts
+            took = self._read_confirmed_state(lambda state: False).limit_counts == limit
             if not took or self._target is None:
                 self._n_untaken += 1
                 if self._n_untaken >= N_UNTAKEN:
@@ -251,7 +253,7 @@ class Motor:
         def has_faint_power(state: OutputState) -> bool:
             return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RUNNING, 0)
 
-        self._link.ask(SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RUNNING))
+        self._link.ask(set_output_state(self.port, FAINT_POWER, BRAKED, run_state=RUNNING))
         self._clock.sleep(self.drive.settle_s)
         state = self._read_confirmed_state(has_faint_power)
         if not has_faint_power(state):
@@ -299,10 +301,7 @@ class Motor:
         return state
 
     def _read_state(self) -> OutputState:
-        return self._link.ask(GetOutputState(self.port))
-
-    def _drive_command(self, power: int, limit: int) -> SetOutputState:
-        return SetOutputState(self.port, power, DRIVEN, BY_SPEED, run_state=RUNNING, limit_counts=limit)
+        return self._link.ask(get_output_state(self.port))
 
 
 def _counter_offsets(state: OutputState) -> tuple[int, int]:

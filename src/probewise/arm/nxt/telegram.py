@@ -1,47 +1,21 @@
 """Encoding and decoding of the brick's telegrams: pure functions without input or output.
 
-A telegram is a type byte, an opcode and a body, on Bluetooth preceded by its length (`framed`). One class per command
-holds the body's fields in the order of the bytes; its `ANSWER` says what a successful answer holds. Construction raises
-ParameterError for values out of bounds, and decoding TelegramError for bytes that are not an answer. Only the commands
-that the arm needs are here.
+A telegram is a type byte, an opcode and a body, on Bluetooth preceded by its length (`framed`); numbers are
+little-endian. Only the commands that the arm needs are here.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import struct
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass
-from typing import Any, ClassVar, Generic, TypeVar, cast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
-from probewise.errors import LinkError, ParameterError
+from probewise.errors import LinkError, require
 
 
 class TelegramError(LinkError):
     """Raised for bytes that are not the expected telegram; the message shows the bytes and the expectation."""
-
-
-def number(code: str, *bounds: int, default: Any = MISSING) -> Any:
-    """Declare a field, a whole number of a `code` of Python's module struct.
-
-    `bounds` of a command's field are its least and greatest value, and others that are allowed: a wrong power or port
-    moves an arm.
-    """
-    return dataclasses.field(default=default, metadata={"code": code, "bounds": bounds})
-
-
-@dataclass(frozen=True)
-class Body:
-    """Body of a command or an answer: successive fields (`number`), little-endian."""
-
-    @classmethod
-    def layout(cls) -> str:
-        """Return the layout of the fields as the module struct has it."""
-        return "".join(field.metadata["code"] for field in dataclasses.fields(cls))
-
-    def pack(self) -> bytes:
-        """Encode the fields."""
-        return struct.pack("<" + self.layout(), *(getattr(self, field.name) for field in dataclasses.fields(self)))
 
 
 def in_hex(raw: bytes) -> str:
@@ -102,42 +76,66 @@ IDLE, RUNNING = 0x00, 0x20
 """Run states of a motor; the brick also reports transient states."""
 
 
+class OutputState(NamedTuple):
+    """State of a motor, and its three counters in counts (degrees of its shaft)."""
+
+    port: int
+    power: int
+    mode: int
+    regulation: int
+    turn_ratio: int
+    run_state: int
+    limit_counts: int
+    tacho_counts: int
+    block_counts: int
+    rotation_counts: int
+
+
+class InputValues(NamedTuple):
+    """Values of an input, raw and converted; out of date while `valid` is 0."""
+
+    port: int
+    valid: int
+    calibrated: int
+    type: int
+    mode: int
+    raw: int
+    normalized: int
+    scaled: int
+    calibrated_value: int
+
+
+class FirmwareVersion(NamedTuple):
+    """Versions of protocol and firmware."""
+
+    protocol_minor: int
+    protocol_major: int
+    firmware_minor: int
+    firmware_major: int
+
+
 @dataclass(frozen=True)
-class Request(Body, Generic[A_co]):
-    """A command, generic in the type of a successful answer: a body, the only value of `ANSWER`'s layout, or None."""
+class Request(Generic[A_co]):
+    """A command, generic in the type of a successful answer: named fields, a number or text, or None."""
 
-    OPCODE: ClassVar[int]
-    ANSWER: ClassVar[type[Body] | str] = ""
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            (low, high, *others), value = field.metadata["bounds"], getattr(self, field.name)
-            plain = isinstance(value, int) and not isinstance(value, bool)
-            if not plain or not (low <= value <= high or value in others):
-                more = "".join(f" or {other}" for other in others)
-                raise ParameterError(field.name, value, f"a whole number from {low} to {high}{more}")
-
-    @property
-    def is_repeatable(self) -> bool:
-        """Whether repeating the command does no harm."""
-        return True
-
-    @property
-    def name(self) -> str:
-        """Name of the command in LEGO's documentation."""
-        return type(self).__name__.upper()
+    name: str  # in LEGO's documentation
+    opcode: int
+    body: bytes = b""  # of a command to a port, beginning with it
+    answer: str = ""  # layout of the answer's body, as the module struct has it
+    fields: Callable[..., Any] | None = None  # what holds more than one value; its first one is the port
+    is_repeatable: bool = True  # whether repeating the command does no harm
 
     def decode_answer(self, reply: Reply) -> A_co:
         """Decode a reply to this command into its answer.
 
         BrickError if the brick refused the command; TelegramError for another command, port or length.
         """
-        if reply.opcode != self.OPCODE:
-            raise TelegramError(f"a reply to opcode {reply.opcode:02X} came for {self.name}, {self.OPCODE:02X}")
+        if reply.opcode != self.opcode:
+            raise TelegramError(f"a reply to opcode {reply.opcode:02X} came for {self.name}, {self.opcode:02X}")
         # A refusal is padded with zeros, or empty: only its status matters.
         if reply.status != OK:
             raise BrickError(self.name, reply.status)
-        layout = "<" + (self.ANSWER if isinstance(self.ANSWER, str) else self.ANSWER.layout())
+        layout = "<" + self.answer
         if len(reply.body) != (size := struct.calcsize(layout)):
             raise TelegramError(
                 f"the answer to {self.name} has {size} bytes; there are {len(reply.body)}: {in_hex(reply.body)}"
@@ -147,149 +145,55 @@ class Request(Body, Generic[A_co]):
             value.partition(b"\0")[0].decode("latin-1") if isinstance(value, bytes) else value
             for value in struct.unpack(layout, reply.body)
         ]
-        if isinstance(self.ANSWER, str):
+        if self.fields is None:
             return cast(A_co, values[0] if values else None)
-        said = self.ANSWER(*values)
-        if isinstance(said, OutputState | InputValues) and said.port != getattr(self, "port", None):
-            raise TelegramError(f"an answer about port {said.port} came for {self}")
-        return cast(A_co, said)
+        if self.body and values[0] != self.body[0]:
+            raise TelegramError(f"an answer about port {values[0]} came for {self.name} of port {self.body[0]}")
+        return cast(A_co, self.fields(*values))
 
 
-@dataclass(frozen=True)
-class SetOutputState(Request[None]):
-    """Drive a motor, or all with port 255; `limit_counts` 0 is no limit. The defaults release the motor."""
+def set_output_state(
+    port: int, power: int = 0, mode: int = 0, regulation: int = 0, *, run_state: int = IDLE, limit_counts: int = 0
+) -> Request[None]:
+    """Drive a motor, or all with port 255; `limit_counts` 0 is no limit. The defaults release the motor.
 
-    OPCODE = 0x04
-    port: int = number("B", 0, 2, ALL_OUTPUTS)
-    power: int = number("b", -100, 100, default=0)
-    mode: int = number("B", 0, 7, default=0)
-    regulation: int = number("B", 0, 2, default=0)
-    turn_ratio: int = number("b", -100, 100, default=0)
-    run_state: int = number("B", 0, 0, 0x10, 0x20, 0x40, default=IDLE)
-    limit_counts: int = number("I", 0, 0xFFFFFFFF, default=0)
-
-    @property
-    def is_repeatable(self) -> bool:
-        """False for limited moves: limits add up, so a repeated move would go twice as far."""
-        return self.limit_counts == 0
+    A limited move is not repeatable: limits add up, so it would go twice as far. Raises ParameterError for a port or a
+    power that is none: it would move an arm.
+    """
+    require(port in (0, 1, 2, ALL_OUTPUTS), "port", port, f"0 to 2, or {ALL_OUTPUTS} for all")
+    require(-100 <= power <= 100, "power", power, "-100 to 100")
+    body = struct.pack("<BbBBbBI", port, power, mode, regulation, 0, run_state, limit_counts)
+    return Request("SETOUTPUTSTATE", 0x04, body, is_repeatable=limit_counts == 0)
 
 
-@dataclass(frozen=True)
-class SetInputMode(Request[None]):
-    """Set the sensor type and the reading mode of an input."""
-
-    OPCODE = 0x05
-    port: int = number("B", 0, 3)
-    type: int = number("B", 0, 0x12)
-    mode: int = number("B", 0, 0xFF)
-
-
-@dataclass(frozen=True)
-class OutputState(Body):
-    """State of a motor, and its three counters in counts (degrees of its shaft)."""
-
-    port: int = number("B")
-    power: int = number("b")
-    mode: int = number("B")
-    regulation: int = number("B")
-    turn_ratio: int = number("b")
-    run_state: int = number("B")
-    limit_counts: int = number("I")
-    tacho_counts: int = number("i")
-    block_counts: int = number("i")
-    rotation_counts: int = number("i")
-
-
-@dataclass(frozen=True)
-class GetOutputState(Request[OutputState]):
+def get_output_state(port: int) -> Request[OutputState]:
     """Read the state of a motor."""
-
-    OPCODE = 0x06
-    ANSWER = OutputState
-    port: int = number("B", 0, 2)
+    return Request("GETOUTPUTSTATE", 0x06, bytes([port]), "BbBBbBIiii", OutputState)
 
 
-@dataclass(frozen=True)
-class InputValues(Body):
-    """Values of an input, raw and converted; out of date while `valid` is 0."""
-
-    port: int = number("B")
-    valid: int = number("B")
-    calibrated: int = number("B")
-    type: int = number("B")
-    mode: int = number("B")
-    raw: int = number("H")
-    normalized: int = number("H")
-    scaled: int = number("h")
-    calibrated_value: int = number("h")
+def reset_rotation_counter(port: int) -> Request[None]:
+    """Set the rotation counter of a motor to 0."""
+    return Request("RESETMOTORPOSITION", 0x0A, bytes([port, 0]))
 
 
-@dataclass(frozen=True)
-class GetInputValues(Request[InputValues]):
+def set_input_type(port: int, kind: int) -> Request[None]:
+    """Set the sensor type of an input, in raw mode."""
+    return Request("SETINPUTMODE", 0x05, bytes([port, kind, RAW]))
+
+
+def get_input_values(port: int) -> Request[InputValues]:
     """Read the values of an input."""
-
-    OPCODE = 0x07
-    ANSWER = InputValues
-    port: int = number("B", 0, 3)
+    return Request("GETINPUTVALUES", 0x07, bytes([port]), "BBBBBHHhh", InputValues)
 
 
-@dataclass(frozen=True)
-class ResetMotorPosition(Request[None]):
-    """Set the block counter (`relative` 1) or the rotation counter (0) of a motor to 0."""
-
-    OPCODE = 0x0A
-    port: int = number("B", 0, 2)
-    relative: int = number("B", 0, 1)
-
-
-@dataclass(frozen=True)
-class GetBatteryLevel(Request[int]):
-    """Read the battery's voltage, in mV."""
-
-    OPCODE = 0x0B
-    ANSWER = "H"
-
-
-@dataclass(frozen=True)
-class KeepAlive(Request[int]):
-    """Reset the brick's sleep timer, which no other command does; the answer is its limit in ms, 0: never."""
-
-    OPCODE = 0x0D
-    ANSWER = "I"
-
-
-@dataclass(frozen=True)
-class GetCurrentProgramName(Request[str]):
-    """Read the file name of the running program."""
-
-    OPCODE = 0x11
-    ANSWER = "20s"
-
-
-@dataclass(frozen=True)
-class FirmwareVersion(Body):
-    """Versions of protocol and firmware."""
-
-    protocol_minor: int = number("B")
-    protocol_major: int = number("B")
-    firmware_minor: int = number("B")
-    firmware_major: int = number("B")
-
-
-@dataclass(frozen=True)
-class GetFirmwareVersion(Request[FirmwareVersion]):
-    """Read the versions of protocol and firmware."""
-
-    OPCODE = 0x88
-    ANSWER = FirmwareVersion
-
-
-@dataclass(frozen=True)
-class GetDeviceInfo(Request[str]):
-    """Read the name of the brick."""
-
-    OPCODE = 0x9B
-    ANSWER = "15s15x"
+GET_BATTERY_LEVEL: Request[int] = Request("GETBATTERYLEVEL", 0x0B, answer="H")  # mV
+KEEP_ALIVE: Request[int] = Request("KEEPALIVE", 0x0D, answer="I")
+"""Reset the brick's sleep timer, which no other command does; the answer is its limit in ms, 0: never."""
+GET_CURRENT_PROGRAM_NAME: Request[str] = Request("GETCURRENTPROGRAMNAME", 0x11, answer="20s")
+GET_FIRMWARE_VERSION: Request[FirmwareVersion] = Request(
+    "GETFIRMWAREVERSION", 0x88, answer="BBBB", fields=FirmwareVersion
+)
+GET_DEVICE_INFO: Request[str] = Request("GETDEVICEINFO", 0x9B, answer="15s15x")  # the brick's name
 
 
 @dataclass(frozen=True)
@@ -303,8 +207,8 @@ class Reply:
 
 def encode(request: Request[Any], *, wants_reply: bool = True) -> bytes:
     """Encode a command as a telegram, without its length."""
-    first = SYSTEM if request.OPCODE >= FIRST_SYSTEM_OPCODE else 0
-    return bytes([first if wants_reply else first | NO_REPLY, request.OPCODE]) + request.pack()
+    first = SYSTEM if request.opcode >= FIRST_SYSTEM_OPCODE else 0
+    return bytes([first if wants_reply else first | NO_REPLY, request.opcode]) + request.body
 
 
 def decode(telegram: bytes) -> Reply:

@@ -1,6 +1,6 @@
 """Draw a case: a system, its concealed effects, a recording, and held-out runs; write it as a user would provide it.
 
-The kinds of noise, most of them not white, come first; of some, the strength follows from a requested detectability.
+The kinds of noise, most of them not white, come first.
 """
 
 from __future__ import annotations
@@ -8,19 +8,18 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import brentq
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.proof.sensors.cases import Stratum, stratum_in_wheel
-from probewise.proof.sensors.effects import amplitude_of_size
+from probewise.proof.sensors import CLEAR, FAINT, GROSS, SMALL, Stratum, amplitude_of_size, stratum_in_wheel
 from probewise.proof.systems.forms import (
     ADDED_FAMILIES,
     FAMILIES,
@@ -50,38 +49,34 @@ OTHER_NOISE = (
 """Kinds of noise of a clean recording, besides white; "t4" and "quantised" are not in the vocabulary."""
 
 
+Noisy: TypeAlias = Callable[[FloatArray, SystemTable, np.random.Generator], FloatArray]
+"""Readings with noise, (n_points,), from noise-free ones, table and a generator."""
+
+
 @dataclass(frozen=True, eq=False)
 class SystemNoise:
-    """A noise model of a case."""
+    """A noise model of a case: "white" or one of OTHER_NOISE, how it is drawn, and the step to which it rounds."""
 
-    name: str  # "white" or one of OTHER_NOISE
-    # Readings with noise, (n_points,), from noise-free ones, table and a generator.
-    draw: Callable[[FloatArray, SystemTable, np.random.Generator], FloatArray]
-    parameters: Mapping[str, object] = field(default_factory=dict)  # by name, as in the vocabulary
-    size_lambda: float = 0.0  # root of twice the expected gain in log likelihood over white noise; 0: fixed strength
-    step: float | None = None  # to which this noise asks to round readings
+    name: str
+    draw: Noisy
+    step: float | None = None
 
 
-def noise_of_size(
-    name: str, wanted: float, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
+def make_noise(
+    name: str, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
-    """Return the noise `name` at the strength at which it is as detectable as an effect of lambda `wanted`.
+    """Return the noise `name`, as detectable as an effect of lambda 12, or at its largest strength if none suffices.
 
-    If none suffices, at the largest. "white", "outliers", "dropouts", "t4" and "quantised" have a fixed strength.
+    "white", "outliers", "dropouts", "t4" and "quantised" have a fixed strength.
     """
-    n = len(rows)
-
-    def of(in_sds: Callable[..., FloatArray], size_lambda: float = 0.0, **parameters: Any) -> SystemNoise:
-        return SystemNoise(name, lambda y, rows, rng: y + sd * in_sds(y, rows, rng), parameters, size_lambda)
 
     def white(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
         return rng.standard_normal(len(y))
 
+    in_sds: Noisy = white
     match name:
-        case "white":
-            return of(white)
         case "correlated_noise":
-            rho = math.sqrt(1 - math.exp(-(wanted**2) / (n - len(rows.rows_by_run))))
+            rho = math.sqrt(1 - math.exp(-(CLEAR**2) / (len(rows) - len(rows.rows_by_run))))
 
             def correlated(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
                 """Draw AR(1) noise of sd 1, which starts afresh in each run."""
@@ -91,77 +86,64 @@ def noise_of_size(
                         out[row] = rho * out[before] + math.sqrt(1 - rho**2) * out[row]
                 return out
 
-            return of(correlated, wanted, rho=rho)
+            in_sds = correlated
         case "random_walk":
             # Eigenvalues of the covariance of n steps of a centred unit-step walk, without that of the mean.
-            count = np.arange(1.0, n + 1)
+            count = np.arange(1.0, len(rows) + 1)
             walk = np.minimum(count[:, None], count)
             centered = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
             spectrum = np.maximum(np.linalg.eigvalsh(centered)[1:], 0.0)
-            q, size = _strength_and_size(lambda a: 1 + a**2 * spectrum, wanted, 1e-4, 1.0)
-            steps = lambda y, rows, rng: white(y, rows, rng) + q * np.cumsum(white(y, rows, rng))  # noqa: E731
-            return of(steps, size, sd_per_row=q * sd)
+            q = _strength(lambda a: 1 + a**2 * spectrum, 1e-4, 1.0)
+            in_sds = lambda y, rows, rng: white(y, rows, rng) + q * np.cumsum(white(y, rows, rng))
         case "signal_dependent_noise":
             low, span = float(readings.min()), float(np.ptp(readings))
-
-            def variance(y: FloatArray, ratio: float) -> FloatArray:
-                return 1 + ratio * np.clip((y - low) / span, 0, None)
-
-            ratio, size = _strength_and_size(lambda a: variance(readings, a), wanted, 1e-3, 1e4)
-            return of(lambda y, rows, rng: np.sqrt(variance(y, ratio)) * white(y, rows, rng), size, ratio=ratio)
+            variance: Callable[..., FloatArray] = lambda y, ratio: 1 + ratio * np.clip((y - low) / span, 0, None)
+            ratio = _strength(lambda a: variance(readings, a), 1e-3, 1e4)
+            in_sds = lambda y, rows, rng: np.sqrt(variance(y, ratio)) * white(y, rows, rng)
         case "noise_per_run":
             logs = rng.standard_normal(rows.n_runs)
-            power, size = _strength_and_size(lambda a: np.exp(2 * a * logs)[rows.run], wanted, 1e-2, 3.0)
-            each = np.exp(power * logs)
-            return of(lambda y, rows, rng: each[rows.run] * white(y, rows, rng), size, values=(sd * each).tolist())
+            power = _strength(lambda a: np.exp(2 * a * logs)[rows.run], 1e-2, 3.0)
+            in_sds = lambda y, rows, rng: np.exp(power * logs)[rows.run] * white(y, rows, rng)
         case "outliers":
-            share, wide = 0.03, 7.0
-
-            def outlying(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
-                return white(y, rows, rng) + np.where(rng.random(len(y)) < share, wide * white(y, rows, rng), 0.0)
-
-            return of(outlying, share=share, size=wide)
+            wide: Noisy = lambda y, rows, rng: np.where(rng.random(len(y)) < 0.03, 7.0 * white(y, rows, rng), 0.0)
+            in_sds = lambda y, rows, rng: white(y, rows, rng) + wide(y, rows, rng)
         case "dropouts":
-            share, value = 0.02, 0.0
-
-            def lost(y: FloatArray, rows: SystemTable, rng: np.random.Generator) -> FloatArray:
-                return np.where(rng.random(len(y)) < share, value, y + sd * white(y, rows, rng))
-
-            return SystemNoise(name, lost, {"share": share, "value": value})
+            lost = lambda y, rows, rng: np.where(rng.random(len(y)) < 0.02, 0.0, y + sd * white(y, rows, rng))
+            return SystemNoise(name, lost)
         case "t4":  # its scale is the sd of the normal that matches its centre
-            return of(lambda y, rows, rng: rng.standard_t(4.0, len(y)), freedom=4.0)
-        case _:  # quantised, to that of 1, 2 and 5 times powers of ten which is nearest on a logarithmic scale
-            power = 10.0 ** math.floor(math.log10(2.0 * sd))
-            step = min((m * power for m in (1.0, 2.0, 5.0, 10.0)), key=lambda m: abs(math.log(m / (2.0 * sd))))
-            return replace(of(white, step=step), step=step)
+            in_sds = lambda y, rows, rng: rng.standard_t(4.0, len(y))
+    step = None
+    if name == "quantised":  # to that of 1, 2 and 5 times powers of ten which is nearest on a logarithmic scale
+        power = 10.0 ** math.floor(math.log10(2.0 * sd))
+        step = min((m * power for m in (1.0, 2.0, 5.0, 10.0)), key=lambda m: abs(math.log(m / (2.0 * sd))))
+    return SystemNoise(name, lambda y, rows, rng: y + sd * in_sds(y, rows, rng), step)
 
 
-def _strength_and_size(
-    variances: Callable[[float], FloatArray], wanted: float, low: float, high: float
-) -> tuple[float, float]:
-    """Return (strength, `wanted`) where noise of the `variances` has lambda `wanted` against noise of their mean.
+def _strength(variances: Callable[[float], FloatArray], low: float, high: float) -> float:
+    """Return the strength, `high` at most, at which noise of these variances has lambda 12 against their mean.
 
-    That is (`high`, its lambda) if it is less there.
+    Lambda is the root of twice the expected gain in log likelihood.
     """
 
-    def size(strength: float) -> float:
-        each = variances(strength)
-        return math.sqrt(max(len(each) * math.log(each.mean()) - float(np.log(each).sum()), 0.0))
+    def beyond(log_strength: float) -> float:
+        each = variances(math.exp(log_strength))
+        gain = len(each) * math.log(each.mean()) - float(np.log(each).sum())
+        return math.sqrt(max(gain, 0.0)) - CLEAR
 
-    if (largest := size(high)) <= wanted:
-        return high, largest
-    return float(np.exp(brentq(lambda a: size(math.exp(a)) - wanted, math.log(low), math.log(high), xtol=1e-4))), wanted
+    if beyond(math.log(high)) <= 0:
+        return high
+    return float(np.exp(brentq(beyond, math.log(low), math.log(high), xtol=1e-4)))
 
 
 SYSTEMS_WHEEL: tuple[Stratum, ...] = (
     *[Stratum("clean")] * 6,
     *[Stratum("clean", other_noise=True)] * 4,
-    Stratum("single", 6.0),
-    *[Stratum("single", 8.0)] * 2,
-    *[Stratum("single", 12.0)] * 2,
-    Stratum("single", 20.0),
-    *[Stratum("pair", 12.0)] * 2,
-    *[Stratum("outside", 20.0)] * 2,
+    Stratum("single", FAINT),
+    *[Stratum("single", SMALL)] * 2,
+    *[Stratum("single", CLEAR)] * 2,
+    Stratum("single", GROSS),
+    *[Stratum("pair", CLEAR)] * 2,
+    *[Stratum("outside", GROSS)] * 2,
 )
 """Twenty cycles are 400 cases."""
 
@@ -289,7 +271,7 @@ def draw_system_case(seed: int, number: int, *, after_refit: AfterRefit) -> Syst
     if name == "noise_per_run" and kind.run is None:
         name = "correlated_noise"  # the table has no column of runs
     diagnosed = everywhere[drawn.diagnosed_row_numbers]
-    noise = noise_of_size(name, 12.0, diagnosed, drawn.diagnosed_table, kind.sd, rng=noising)
+    noise = make_noise(name, diagnosed, drawn.diagnosed_table, kind.sd, rng=noising)
     readings = noise.draw(everywhere, drawn.table, noising)
     knows = str(noising.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
     step = noise.step
@@ -323,7 +305,7 @@ def _draw_effects(
     if stratum.kind == "outside":
         families = [OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]]
         forms = list(forms_out_of_vocabulary(drawn.true_system, rng))
-        name_of = lambda form: form.name.removeprefix("strange_").split(":")[0]  # noqa: E731
+        name_of = lambda form: form.name.removeprefix("strange_").split(":")[0]
     elif stratum.kind == "pair":
         families = [str(name) for name in rng.choice(FAMILIES, 2, replace=False)]
     chosen = []

@@ -96,7 +96,6 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
         if last > first:
             columns, rows = (1 + max(getattr(tile, name) for tile in tiles) for name in ("column", "row"))
             pages = f"pages {first} to {last}, {columns} side by side, {rows} one above the other, from the lower left"
-            pages += "; blank ones are left out" if len(tiles) < columns * rows else ""
         said = [line for text in sheet.lines for line in textwrap.wrap(text, _COVER_LETTERS)]
         lines += ["", sheet.name, f"{width:g} x {height:g} mm; {pages}", *said, f"origin: {sheet.frame}"]
         if sheet.orientations_rad:
@@ -173,7 +172,7 @@ def _draw_sheet_part(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: A
     crosses = [] if sheet.crosses_mm is None else sheet.crosses_mm.tolist()
     names = sheet.cross_names or [f"{k}: ({x:g}, {y:g})" for k, (x, y) in enumerate(crosses, start=1)]
     beside = [(x + 10.0, y + 10.0, name) for (x, y), name in zip(crosses, names, strict=True)]
-    for x, y, words in (*beside, *sheet.words):
+    for x, y, words in beside:
         if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
             at_x, at_y = place(np.array([[x, y]]))[0].tolist()
             fits = at_x + _LETTER_MM * len(words) < place(np.array([high_mm]))[0, 0]

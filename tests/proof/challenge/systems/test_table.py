@@ -76,10 +76,8 @@ def test_alarms_and_names_on_clean_recordings_are_counted(make):
     assert _row([quiet, loud], "physics named, no effect, white noise").found.value == 0.5
 
 
-def test_noise_of_another_kind_is_scored_by_its_name(make):
+def test_noise_of_another_kind_has_a_row_of_its_own(make):
     told = make.system_case(truth=["outliers"], other_noise=True, noise_model="outliers", p_value=0.4)
-    missed = make.system_case(truth=["outliers"], said=[], other_noise=True, noise_model="outliers", p_value=0.4)
-    assert _row([told, missed], "noise named right, no effect, other noise").found.value == 0.5
     assert _row([told], "outliers").found.value == 0.0
 
 
@@ -97,7 +95,7 @@ def test_held_out_gain_is_the_median_share_and_capped(make):
         make.system_single(gains=(900.0, 500.0)),
         make.system_single(gains=(10.0, 40.0)),
     ]
-    assert gains_on_held_out_runs(cases[1], "right") == (100.0, 100.0)
+    assert gains_on_held_out_runs(cases[1]) == (100.0, 100.0)
     assert _row(cases, "held-out runs: median share of the right model's gain").found.value == 0.5
 
 
@@ -115,13 +113,12 @@ def test_what_is_on_no_list_is_unknown_or_as_good_as_the_true_law(said, gains, t
     assert _row([case], "the same without unknown").found.value == named
 
 
-def test_intervals_of_values_per_run_have_a_row_of_their_own(make):
+def test_intervals_of_values_per_run_do_not_count(make):
     """One effect has one for each run: they would outnumber all others."""
     case = make.system_single(
         parameters={"offset_per_run": {"values[1]": [1.0, 0.9, 1.1], "values[2]": [1.0, 1.05, 1.1]}}
     )
     drift = make.system_single(parameters={"offset_drift": {"a": [1.0, 0.9, 1.1]}})
-    assert _row([case, drift], "of values per run").found.value == 0.5
     assert _row([case, drift], "95 % intervals of effect parameters cover").found.value == 1.0
 
 

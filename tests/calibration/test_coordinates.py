@@ -7,7 +7,7 @@ import pytest
 
 from probewise.calibration import SSFPrior
 from probewise.calibration.about_peaks import LightContrasts
-from probewise.calibration.coordinates import WholeFootprintCoordinates
+from probewise.calibration.quick import WholeFootprintCoordinates
 from probewise.priors import LogUniform, Uniform
 
 

@@ -7,10 +7,9 @@ import pytest
 
 from probewise.calibration import calibrate, default_prior, quick
 from probewise.calibration.about_peaks import LightContrasts, _MixtureAboutPeaks, _StudentTDensity
-from probewise.calibration.coordinates import WholeFootprintCoordinates
 from probewise.calibration.paper import ProblemsByOrder, search_prior_of_order
 from probewise.calibration.peaks import climb, starts_of_climbs
-from probewise.calibration.quick import _NearPosterior, fit_orders_quickly
+from probewise.calibration.quick import WholeFootprintCoordinates, _NearPosterior, fit_orders_quickly
 from probewise.nested import Weighted
 from probewise.recordings import paper_plan
 from probewise.world import Blob, World, gaussian_spot

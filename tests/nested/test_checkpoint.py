@@ -29,11 +29,10 @@ from probewise.nested import (
     Tally,
     run,
 )
-from probewise.nested.save import CheckpointFile, RunState
+from probewise.nested.save import CheckpointFile
 from probewise.priors import Product, Uniform
 
 SEED = 20240229
-NEVER = 1e9  # seconds between savings: only what an interruption saves is saved
 
 
 class Stop(Exception):
@@ -141,7 +140,7 @@ def test_a_run_stopped_after_every_round_ends_as_one_never_stopped(name: str, mo
     assert len(states) > 4
     for _ in states:
         with pytest.raises(Stop):
-            quiet(make(), move=MOVES[move], progress=stopper(1), checkpoint=path, checkpoint_every_s=NEVER, **options)
+            quiet(make(), move=MOVES[move], progress=stopper(1), checkpoint=path, **options)
     problem = Counted(make())
     resumed = quiet(problem, move=MOVES[move], checkpoint=path, **options)
     assert_same(resumed, whole)
@@ -159,9 +158,7 @@ def test_a_run_interrupted_within_rounds_ends_as_one_never_interrupted(name: str
     for last_call in itertools.count(3, 3):
         problem = Counted(make(), last_call, interrupt)
         try:
-            found = quiet(
-                problem, move=MOVES[move], checkpoint=path, checkpoint_every_s=0, return_interrupted=True, **options
-            )
+            found = quiet(problem, move=MOVES[move], checkpoint=path, return_interrupted=True, **options)
         except KeyboardInterrupt:  # before the first round was done
             continue
         if problem.n_calls < last_call:
@@ -317,8 +314,9 @@ def test_a_disk_that_fills_up_costs_the_checkpoint_only(path: Path, monkeypatch:
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", fsync)
+        patch.setattr(CheckpointFile, "save_if_due", CheckpointFile.save)  # after every round
         with pytest.warns(NotSavedWarning, match=r"No space left on device.*goes on unsaved"):
-            found = quiet(slope(), n_live=30, checkpoint=path, checkpoint_every_s=0)
+            found = quiet(slope(), n_live=30, checkpoint=path)
     assert_same(found, whole)
     assert [*path.parent.iterdir()] == [path]
     # The third saving stands.
@@ -346,7 +344,6 @@ def test_ctrl_c_raises_by_default_and_the_run_is_saved(path: Path) -> None:
             Counted(problems.plateau(), late, interrupt),
             n_live=40,
             checkpoint=path,
-            checkpoint_every_s=NEVER,
         )
     problem = Counted(problems.plateau())
     whole = quiet(problems.plateau(), n_live=40)
@@ -379,7 +376,7 @@ def test_a_failing_likelihood_is_named_and_the_run_so_far_saved(
     whole = quiet(problem, n_live=40)
     for at, n_least in ((2, None), (problem.n_calls - 2, 40)):
         with pytest.raises(NotConvergedError, match=message) as caught:
-            quiet(Counted(problems.plateau(), at, answer), n_live=40, checkpoint=path, checkpoint_every_s=NEVER)
+            quiet(Counted(problems.plateau(), at, answer), n_live=40, checkpoint=path)
         partial = caught.value.partial
         if n_least is None:
             assert partial is None  # no point had died
@@ -390,25 +387,3 @@ def test_a_failing_likelihood_is_named_and_the_run_so_far_saved(
             assert partial.warnings[-1] == f"the likelihood failed: {caught.value}"
         assert path.exists()
     assert_same(quiet(problems.plateau(), n_live=40, checkpoint=path), whole)
-
-
-# ------------------------------------------------------------------ what it costs
-
-
-@pytest.mark.parametrize(("every_s", "share"), [(0, 1.0), (NEVER, 0.0)])
-def test_a_run_is_saved_as_often_as_asked(
-    every_s: float, share: float, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each state of a run that is saved after every round: even where saving takes longer than a round."""
-    n_saved = itertools.count()
-    true = CheckpointFile.save
-
-    def save(self: CheckpointFile, now: RunState) -> None:
-        next(n_saved)
-        true(self, now)
-
-    monkeypatch.setattr(CheckpointFile, "save", save)
-    states: list[RoundSummary] = []
-    quiet(slope(), n_live=30, checkpoint=path, checkpoint_every_s=every_s, progress=states.append)
-    # The first live points, every round, and the end.
-    assert next(n_saved) == round(share * (1 + len(states))) + 1

@@ -10,8 +10,8 @@ import pytest
 from nested_sampling import problems
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested import Check, NestedResult, merge, run
-from probewise.nested.merge import agreement_of, n_alive_at_death
+from probewise.nested import NestedResult, merge, run
+from probewise.nested.result import n_alive_at_death
 from probewise.priors import Product, Uniform
 
 N_ERRORS = 3.9
@@ -56,9 +56,8 @@ def test_merged_runs_are_one_run_with_the_live_points_of_all(
     assert np.array_equal(order, np.arange(merged.n_dead))
     assert np.exp(merged.log_weight).sum() == pytest.approx(1.0)
     assert np.array_equal(alive(merged), merged.n_at_death)
-    assert merged.agreement is not None
-    assert merged.agreement.log_z == tuple(r.log_z for r in terraces)
-    assert "8, ln Z agree" in merged.summary()
+    assert not merged.warnings
+    assert merged.memory == pytest.approx(np.mean([r.memory for r in terraces]))
 
 
 def test_runs_of_different_live_points_and_ends_are_merged(rng: np.random.Generator) -> None:
@@ -83,7 +82,6 @@ def test_merging_in_two_stages_is_merging_at_once(terraces: list[NestedResult]) 
     staged, at_once = (merge(parts, rng=np.random.default_rng(0)) for parts in (halves, terraces))
     assert staged.log_z == at_once.log_z
     assert np.array_equal(staged.theta, at_once.theta)
-    assert staged.agreement == at_once.agreement
     assert staged.seed_state == at_once.seed_state
     with pytest.raises(ParameterError, match="seed_state of run 2"):
         merge([halves[0], terraces[1]], rng=np.random.default_rng(0))
@@ -110,31 +108,6 @@ def test_runs_that_disagree_say_so_and_widen_the_error(terraces: list[NestedResu
     assert merged.log_z_error == pytest.approx(np.std([r.log_z for r in far], ddof=1))
     assert "disagree" in merged.warnings[0]
     assert "doubtful: the 3 runs disagree" in merged.summary()
-
-
-def test_a_bias_that_all_runs_share_is_found_and_their_memory_averaged(
-    terraces: list[NestedResult], rng: np.random.Generator
-) -> None:
-    """Each run is off by 1.5 errors from its second estimate, which its own check lets pass; together by four."""
-    checks = [Check("a second pass", r.log_z - 1.5 * r.log_z_error, r.log_z_error / 9, 1.5, 100) for r in terraces]
-    runs = [dataclasses.replace(r, check=check) for r, check in zip(terraces, checks, strict=True)]
-    with pytest.warns(DoubtfulResultWarning, match="does not average out"):
-        merged = merge(runs, rng=rng)
-    assert merged.check is not None
-    assert merged.check.distance > 2.5
-    assert merged.memory == pytest.approx(np.mean([r.memory for r in runs]))
-    assert merge([*runs[:3], dataclasses.replace(runs[3], check=None)], rng=rng).check is None
-
-
-def test_agreement_by_hand(terraces: list[NestedResult]) -> None:
-    """Two runs: chi-square is the squared difference over the sum of the squared errors."""
-    one = dataclasses.replace(terraces[0], log_z=1.0, log_z_error=0.3)
-    two = dataclasses.replace(terraces[1], log_z=2.0, log_z_error=0.4)
-    found = agreement_of([one, two])
-    assert found.chi_square == pytest.approx(1.0 / 0.25)
-    assert found.p_value == pytest.approx(math.erfc(2.0 / math.sqrt(2)))
-    assert found.log_z_sd == pytest.approx(math.sqrt(0.5))
-    assert found.n_runs == 2
 
 
 def test_what_is_no_independent_run_of_the_same_problem_is_refused(

@@ -10,7 +10,7 @@ from nested_sampling.problems import Known
 from scipy.special import ndtr
 
 from probewise import nested
-from probewise.nested.repartition import repartitioned
+from probewise.nested.importance import repartitioned
 from probewise.priors import Normal, Product, Uniform
 
 WIDE = Product({"x": Normal(0.0, 10.0), "y": Normal(0.0, 10.0)})

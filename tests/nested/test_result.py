@@ -11,7 +11,7 @@ import pytest
 from nested_sampling import problems
 
 from probewise.errors import FileError, ParameterError, ShapeError
-from probewise.nested import Agreement, NestedResult, run
+from probewise.nested import NestedResult, run
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +20,7 @@ def result() -> NestedResult:
 
 
 def test_a_saved_result_comes_back_whole(result: NestedResult, tmp_path: Path) -> None:
-    agreement = Agreement((1.0, 2.5), (0.5, 0.25), 7.2, 0.0073)
-    doubtful = dataclasses.replace(result, warnings=("a doubt",), agreement=agreement)
+    doubtful = dataclasses.replace(result, warnings=("a doubt",))
     doubtful.save(tmp_path / "run.npz")
     back = NestedResult.load(tmp_path / "run.npz")
     for field in dataclasses.fields(NestedResult):

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested import RemainingEvidence, diversify, merge, refine, run, update
-from probewise.nested.repartition import repartitioned
+from probewise.nested.importance import repartitioned
 from probewise.priors import Product, Uniform
 
 SQUARE = Product({"a": Uniform(-3.0, 3.0), "b": Uniform(-3.0, 3.0)})

@@ -18,7 +18,7 @@ from probewise.scene import (
     region_of,
 )
 from probewise.sensor import FAST_NODES, gaussian
-from probewise.sensor._normal import normal_cdf
+from probewise.sensor.gaussian import normal_cdf
 
 PATTERNS = {
     "uniform": kinds.Uniform(0.3),

@@ -6,13 +6,15 @@ The evidence gives its number of Gaussians N (the order), the posterior mean its
 
 from probewise.calibration.fields import (
     QuantitySummary,
+    ScanNoise,
     choose_pixel_mm,
+    draw_sd,
     mixture_moments,
+    noise_by_scan,
     posterior_mean_ssf_field,
     ssf_quantities,
 )
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
-from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan
 from probewise.calibration.paper import OrderPosterior, estimate_ssf, problem_for
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (

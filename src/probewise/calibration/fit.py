@@ -18,11 +18,12 @@ from probewise._display import Reported
 from probewise._kinds import checked_whole, require_flag, require_like, require_rng
 from probewise.calibration.fields import (
     choose_pixel_mm,
+    draw_sd,
     gaussians_sorted_by_mass,
     mixture_moments,
+    noise_by_scan,
     posterior_mean_ssf_field,
 )
-from probewise.calibration.noise import draw_sd, noise_by_scan
 from probewise.calibration.paper import OrderPosterior, ProblemsByOrder, Progress, search_prior_of_order
 from probewise.calibration.priors import SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.quick import fit_orders_quickly

@@ -136,7 +136,7 @@ def search_prior_of_order(
     if not refined:
         note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
         return OrderPosterior(result, None, (note,))
-    more = refine(result, problem, rng=rng, n_draws=_N_DRAWS, look=False)
+    more = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
     apart = abs(more.log_z - result.log_z) / math.hypot(more.log_z_error, result.log_z_error)
     if apart <= _DISAGREE or not more.pareto_k < MOST_K:
         return OrderPosterior(result, more)

@@ -17,8 +17,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_path, require_kind
 from probewise._posterior_samples import NamedSamples, interval_table_lines
 from probewise._version import __version__
-from probewise.calibration.fields import QuantitySummary, posterior_mean_ssf_field, ssf_quantities
-from probewise.calibration.noise import ScanNoise
+from probewise.calibration.fields import QuantitySummary, ScanNoise, posterior_mean_ssf_field, ssf_quantities
 from probewise.calibration.priors import PriorRow
 from probewise.effects import EFFECTS, OTHER_FORMS, Extent, Origin
 from probewise.effects.noise import noise_sd
@@ -183,7 +182,7 @@ class FittedSensor(NamedSamples):
 
     @property
     def is_free_form(self) -> bool:
-        """Whether its SSF is a free form (`probewise.sensor.free_form`) rather than a mixture of a few Gaussians."""
+        """Whether its SSF is a free form (`probewise.sensor.ssf`) rather than a mixture of a few Gaussians."""
         return is_free_form(self.samples[:, : 6 * self.n_gaussians])
 
     def mean_mixture(self, n_gaussians: int | None = None) -> FixedMixture:

@@ -30,7 +30,7 @@ from probewise.diagnosis.samples import N_SAMPLES, ModelSamples, draw_noise_sd, 
 from probewise.diagnosis.simulator_rows import SimulatorApparatus
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError, require
 from probewise.nested import Weighted
-from probewise.nested.repartition import repartitioned
+from probewise.nested.importance import repartitioned
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, System, table_for

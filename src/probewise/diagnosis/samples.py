@@ -16,8 +16,12 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats, rounding_error
-from probewise.calibration.fields import choose_pixel_mm, gaussians_sorted_by_mass, posterior_mean_ssf_field
-from probewise.calibration.noise import noise_by_scan
+from probewise.calibration.fields import (
+    choose_pixel_mm,
+    gaussians_sorted_by_mass,
+    noise_by_scan,
+    posterior_mean_ssf_field,
+)
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.diagnosis.best_repair import BestRepair, predicts_far_worse
 from probewise.diagnosis.evidence import Linearised, NoiseEvidence

@@ -6,7 +6,7 @@ the natural parameters of an exponential family.) In coordinates z every prior i
 evidences need no special case.
 
 The misfit of a few Gaussians to a real SSF looks like physics, and the evidence favours another Gaussian only if it
-gains ten nats or more. A free form (`probewise.sensor.free_form`) absorbs this misfit: small weights at many places,
+gains ten nats or more. A free form (`probewise.sensor.ssf`) absorbs this misfit: small weights at many places,
 each with a normal prior, so that the evidence penalises only those used.
 """
 

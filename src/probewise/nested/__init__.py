@@ -6,10 +6,9 @@ evidence Z, eq. 18; 300 live points; stop when consecutive values of log Z diffe
 
 from probewise.nested.diversify import diversify
 from probewise.nested.importance import Weighted, pareto_k, refine, update
-from probewise.nested.merge import merge
 from probewise.nested.moves import KernelMove, Move, PriorRejection, SliceMove, Tally
 from probewise.nested.problem import Bound, Evaluator, FunctionProblem, Points, Samplable, make_problem
-from probewise.nested.result import Agreement, Check, NestedResult, Samples
+from probewise.nested.result import Check, NestedResult, Samples, merge
 from probewise.nested.sampler import (
     LIVE_PER_PARAM,
     NESTED_STOP,
@@ -25,7 +24,6 @@ from probewise.nested.sampler import (
 __all__ = [
     "LIVE_PER_PARAM",
     "NESTED_STOP",
-    "Agreement",
     "Bound",
     "Check",
     "Evaluator",

@@ -6,7 +6,7 @@ the posterior of the first run (`repartition`), or, where that saves nothing, is
 
 Parts of the posterior without live points escape both. So missed peaks are looked for first, from the run's dead points
 and its last live ones, and the prior of the second estimate gets a part about each: its posterior tells which of them
-matter. The repetition hops between all parts.
+matter.
 
 - Two modes shrink at the same rate until their tops are near, and over these tens of nats the number of live points in
   each drifts: a narrow mode that begins with a few may lose them all. But some points that died early lie in it. Where
@@ -31,9 +31,9 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import NotConvergedError, ParameterError, message_of
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import MOST_MEMORY, warning_of_few_lineages, warning_of_few_possible_draws
-from probewise.nested.moves import HoppingMove, Move, SliceMove
+from probewise.nested.importance import covariance_root_of_points, repartitioned, root_of_covariance
+from probewise.nested.moves import Move, SliceMove
 from probewise.nested.problem import Evaluator, Points, Samplable
-from probewise.nested.repartition import covariance_root_of_points, repartitioned, root_of_covariance
 from probewise.nested.result import Check, NestedResult
 
 _SAMPLES_PER_PARAM, _FEWEST_SAMPLES = 20, 200  # of peaks that are returned
@@ -287,15 +287,12 @@ class _Budget:
     def left(self) -> int:
         return int(self.limit - self.spent)
 
-    def run(
-        self, problem: Samplable, n_live: int, chain: SliceMove, modes: Clusters | None = None
-    ) -> NestedResult | None:
-        """Run nested sampling, with hops between `modes`; None if too few evaluations are left for a complete run."""
+    def run(self, problem: Samplable, n_live: int, chain: SliceMove) -> NestedResult | None:
+        """Run nested sampling; None if too few evaluations are left for a complete run."""
         # A run is worth a start with its first live points, and twice the evaluations of one round.
         if self.left < n_live * (1 + chain.n_steps(len(problem.prior.names)) * chain.target):
             return None
-        move = chain if modes is None else HoppingMove(chain, modes)
-        found = self.search(problem, n_live=n_live, move=move, max_calls=self.left, rng=self.rng)
+        found = self.search(problem, n_live=n_live, move=chain, max_calls=self.left, rng=self.rng)
         self.spent += found.n_calls
         return found if found.complete else None
 
@@ -362,9 +359,8 @@ def check_and_repeat(
     max_calls: int | None,
     least_live: int,
     rng: np.random.Generator,
-    repeat: bool = True,
 ) -> NestedResult:
-    """Check a run that its stopping rule ended; `repeat` it with longer chains where there are doubts.
+    """Check a run that its stopping rule ended; repeat it with longer chains where the second estimate disagrees.
 
     Limits on all evaluations, those of `first` included: `max_cost` times those of `first`, and `max_calls`, if not
     None. `least_live`: fewest live points allowed for the problem. `evaluate`: of the problem, for the search of missed
@@ -386,8 +382,8 @@ def check_and_repeat(
             ]
         else:
             n_check, notes = budget.spent - first.n_calls, second.doubts(first)
-            if notes and repeat and not second.run.warnings:
-                again = budget.run(evaluate.problem, first.n_live, chain, second.parts)
+            if notes and not second.run.warnings and not second.missing_part_in_words(first):
+                again = budget.run(evaluate.problem, first.n_live, chain)
                 if again is not None and not again.warnings and not second.doubts(again):
                     now, notes = again, []
             log_z, error = second.run.log_z, second.run.log_z_error

@@ -3,7 +3,8 @@
 From such draws evidence and posterior are estimated independently of prior volumes, often with a hundredth of a run's
 error for a few thousand evaluations (Cameron & Pettitt 2014; Lange 2023 with neural networks); the error of a run is
 sqrt(H / n_live), with H the information in nats. The Pareto k of the weights' tail tells whether they are reliable
-(Vehtari, Simpson, Gelman, Yao & Gabry 2024). `refine` does so for a run, `update` for one with new readings.
+(Vehtari, Simpson, Gelman, Yao & Gabry 2024). `refine` does so for a run, `update` for one with new readings. From a
+`repartitioned` prior near the samples another run is short.
 """
 
 from __future__ import annotations
@@ -11,21 +12,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.special import expit
 
 from probewise._arrays import FloatArray, logsumexp, own_arithmetic
 from probewise._kinds import checked_whole, require_callable, require_rng
-from probewise.errors import require
-from probewise.nested.check import check_and_repeat
+from probewise.errors import ParameterError, require
 from probewise.nested.clusters import Clusters, find_disconnected_clusters
-from probewise.nested.moves import SliceMove
 from probewise.nested.problem import Evaluator, Samplable, Space, unbounded_space_of
 from probewise.nested.result import NestedResult, Samples
-from probewise.nested.sampler import least_live, run_once
 from probewise.nested.weights import n_effective, resampled_rows, student_t_draws, student_t_log_norm
+from probewise.priors import Prior
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 MOST_K = 0.7
@@ -38,6 +37,10 @@ _MOST_KERNELS = 400
 _FEW = 40
 _SCALES = (1.0, 0.5, 0.2, 0.05, 0.01)
 _BLOCK = 2048
+# Of a prior near a posterior:
+_DEGREES_NEAR, _WIDENING = 5.0, 1.4  # and times the samples' sds
+_FLATTEST = 1e-12  # least variance along an axis, relative to the greatest
+_LEAST_SAMPLES = 2  # distinct samples per parameter, to determine the axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +325,6 @@ def refine(
     *,
     rng: np.random.Generator,
     n_draws: int = 5000,
-    look: bool = True,
 ) -> Weighted:
     """Reduce the error of a run's evidence and posterior by importance sampling; see `Weighted.sound` before its use.
 
@@ -337,10 +339,9 @@ def refine(
     H (nats) it knows the shares of modes as n_live / H independent samples do, so that a mode of share s is lost with
     probability exp(-s n_live / H). The sum of s times that over the modes found is added.
 
-    `result` is a run of the same problem, or an earlier refinement. `look`: whether to check a run that has no check
-    (made with `max_cost=1`), for at most as many evaluations again; parts of the posterior that it has missed are among
-    the warnings. Raises ParameterError if an option is out of range, the run has other parameters, or the prior has
-    neither `to_unit_cube` nor coordinates; NotConvergedError if the likelihood fails.
+    `result` is a run of the same problem, or an earlier refinement. Raises ParameterError if an option is out of range,
+    the run has other parameters, or the prior has neither `to_unit_cube` nor coordinates; NotConvergedError if the
+    likelihood fails.
     """
     require_rng(rng)
     n_draws = checked_whole("n_draws", n_draws, least=100)
@@ -366,19 +367,6 @@ def refine(
             known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
     found = draw_and_weigh(best, held, space, evaluate, n_draws=n_draws, rng=rng)
     found = with_error_of_lost_parts(found, n_lineages, space, rng)
-    if look and isinstance(result, NestedResult) and result.check is None:
-        checked = check_and_repeat(
-            result,
-            Evaluator(problem),
-            SliceMove(),
-            run_once,
-            max_cost=2.0,
-            max_calls=None,
-            least_live=least_live(len(result.names)),
-            rng=rng.spawn(1)[0],  # of its own: the refined evidence is the same with and without the look
-            repeat=False,
-        )
-        found, result = replace(found, n_calls=found.n_calls + checked.n_calls - result.n_calls), checked
     return replace(found, warnings=(*found.warnings, *_inherited_warnings(found, result)))
 
 
@@ -421,7 +409,7 @@ def update(
         now = previous.log_z + total, math.hypot(previous.log_z_error, n_eff**-0.5)
         n_own = effective_lineages(previous) * n_eff / len(rows)
         old = Weighted(evaluate.names, theta, log_likelihood, log_weight - total, *now, n_own, 0, pareto_k=-math.inf)
-        found = refine(old, problem, rng=rng, n_draws=n_draws, look=False)
+        found = refine(old, problem, rng=rng, n_draws=n_draws)
         if found.sound:
             return replace(found, n_calls=found.n_calls + evaluate.n_calls)
         k = found.pareto_k
@@ -488,3 +476,108 @@ def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, r
     doubt = f"{100 * lost:.0f} % of the posterior may be lost: too few live points for its parts"
     warnings = found.warnings if lost < MOST_LOST else (*found.warnings, doubt)
     return replace(found, warnings=warnings, log_z_error=math.hypot(found.log_z_error, lost))
+
+
+@dataclass(frozen=True, eq=False)
+class Repartitioned:
+    """A problem with the same evidence and posterior, but a prior near that posterior: posterior repartitioning.
+
+    Evidence and posterior depend only on the product of prior and likelihood, so any density may replace the prior if
+    the likelihood compensates for it (Chen, Hobson, Das & Gelderblom 2019, Stat. Comput. 29, 835). From a density near
+    the posterior there are few nats of compression, which lowers the cost and the error of a run. Live points climb to
+    regions that the density undersamples; a distant part of the posterior without any sample stays unseen.
+
+    `prior` has coordinates to draw in, and `log_prior_ratio`: the log of the original prior's density over its own.
+    """
+
+    problem: Samplable
+    prior: Any
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log likelihood plus the log of the original over the new prior density, (n, n_params) -> (n,)."""
+        # The ratio first: a likelihood may modify its argument.
+        log_prior_ratio = self.prior.log_prior_ratio(theta)
+        return np.asarray(self.problem.log_likelihood(theta) + log_prior_ratio)
+
+
+class _PriorNearPosterior:
+    """A prior near the posterior: a mixture of Student t products in unbounded coordinates x, those of `space`.
+
+    There is a part for each of some groups of points. In it x = `center` (n_parts, n_params) + `root` (n_parts,
+    n_params, n_params) e, where the coordinates e along its principal axes are independent Student t of 5 degrees of
+    freedom. Chains move in the coordinates e of the first part. `original`: the problem's prior.
+    """
+
+    def __init__(self, original: Prior, groups: Sequence[FloatArray]) -> None:
+        self.original, self.names, self.space = original, original.names, unbounded_space_of(original)
+        x = [self.space.enter(each) for each in groups]
+        self.share: FloatArray = np.array([len(group) for group in x]) / sum(map(len, x))
+        self.center = np.stack([group.mean(axis=0) for group in x])
+        self.root = np.stack([covariance_root_of_points(group, _WIDENING) for group in x])
+        self.inverse_root: FloatArray = np.asarray(np.linalg.inv(self.root), dtype=np.float64)
+        self._log_dets: FloatArray = np.asarray(np.linalg.slogdet(self.root)[1], dtype=np.float64)
+
+    @property
+    def coordinates(self) -> _PriorNearPosterior:
+        return self
+
+    def from_unit_cube(self, u: FloatArray) -> FloatArray:
+        return self.original.from_unit_cube(u)  # of the original; samplers use `draw`
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw `n` points of this prior in the coordinates of chains, (n, n_params)."""
+        part = rng.choice(len(self.share), size=n, p=self.share)
+        e = rng.standard_t(_DEGREES_NEAR, (n, len(self.names)))
+        return self._to_axes(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e), 0)
+
+    def log_prior_ratio(self, theta: FloatArray) -> FloatArray:
+        x = self.space.enter(theta)
+        return np.asarray(self.space.leave(x)[1] - self._log_density(x))
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        return self._to_axes(self.space.enter(theta), 0)
+
+    def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x = self.center[0] + e @ self.root[0].T
+        theta, log_plain = self.space.leave(x)
+        return theta, np.where(np.isfinite(log_plain), self._log_density(x) + self._log_dets[0], -np.inf)
+
+    def _to_axes(self, x: FloatArray, part: int) -> FloatArray:
+        # A matrix product would depend, in the last bit, on the batch, which an executor divides.
+        return np.asarray(np.einsum("nj,ij->ni", x - self.center[part], self.inverse_root[part]))
+
+    def _log_density(self, x: FloatArray) -> FloatArray:
+        nu = _DEGREES_NEAR
+        e = np.stack([self._to_axes(x, part) for part in range(len(self.share))])
+        along = (student_t_log_norm(1, nu) - 0.5 * (nu + 1) * np.log1p(e**2 / nu)).sum(axis=2)
+        return np.asarray(np.logaddexp.reduce(along + (np.log(self.share) - self._log_dets)[:, None], axis=0))
+
+
+def repartitioned(problem: Samplable, theta: FloatArray, *, peaks: Sequence[FloatArray] = ()) -> Repartitioned:
+    """Repartition a problem: a prior near its posterior, for a second run that is shorter and more precise.
+
+    Its log Z is that of the original problem; its `log_likelihood` is not, so that `refine` takes its runs with this
+    problem. Along each principal axis the prior is a Student t with five degrees of freedom, 1.4 times as wide as the
+    samples `theta`, (n_samples, n_params), of the posterior. With `peaks`, further groups of points, it is a mixture
+    with a part for each group, by its number of points. ParameterError if there are too few distinct samples to
+    determine the axes.
+    """
+    n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * len(problem.prior.names)
+    if n_different < max(least, 1):
+        raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
+    return Repartitioned(problem, _PriorNearPosterior(problem.prior, (theta, *peaks)))
+
+
+def covariance_root_of_points(x: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Return a root of the covariance of points (n, n_params), times `scale`; see `root_of_covariance`."""
+    return root_of_covariance(np.atleast_2d(np.cov(x, rowvar=False)), scale)
+
+
+def root_of_covariance(covariance: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Return a root of a covariance, (n_params, n_params): the principal axes as columns, times sd and `scale`.
+
+    Axes without variance keep a millionth of the greatest sd, so that the root can be inverted.
+    """
+    variance, axes = np.linalg.eigh(covariance)
+    sd = np.sqrt(np.maximum(variance, _FLATTEST * max(float(variance[-1]), 1e-300)))
+    return np.asarray(scale * axes * sd)

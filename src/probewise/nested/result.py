@@ -1,4 +1,7 @@
-"""Weighted posterior samples, and the result of a run of nested sampling with everything needed to judge it."""
+"""Weighted posterior samples, and the result of a run of nested sampling with everything needed to judge it.
+
+Independent runs of one problem merge into one result (Higson, Handley, Hobson & Lasenby 2019).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ import io
 import json
 import math
 import platform
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from types import ModuleType
@@ -17,20 +21,32 @@ from typing import Any
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray, data_frame, frozen_int, own_arithmetic, read_only_floats
 from probewise._display import ShowsItself
 from probewise._kinds import checked_number, checked_path, checked_whole, require_rng
 from probewise._version import __version__
 from probewise._writing import write_bytes_atomically
-from probewise.errors import FileError, ParameterError, ShapeError, message_of, require, shown
-from probewise.nested.evidence import birth_rows, log_volumes
+from probewise.errors import (
+    DoubtfulResultWarning,
+    FileError,
+    ParameterError,
+    ShapeError,
+    message_of,
+    require,
+    shown,
+)
+from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, integrate, log_volumes, n_independent
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
 _FORMAT = "nested-result/4"
 # How an array is kept, by the annotation of its field.
 _READ_ONLY: Mapping[object, Callable[[Any], NDArray[Any]]] = {"FloatArray": read_only_floats, "IntArray": frozen_int}
 _OF_RANKS = ("insertion_rank", "insertion_n_ranked")
+# p value below which runs disagree: one false alarm in 1000 merges.
+_DISAGREE = 1e-3
+_LEVELS = ("log_likelihood", "label", "log_birth", "birth_label")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,26 +140,6 @@ class Samples(ShowsItself):
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """A test whether independent runs of one problem agree within their errors."""
-
-    log_z: tuple[float, ...]
-    log_z_error: tuple[float, ...]
-    chi_square: float  # sum of the runs' squared deviations from their weighted mean, in units of their errors
-    p_value: float  # of a chi-square at least as large if the errors are right
-
-    @property
-    def n_runs(self) -> int:
-        """Number of runs."""
-        return len(self.log_z)
-
-    @property
-    def log_z_sd(self) -> float:
-        """Standard deviation of ln Z between the runs."""
-        return float(np.std(self.log_z, ddof=1))
-
-
-@dataclass(frozen=True)
 class Check:
     """A second, independent estimate of the evidence by a method, the `route`; see `probewise.nested.check`.
 
@@ -183,7 +179,6 @@ class NestedResult(Samples):
     seed_state: str  # of the random generator at the start, as JSON, a list of states for merged runs
     versions: Mapping[str, str]  # of the software
     warnings: tuple[str, ...]  # reasons to doubt the result; empty for a sound run
-    agreement: Agreement | None = None  # of the runs that were merged into this result
     check: Check | None = None  # a second estimate of the evidence
 
     @property
@@ -209,9 +204,6 @@ class NestedResult(Samples):
             f"stopped      {self.stop_reason}",
             f"insertion    p = {self.insertion_p_value:.2g}",
         ]
-        if self.agreement is not None:
-            p = self.agreement.p_value
-            lines.append(f"runs         {self.agreement.n_runs}, ln Z agree with p = {p:.2g}")
         if self.check is not None:
             lines.append(
                 f"check        log Z {self.check.log_z:.2f} ± {self.check.log_z_error:.2f} by {self.check.route}, "
@@ -287,7 +279,7 @@ class NestedResult(Samples):
         path = checked_path("path", path)
         arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self) if f.type in _READ_ONLY}
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
-        head |= {name: head[name] and asdict(head[name]) for name in ("agreement", "check")}
+        head["check"] = self.check and asdict(self.check)
         write_bytes_atomically(path, archive_bytes({"format": _FORMAT, **head}, arrays, compressed=True))
 
     @classmethod
@@ -296,14 +288,13 @@ class NestedResult(Samples):
         path = checked_path("path", path)
         wanted, cure = "a file written by NestedResult.save", "make the file anew with this version"
         head, arrays = read_archive(path, _FORMAT, wanted, cure=cure)
+        head.pop("agreement", None)  # of earlier versions
         if odd := {*head, *arrays} ^ {f.name for f in fields(cls)}:
             names = ", ".join(sorted(odd))
             raise FileError(path, f"fields {names} missing or unknown", "the fields that NestedResult.save writes")
         try:
             head |= {name: tuple(head[name]) for name in ("names", "warnings")}
             head["check"] = head["check"] and Check(**head["check"])
-            if runs := head["agreement"]:
-                head["agreement"] = Agreement(**(runs | {n: tuple(runs[n]) for n in ("log_z", "log_z_error")}))
             n_dead, n_ranks = (arrays[name].size for name in ("log_weight", "insertion_rank"))
             shapes = {"theta": (n_dead, len(head["names"])), **dict.fromkeys(_OF_RANKS, (n_ranks,))}
             for name, array in arrays.items():
@@ -366,3 +357,124 @@ def _import_optional(name: str) -> ModuleType:
         raise ImportError(
             f"{name} is an optional package that cannot be imported ({error}); install it with: pip install {name}"
         ) from error
+
+
+@own_arithmetic
+def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
+    """Merge independent runs of the same problem, two or more, into one run with the live points of all.
+
+    A point is alive between the level above which it was drawn and its own. Sorted by level, the points of all runs
+    form a run whose number of live points at each level is the sum over the runs (Higson, Handley, Hobson & Lasenby
+    2019, section 4). The runs may differ in their numbers of live points and in where they stop. The labels make the
+    count exact on plateaus. Merged runs may be merged again. The error of ln Z, for which `rng` draws, falls as one
+    over the root of the number of runs.
+
+    If the runs' evidences differ by more than their errors allow (chi-square, p < 0.001), a warning is added and the
+    error is at least their scatter.
+
+    Raises ParameterError if there are fewer than two runs, or their parameters differ, or they share a seed or lack a
+    complete record of births and deaths.
+    """
+    require_rng(rng)
+    parts = tuple(results)
+    seeds = _seed_states_of_mergeable_runs(parts)
+    order = np.lexsort([np.concatenate([getattr(r, name) for r in parts]) for name in _LEVELS[1::-1]])
+    joined = {name: np.concatenate([getattr(r, name) for r in parts])[order] for name in ("theta", *_LEVELS)}
+    n_at_death = n_alive_at_death(*(joined[name] for name in _LEVELS))
+    first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
+    parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
+    parent = np.where(parent >= 0, np.argsort(order)[parent], -1)[order]
+    # Each run has its own estimate: in the joined record a run is never complete between two rounds.
+    remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
+    log_start, log_start_error = _pooled_log_possible_share(parts)
+    evidence = integrate(joined["log_likelihood"], n_at_death, rng=rng, log_start=log_start)
+    error = math.hypot(math.sqrt(remembered) * evidence.spread, log_start_error)
+    # Fisher's method combines independent p values.
+    fisher = -2.0 * float(np.log(np.maximum([r.insertion_p_value for r in parts], 1e-300)).sum())
+    p_value = float(chdtrc(2 * len(parts), fisher))
+    doubts = list[str]()
+    # A constant likelihood has an exact evidence: the error is nought, or a last digit.
+    each, own = np.array([[r.log_z, max(r.log_z_error, 1e-12)] for r in parts]).T
+    chi_square = float((((each - np.average(each, weights=own**-2)) / own) ** 2).sum())
+    if (p := float(chdtrc(len(parts) - 1, chi_square))) < _DISAGREE:
+        error = max(error, float(np.std(each, ddof=1)))
+        doubts.append(
+            f"the {len(parts)} runs disagree more than their errors: ln Z from {each.min():.2f} to {each.max():.2f} "
+            f"(p = {p:.1g}): some missed a part of the posterior; the error is widened to their scatter; use more "
+            "n_live or longer chains"
+        )
+    if p_value < DOUBTFUL_P_VALUE:
+        doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
+    for doubt in doubts:
+        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
+    inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
+    return NestedResult(
+        names=parts[0].names,
+        **joined,
+        log_weight=evidence.log_weight,
+        parent=parent,
+        n_at_death=n_at_death,
+        log_start=log_start,
+        log_start_error=log_start_error,
+        log_z=evidence.log_z,
+        log_z_error=error,
+        memory=remembered,
+        information=evidence.information,
+        n_eff=n_independent(joined["theta"], np.exp(evidence.log_weight), parent),
+        n_calls=sum(r.n_calls for r in parts),
+        n_live=sum(r.n_live for r in parts),
+        stop_reason=f"merged {len(parts)} runs: " + "; ".join(dict.fromkeys(r.stop_reason for r in parts)),
+        complete=all(r.complete for r in parts),
+        insertion_rank=np.concatenate([r.insertion_rank for r in parts]),
+        insertion_n_ranked=np.concatenate([r.insertion_n_ranked for r in parts]),
+        insertion_p_value=p_value,
+        seed_state=json.dumps(seeds),
+        versions=software_versions(),
+        warnings=(*doubts, *inherited),
+    )
+
+
+def n_alive_at_death(
+    log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
+) -> IntArray:
+    """Count the points alive at each death, itself included, from the levels of birth and death, all (n_dead,).
+
+    Deaths are in order of level. A point is alive from the deaths on that lie strictly above its birth.
+    """
+    birth, death = birth_rows(log_likelihood, label, log_birth, birth_label), np.arange(len(label))
+    return np.asarray(np.searchsorted(np.sort(birth), death) - death)
+
+
+def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object]:
+    if len(parts) < 2:
+        raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
+    names, seeds = parts[0].names, list[object]()
+    require(names, "results", "runs without parameters", "runs with some; the evidence is exact without")
+    for number, result in enumerate(parts, start=1):
+        require(result.names == names, f"names of run {number}", result.names, f"those of the first run, {names}")
+        if not np.array_equal(n_alive_at_death(*(getattr(result, name) for name in _LEVELS)), result.n_at_death):
+            allowed = "complete runs of nested sampling, in the order of log likelihood and label"
+            raise ParameterError(f"n_at_death of run {number}", "not what births and deaths give", allowed)
+        state = json.loads(result.seed_state)
+        for one in state if isinstance(state, list) else [state]:
+            if one in seeds:
+                allowed = "independent runs: give each its own generator, `rng.spawn(n_runs)`"
+                raise ParameterError(f"seed_state of run {number}", "that of a run before it", allowed)
+            seeds.append(one)
+    return seeds
+
+
+def _pooled_log_possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
+    """Pool the shares of the prior with nonzero likelihood; return the log of the pooled share and its error.
+
+    A share s = m / n has the relative error sqrt((1 - s) / m), from which m follows; if all were possible, m is the
+    number of live points.
+    """
+    found = drawn = 0.0
+    for result in parts:
+        share = math.exp(result.log_start)
+        possible = (1.0 - share) / result.log_start_error**2 if result.log_start_error > 0 else float(result.n_live)
+        found += possible
+        drawn += possible / share
+    share = found / drawn
+    return math.log(share), math.sqrt(max(1.0 - share, 0.0) / found)

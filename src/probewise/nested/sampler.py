@@ -24,7 +24,6 @@ import numpy as np
 
 from probewise._arrays import logsumexp, own_arithmetic
 from probewise._kinds import (
-    checked_finite_number,
     checked_number,
     checked_path,
     checked_whole,
@@ -146,7 +145,6 @@ def run(
     max_calls: int | None = None,
     max_cost: float = 5.0,
     checkpoint: str | Path | None = None,
-    checkpoint_every_s: float = 10.0,
     executor: Executor | None = None,
     n_workers: int | None = None,
     return_interrupted: bool = False,
@@ -179,12 +177,12 @@ def run(
         Limit of likelihood evaluations; at the limit the run ends with a warning.
     max_cost
         Limit of all evaluations in units of those of the first run; 1 means no check. Else the evidence is estimated a
-        second time, and the run repeated where the two disagree or a mode was lost (`probewise.nested.check`); what
+        second time, and the run repeated where the two disagree (`probewise.nested.check`); what
         remains in doubt is a warning.
-    checkpoint, checkpoint_every_s
-        File to which the state is saved atomically, at most once in so many seconds and ten times the saving time (0:
-        after every round); its folder is created if missing. If the file exists, the run resumes and ends bit for bit
-        as if it had not been interrupted or killed; `rng` must be as at the run's start. `max_calls` may differ.
+    checkpoint
+        File to which the state is saved atomically, at most once in ten seconds and ten times the saving time; its
+        folder is created if missing. If the file exists, the run resumes and ends bit for bit as if it had not been
+        interrupted or killed; `rng` must be as at the run's start. `max_calls` may differ.
     executor, n_workers
         Evaluates each batch of a slow likelihood in `n_workers` parts, by default the number of processors. The result
         is the same to the last bit if a hypothesis' likelihood does not depend on its batch (for matrix products in
@@ -205,8 +203,8 @@ def run(
     once = partial(
         run_once, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
     )
-    kept: dict[str, Any] = {"checkpoint": checkpoint, "checkpoint_every_s": checkpoint_every_s, "max_calls": max_calls}
-    result = once(posed, rng=rng, n_live=n_live, stop=stop, move=moving, n_replaced=n_replaced, **kept)
+    options: dict[str, Any] = {"n_replaced": n_replaced, "checkpoint": checkpoint, "max_calls": max_calls}
+    result = once(posed, rng=rng, n_live=n_live, stop=stop, move=moving, **options)
     if max_cost > 1 and result.names and result.complete:
         # A separate generator that depends only on the state after the run, hence is the same after a resumption.
         checking = np.random.default_rng(rng.integers(2**63, size=4))
@@ -266,7 +264,6 @@ def run_once(
     progress: Callable[[RoundSummary], None] | None = None,
     max_calls: int | None = None,
     checkpoint: str | Path | None = None,
-    checkpoint_every_s: float = 10.0,
     executor: Executor | None = None,
     n_workers: int | None = None,
     return_interrupted: bool = False,
@@ -285,8 +282,6 @@ def run_once(
         require_callable("progress", progress, allowed)
     if checkpoint is not None:
         checkpoint = checked_path("checkpoint", checkpoint)
-    if not checked_finite_number("checkpoint_every_s", checkpoint_every_s) >= 0:
-        raise ParameterError("checkpoint_every_s", checkpoint_every_s, "0 or more")
     if executor is not None:
         made = "an executor such as concurrent.futures.ProcessPoolExecutor(), or None; for a count pass n_workers too"
         require_like("executor", executor, ("map", "submit"), made)
@@ -319,7 +314,7 @@ def run_once(
     keeper = resumed = None
     if checkpoint is not None:
         settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
-        keeper = CheckpointFile(checkpoint, checkpoint_every_s, settings)
+        keeper = CheckpointFile(checkpoint, settings)
         resumed = keeper.resume(evaluate, moving, rng)
     now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if len(now.live) < n_live:  # a run with more calls begins again

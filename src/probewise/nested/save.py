@@ -23,6 +23,7 @@ from probewise.nested.result import archive_bytes, read_archive
 
 _FORMAT = "nested-checkpoint/4"
 _ROUNDING = 1e-6
+_EVERY_S = 10.0  # least seconds between two writes: a killed run loses no more
 _WAY_OUT = "give another file, or delete this one to start anew"
 _WRITABLE = "a file in an existing, writable folder"
 
@@ -96,7 +97,6 @@ class CheckpointFile:
     """The checkpoint file of a run: the run's state is written to `path` atomically, and read to resume the run."""
 
     path: Path
-    every_s: float  # least seconds between two writes, 0 for every round
     settings: dict[str, object]  # see `settings_of_run`
     _last_saving: float = field(default_factory=time.monotonic)
     _saving_time_s: float = 0.0
@@ -114,8 +114,8 @@ class CheckpointFile:
             raise FileError(self.path, f"cannot be written ({error.strerror})", _WRITABLE) from error
 
     def save_if_due(self, now: RunState) -> None:
-        """Save once `every_s` and ten times the duration of the last saving have passed; always if `every_s` is 0."""
-        if self.every_s == 0 or time.monotonic() - self._last_saving >= max(self.every_s, 10.0 * self._saving_time_s):
+        """Save once ten seconds and ten times the duration of the last saving have passed."""
+        if time.monotonic() - self._last_saving >= max(_EVERY_S, 10.0 * self._saving_time_s):
             self.save(now)
 
     def save(self, now: RunState) -> None:

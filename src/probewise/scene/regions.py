@@ -27,7 +27,7 @@ class Region(Protocol):
 
     Regions are small frozen values of batched geometry (scene/regions.py). The sensor integrates
     a region in closed form where its kind has one (sensor/gaussian.py), or pixel by pixel
-    (sensor/discrete.py).
+    (sensor/ssf.py).
     """
 
     @property

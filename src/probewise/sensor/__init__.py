@@ -6,16 +6,20 @@ mixture of Gaussians (eq. 10).
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
 from probewise.sensor.commanded import COMMANDED, with_declared_height_commanded
-from probewise.sensor.discrete import mean_albedo_by_pixels
-from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bend_coefficients, free_form_theta, is_free_form
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
+    N_BENDS,
+    N_FREE_FORM,
     FixedMixture,
     FreeMixture,
     SSFField,
     SSFModel,
+    bend_coefficients,
     footprint_of,
+    free_form_theta,
+    is_free_form,
+    mean_albedo_by_pixels,
     mean_ssf_field,
     merged_mean_mixture,
     mixture_of_field,

@@ -14,7 +14,7 @@ from probewise._kinds import checked_number, require_like
 from probewise.errors import ParameterError, require
 from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
-from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, Region, UniformRegion
+from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, Region
 from probewise.scene.scenes import Card, CardedScene, Scene
 from probewise.sensor.commanded import (
     footprint_at_commanded_height,
@@ -369,11 +369,6 @@ def response(layout: RegionsAndPoses, footprint: Footprint, *, n_nodes: int = AC
         out[:, part.rows] = part.response(footprint)
     for rows, region in layout.rows_and_regions_by_orientation:
         if any((part.rows == rows[0]).any() for part in batches):
-            continue
-        if isinstance(region, UniformRegion):  # whatever the footprint
-            level = region.level[:, None]
-            for g in range(footprint.weight.shape[2]):
-                out[:, rows] += select_reading_columns(footprint.weight[:, :, g], rows) * level
             continue
         x, y, turn = (select_reading_columns(a, rows) for a in layout.poses.arrays)
         if turn.shape[0] == 1 and (turn == turn[:, :1]).all():

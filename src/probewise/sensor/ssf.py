@@ -1,4 +1,4 @@
-"""The spatial sensitivity function (SSF): mixtures of Gaussians and discrete fields (paper, eq. 10)."""
+"""The spatial sensitivity function (SSF): mixtures of Gaussians, discrete fields and free forms (paper, eq. 9, 10)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, read_only_floats, require_finite
+from probewise._arrays import FloatArray, IntArray, logsumexp, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_whole
 from probewise.errors import ParameterError, ShapeError, require
-from probewise.sensor.stages import Footprint
+from probewise.scene.regions import Region
+from probewise.sensor.stages import Footprint, Poses
 
 _REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
 _NEGLIGIBLE = 1e-9  # share of a field's light that is not drawn
@@ -180,6 +181,54 @@ class SSFField(ShowsItself):
         return np.asarray((self.values.ravel()[:, None] * off).T @ off)
 
 
+_PLACES_AT_ONCE = 2**18
+# A Fibonacci lattice in the unit square, whose places are even along either side: a straight edge cuts off a share that
+# is right to a hundredth.
+_N_PLACES = 89
+_PLACES_IN_PIXEL = (np.stack([np.arange(89), 55 * np.arange(89) % 89], axis=1) + 0.5) / _N_PLACES - 0.5
+
+
+def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> FloatArray:
+    """Compute the response of a discrete SSF: its pixels' values times the mean albedo of each pixel (paper, eq. 9).
+
+    The second of two independent routes to the response; the other, the closed forms of `probewise.sensor.gaussian`,
+    shares only the regions' albedo at points. The albedo of a pixel is its covered share, from 89 places in it.
+
+    Returns response R, shape (n_samples, n_points); n_samples is 1 where it is the same for all hypotheses. Raises
+    ShapeError if poses and region hold different numbers of hypotheses, neither of them 1.
+
+    `region`: albedo field of each hypothesis (n_regions of them, n_samples or 1); `field`: the discrete SSF in the
+    sensor frame; its pixels turn with the sensor; `poses`: where the sensor stands; arrays broadcast to (n_samples,
+    n_points).
+    """
+    x, y, turn = np.broadcast_arrays(*poses.arrays)
+    n_poses, n_points = x.shape
+    if n_poses not in (1, region.n_regions) and region.n_regions != 1:
+        raise ShapeError(f"poses of {n_poses} hypotheses, {region.n_regions} regions; allowed: equal numbers, or 1")
+    if n_poses > 1:
+        # Each hypothesis has its own poses: evaluate one hypothesis at a time.
+        out = np.empty((n_poses, n_points))
+        for i in range(n_poses):
+            one = Poses(x[i : i + 1], y[i : i + 1], turn[i : i + 1])
+            found = mean_albedo_by_pixels(region, field, one)
+            out[i] = found[i if len(found) > 1 else 0]
+        return out
+    values = field.values.ravel()
+    kept = np.abs(values) > 1e-12 * np.abs(values).max()
+    places = (field.centers_mm[kept][:, None] + field.pixel_mm * _PLACES_IN_PIXEL).reshape(-1, 2)  # in the sensor frame
+    weights = np.repeat(values[kept] / _N_PLACES, _N_PLACES)
+    out = np.empty((region.n_regions, n_points))
+    block = max(1, _PLACES_AT_ONCE // (len(weights) * region.n_regions))
+    for start in range(0, n_points, block):
+        rows = slice(start, start + block)
+        cosine, sine = np.cos(turn[0, rows])[:, None], np.sin(turn[0, rows])[:, None]
+        lab_x = x[0, rows, None] + cosine * places[:, 0] - sine * places[:, 1]
+        lab_y = y[0, rows, None] + sine * places[:, 0] + cosine * places[:, 1]
+        albedo = region.albedo(np.stack([lab_x.ravel(), lab_y.ravel()], axis=-1))
+        out[:, rows] = albedo.reshape(len(albedo), -1, len(weights)) @ weights
+    return out
+
+
 def mean_ssf_field(
     footprint: Footprint, *, u_mm: FloatArray, v_mm: FloatArray, weights: FloatArray | None = None
 ) -> SSFField:
@@ -251,15 +300,38 @@ def merged_mean_mixture(footprint: Footprint, *, n_gaussians: int = 1) -> FixedM
     return FixedMixture(*(np.array(part) for part in zip(*merged, strict=True)))
 
 
-def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
+def mixture_of_field(field: SSFField, *, n_gaussians: int) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Pixels count as points, negative values of the field as 0. Gaussians without mass are left out of the `n_gaussians`.
-    Raises ParameterError if a Gaussian would have no width, as one on a single pixel.
+    Pixels count as points, negative values of the field as 0, in expectation-maximisation. Gaussians without mass are
+    left out of the `n_gaussians`. Raises ParameterError if one would have no width, as on a single pixel.
     """
+    require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
-    return _mixture_of_points(values[kept], field.centers_mm[kept], n_gaussians)
+    w, places = values[kept] / values[kept].sum(), field.centers_mm[kept]
+    none = np.zeros((len(w), 4))
+    _, mean, cov = _mass_mean_covariance(w, places, none)
+    # Start from Gaussians of increasing width, spread along the principal axis.
+    variance, axes = np.linalg.eigh(cov)
+    weights = np.full(n_gaussians, 1 / n_gaussians)
+    centers = mean + 0.5 * np.linspace(-1, 1, n_gaussians)[:, None] * axes[:, 1] * np.sqrt(variance[1])
+    shapes = cov * np.geomspace(0.4, 2.0, n_gaussians)[:, None, None]
+    floor = 1e-6 * np.trace(cov) * np.eye(2)
+    last, score = -np.inf, -np.inf
+    for _ in range(300):
+        off = places[:, None] - centers
+        square = np.einsum("nki,kij,nkj->nk", off, np.linalg.inv(shapes), off)
+        log_p = np.log(weights) - 0.5 * (square + np.linalg.slogdet(shapes)[1])
+        total = logsumexp(log_p, axis=1)
+        last, score = score, float(w @ total)
+        shares = w[:, None] * np.exp(log_p - total[:, None])
+        fitted = [_mass_mean_covariance(own, places, none) for own in shares.T if own.sum() > 1e-9]
+        weights, centers, shapes = (np.array(part) for part in zip(*fitted, strict=True))
+        shapes = shapes + floor
+        if score - last < 1e-8:
+            break
+    return FixedMixture(weights, centers, shapes - floor)
 
 
 def _similar_groups(w: FloatArray, places: FloatArray, n_groups: int) -> list[IntArray]:
@@ -294,39 +366,76 @@ def _mass_mean_covariance(w: FloatArray, means: FloatArray, covs: FloatArray) ->
     return mass, mean, (w @ covs).reshape(2, 2) / mass + (w[:, None] * off).T @ off / mass
 
 
-def _mixture_of_points(w: FloatArray, places: FloatArray, n_gaussians: int) -> FixedMixture:
-    """Fit at most `n_gaussians` to weighted points (n, 2), by expectation-maximisation."""
-    require(n_gaussians >= 1, "n_gaussians", n_gaussians, "1 or more")
-    w = w / w.sum()
-    none = np.zeros((len(w), 4))
-    _, mean, cov = _mass_mean_covariance(w, places, none)
-    if n_gaussians == 1:
-        return FixedMixture(np.ones(1), mean[None], cov[None])
-    # Start from Gaussians of increasing width, spread along the principal axis.
-    main = np.linalg.eigh(cov)[1][:, 1] * np.sqrt(np.linalg.eigvalsh(cov)[1])
-    spread = np.linspace(-1, 1, n_gaussians)
-    weights = np.full(n_gaussians, 1 / n_gaussians)
-    centers = mean + 0.5 * spread[:, None] * main
-    shapes = cov * np.geomspace(0.4, 2.0, n_gaussians)[:, None, None]
-    floor = 1e-6 * np.trace(cov) * np.eye(2)
-    last = -np.inf
-    for _ in range(300):
-        log_p = np.empty((len(w), n_gaussians))
-        for k in range(n_gaussians):
-            inverse = np.linalg.inv(shapes[k])
-            quadratic = np.einsum("ni,ij,nj->n", places - centers[k], inverse, places - centers[k])
-            log_p[:, k] = np.log(weights[k]) - 0.5 * (quadratic + np.log(np.linalg.det(shapes[k])))
-        top = log_p.max(axis=1, keepdims=True)
-        p = np.exp(log_p - top)
-        total = p.sum(axis=1, keepdims=True)
-        score = float(w @ (top + np.log(total))[:, 0])
-        shares = w[:, None] * p / total
-        alive = shares.sum(axis=0) > 1e-9
-        shares, n_gaussians = shares[:, alive], int(alive.sum())
-        fitted = [_mass_mean_covariance(shares[:, k], places, none) for k in range(n_gaussians)]
-        weights, centers, shapes = (np.array(part) for part in zip(*fitted, strict=True))
-        shapes = shapes + floor
-        if score - last < 1e-8:
-            break
-        last = score
-    return FixedMixture(weights, centers, shapes - floor)
+# A free-form SSF: one Gaussian, and nineteen narrower ones of either sign that change its form. A real SSF (a ring, a
+# shadow across the spot, a long tail) is no mixture of a few Gaussians. Here one Gaussian sets place and size; the
+# others lie on rings about it, in units of its sds, and readings are linear in their shares of the mass. The shares are
+# restricted to the directions that keep the first and second moments, so the whole has the mean and covariance of the
+# one Gaussian and no parameter is redundant.
+
+
+def _places_and_widths_on_rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
+    """Return Gaussians' places (n, 2) and widths (n,); a ring is (radius, number, width, rotation in spacings)."""
+    places = [
+        (radius * np.cos(turn), radius * np.sin(turn))
+        for radius, n, _, first in rings
+        for turn in 2 * np.pi * (np.arange(n) + first) / n
+    ]
+    return np.array(places), np.repeat([width for _, _, width, _ in rings], [n for _, n, _, _ in rings])
+
+
+# In sds of the one Gaussian: spaced by about their widths, out to where a long tail still shows.
+_PLACES, _WIDTHS = _places_and_widths_on_rings(
+    (0.0, 1, 0.45, 0.0), (0.8, 6, 0.5, 0.0), (1.6, 8, 0.6, 0.0), (2.7, 4, 0.9, 0.5)
+)
+
+
+def _moment_preserving_basis() -> FloatArray:
+    """Return an orthonormal basis of the shares that change neither mean nor covariance, (N_FREE_FORM - 1, N_BENDS)."""
+    x, y = _PLACES.T
+    moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
+    return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)
+
+
+_DIRECTIONS = _moment_preserving_basis()
+
+N_BENDS: int = _DIRECTIONS.shape[1]
+"""Number of free-form coefficients (bends)."""
+
+N_FREE_FORM = 1 + len(_WIDTHS)
+"""Number of Gaussians of a free form, the one that sets place and size first."""
+
+
+def free_form_theta(one: FloatArray, bends: FloatArray) -> FloatArray:
+    """Return the parameters of free forms: each a Gaussian bent without a change of its mean and covariance.
+
+    `one`: the paper's a, u, v, A, B, C of one Gaussian that holds the whole mass, (n_samples, 6); `bends`: coefficients
+    of the basis of shares that keep mean and covariance, of either sign, (n_samples, N_BENDS). Returns the paper's
+    parameters of the mixture, (n_samples, 6 N_FREE_FORM).
+    """
+    shares = bends @ _DIRECTIONS.T
+    a, u, v, aa, bb, cc = (one[:, k, None] for k in range(6))
+    det = aa * bb - cc**2
+    sd_u, rest_v = np.sqrt(bb / (2 * det)), np.sqrt(0.5 / bb)  # with the next line: the Cholesky factor
+    slope = -cc / bb
+    blocks = np.empty((len(one), N_FREE_FORM, 6))
+    blocks[:, 0] = one
+    blocks[:, 0, 0] *= 1 - shares.sum(axis=1)
+    blocks[:, 1:, 0] = a * shares / _WIDTHS**2
+    blocks[:, 1:, 1] = u + sd_u * _PLACES[:, 0]
+    blocks[:, 1:, 2] = v + slope * sd_u * _PLACES[:, 0] + rest_v * _PLACES[:, 1]
+    for k, moment in ((3, aa), (4, bb), (5, cc)):
+        blocks[:, 1:, k] = moment / _WIDTHS**2
+    return blocks.reshape(len(one), -1)
+
+
+def bend_coefficients(theta: FloatArray) -> FloatArray:
+    """Return the coefficients `bends` of free forms, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
+    return np.asarray(footprint_of(theta, N_FREE_FORM).weight[:, 0, 1:] @ _DIRECTIONS)
+
+
+def is_free_form(theta: FloatArray) -> bool:
+    """Return whether all these mixtures, (n_samples, 6 n), have a free form's number and widths of Gaussians."""
+    if theta.shape[1] != 6 * N_FREE_FORM:
+        return False
+    blocks = theta.reshape(len(theta), N_FREE_FORM, 6)
+    return bool(np.allclose(blocks[:, 1:, 3:] * _WIDTHS[:, None] ** 2, blocks[:, :1, 3:], rtol=1e-6, atol=1e-12))

@@ -13,8 +13,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
-from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_of_cells_in_place
-from probewise.sensor.gaussian import moments_in_lab_frame, probabilities_beyond_corner_and_sides
+from probewise.sensor.gaussian import (
+    CENTRE,
+    PER_SD,
+    moments_in_lab_frame,
+    normal_cdf_of_cells_in_place,
+    probabilities_beyond_corner_and_sides,
+)
 from probewise.sensor.stages import Footprint, Poses
 
 _BLOCK = 2**14  # elements at a time: they fit the cache

@@ -17,7 +17,7 @@ from probewise.diagnosis.search import search, thorough
 from probewise.diagnosis.search.thorough import Weighing, sentence_with_agreement
 from probewise.effects import EFFECTS, VOCABULARY, Extent, HeavyTailedPrior
 from probewise.effects.effect import PHASE, sine_and_cosine_entries
-from probewise.nested.repartition import Repartitioned
+from probewise.nested.importance import Repartitioned
 from probewise.priors import Normal, Product, Uniform
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene

@@ -23,7 +23,7 @@ from probewise.diagnosis.posterior import HypothesisProblem
 from probewise.diagnosis.search.hypotheses import Searched, WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.words import Names, combination_label
 from probewise.errors import DoubtfulResultWarning
-from probewise.nested.repartition import repartitioned
+from probewise.nested.importance import repartitioned
 from probewise.progress import Progress, silent
 
 A_NAT = 1.0
@@ -108,7 +108,7 @@ def weigh_thoroughly(
         Source of randomness.
     n_live
         Live points of each run, or more if there are many parameters. The first run, from the whole prior, locates the
-        posterior; further runs, from priors near it (`probewise.nested.repartition`), estimate the evidence until its
+        posterior; further runs, from priors near it (`probewise.nested.importance`), estimate the evidence until its
         error is small.
     progress
         Called after every round of every run, with the number and the name of the hypothesis.
@@ -215,7 +215,7 @@ def _evidence_near_posterior(
         nearer = repartitioned(problem, theta)
         found = run(nearer)
         runs.append(found)
-        sharper = nested.refine(found, nearer, rng=rng, look=False)
+        sharper = nested.refine(found, nearer, rng=rng)
         if sharper.sound and sharper.log_z_error < found.log_z_error:
             return sharper.log_z, sharper.log_z_error, ()
         weights = np.array([1.0 / own.log_z_error**2 for own in runs])
